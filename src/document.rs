@@ -1,0 +1,443 @@
+//! Reading JSON documents with *all* their faults.
+//!
+//! A client that sends a body with five mistakes should be told of five, each with its place. Derived
+//! deserialization stops at the first, so documents are read in two steps: [`parse`] turns text into a
+//! [`serde_json::Value`], and the readers of each domain type walk that value by [`Place`]s, noting every
+//! [`Fault`] with its JSON pointer (RFC 6901) and reading on.
+//!
+//! A reader returns `Option`: `None` means that it noted at least one fault. [`Faults::check`] turns the two
+//! into a `Result` at the end.
+//!
+//! This module knows no document in particular; those live beside the types that they describe.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+use utoipa::ToSchema;
+
+use crate::attribute::MAX_COST;
+
+/// One thing wrong with a document, and where.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Fault {
+    /// JSON pointer (RFC 6901) to the faulty value; the empty pointer is the whole document.
+    #[schema(example = "/demonstration/3/x")]
+    pub pointer: String,
+    /// What is wrong, and what would be right.
+    #[schema(example = "expected a number, found \"a\"")]
+    pub detail: String,
+}
+
+/// Everything wrong with one document, in document order.
+#[derive(Clone, Debug, Default, PartialEq, Eq, thiserror::Error)]
+pub struct Faults {
+    listed: Vec<Fault>,
+    n_unlisted: usize,
+}
+
+impl Faults {
+    /// Most faults that are listed; further ones are only counted. A million faulty states would otherwise
+    /// make an answer larger than the request.
+    pub const MAX_LISTED: usize = 1000;
+
+    /// A document with a single fault.
+    #[must_use]
+    pub fn one(pointer: impl Into<String>, detail: impl Into<String>) -> Self {
+        let fault = Fault { pointer: pointer.into(), detail: detail.into() };
+        Self { listed: vec![fault], n_unlisted: 0 }
+    }
+
+    /// Notes a fault at `place`.
+    pub fn note(&mut self, place: &Place<'_, '_>, detail: impl Into<String>) {
+        self.note_at(&place.path, detail);
+    }
+
+    /// Notes a fault at `path`.
+    pub fn note_at(&mut self, path: &Path<'_>, detail: impl Into<String>) {
+        if self.listed.len() < Self::MAX_LISTED {
+            self.listed.push(Fault { pointer: path.to_string(), detail: detail.into() });
+        } else {
+            self.n_unlisted += 1;
+        }
+    }
+
+    /// Whether nothing was found wrong.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.listed.is_empty()
+    }
+
+    /// How many faults were found, listed or not.
+    #[must_use]
+    pub fn count(&self) -> usize {
+        self.listed.len() + self.n_unlisted
+    }
+
+    /// The first [`Self::MAX_LISTED`] faults.
+    #[must_use]
+    pub fn listed(&self) -> &[Fault] {
+        &self.listed
+    }
+
+    /// Adds the faults of another reading of the same document.
+    pub fn append(&mut self, other: Self) {
+        for fault in other.listed {
+            if self.listed.len() < Self::MAX_LISTED {
+                self.listed.push(fault);
+            } else {
+                self.n_unlisted += 1;
+            }
+        }
+        self.n_unlisted += other.n_unlisted;
+    }
+
+    /// Ends a reading: the value if nothing was noted, else the faults.
+    ///
+    /// # Errors
+    ///
+    /// `self`, if a fault was noted or (a defect of a reader) `read` is missing without one.
+    pub fn check<T>(mut self, read: Option<T>) -> Result<T, Self> {
+        match read {
+            Some(value) if self.is_empty() => Ok(value),
+            Some(_) => Err(self),
+            None => {
+                debug_assert!(!self.is_empty(), "a reader gave nothing and noted no fault");
+                if self.is_empty() {
+                    self.note_at(&Path::Root, "this document could not be read");
+                }
+                Err(self)
+            }
+        }
+    }
+}
+
+impl fmt::Display for Faults {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for (n, fault) in self.listed.iter().enumerate() {
+            let separator = if n == 0 { "" } else { "\n" };
+            let pointer = if fault.pointer.is_empty() { "(document)" } else { &fault.pointer };
+            write!(f, "{separator}{pointer}: {}", fault.detail)?;
+        }
+        if self.n_unlisted > 0 {
+            write!(f, "\nand {} more", self.n_unlisted)?;
+        }
+        Ok(())
+    }
+}
+
+/// Why a text is not a document at all.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ParseError {
+    /// The text is not JSON. Lines and columns count from 1.
+    #[error("not JSON at line {line}, column {column}: {detail}")]
+    Syntax {
+        /// Line of the fault.
+        line: usize,
+        /// Column of the fault, in bytes.
+        column: usize,
+        /// What the parser met.
+        detail: String,
+    },
+    /// The text is JSON with a value that cannot be held: a number beyond the range of 64-bit floats.
+    #[error(transparent)]
+    Faults(#[from] Faults),
+}
+
+/// Parses JSON text.
+///
+/// # Errors
+///
+/// [`ParseError::Syntax`] if `text` is not JSON (`NaN` and `Infinity` are not), [`ParseError::Faults`] if a
+/// number in it overflows a 64-bit float.
+pub fn parse(text: &[u8]) -> Result<Value, ParseError> {
+    serde_json::from_slice(text).map_err(|error| explain_parse_error(text, &error))
+}
+
+/// Parses once more, slowly, to say where the fault is.
+fn explain_parse_error(text: &[u8], error: &serde_json::Error) -> ParseError {
+    let detail = error.to_string();
+    // serde_json appends the position, which is given separately here.
+    let detail = detail.split(" at line ").next().unwrap_or_default().to_owned();
+    if detail == "number out of range" {
+        let mut deserializer = serde_json::Deserializer::from_slice(text);
+        let tracked = serde_path_to_error::deserialize::<_, Value>(&mut deserializer);
+        let pointer = tracked.err().map(|error| pointer_of(error.path())).unwrap_or_default();
+        return Faults::one(pointer, "expected a finite number, found one beyond the range of 64-bit floats").into();
+    }
+    ParseError::Syntax { line: error.line(), column: error.column(), detail }
+}
+
+fn pointer_of(path: &serde_path_to_error::Path) -> String {
+    use serde_path_to_error::Segment;
+    let mut pointer = String::new();
+    for segment in path {
+        pointer.push('/');
+        match segment {
+            Segment::Seq { index } => pointer.push_str(&index.to_string()),
+            Segment::Map { key } => pointer.push_str(&escape(key)),
+            Segment::Enum { variant } => pointer.push_str(&escape(variant)),
+            Segment::Unknown => {}
+        }
+    }
+    pointer
+}
+
+/// The way from a document's root to a value in it. Lives on the stack of the readers, so that following it costs
+/// nothing until a fault has to be written down.
+#[derive(Clone, Copy, Debug)]
+pub enum Path<'p> {
+    /// The document.
+    Root,
+    /// A member of an object.
+    Member(&'p Path<'p>, &'p str),
+    /// An item of an array.
+    Item(&'p Path<'p>, usize),
+}
+
+impl fmt::Display for Path<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Path::Root => Ok(()),
+            Path::Member(parent, name) => write!(f, "{parent}/{}", escape(name)),
+            Path::Item(parent, index) => write!(f, "{parent}/{index}"),
+        }
+    }
+}
+
+/// Escapes a member's name for a JSON pointer (RFC 6901, section 4).
+fn escape(name: &str) -> String {
+    name.replace('~', "~0").replace('/', "~1")
+}
+
+/// A value in a document, and the way to it.
+#[derive(Clone, Copy, Debug)]
+pub struct Place<'v, 'p> {
+    /// The value found there.
+    pub value: &'v Value,
+    /// How it was reached.
+    pub path: Path<'p>,
+}
+
+impl<'v, 'p> Place<'v, 'p> {
+    /// The whole document.
+    #[must_use]
+    pub fn root(value: &'v Value) -> Self {
+        Self { value, path: Path::Root }
+    }
+
+    /// Reads an object that may have the members in `known` and no others.
+    pub fn object(&self, known: &[&str], faults: &mut Faults) -> Option<Object<'v, 'p>> {
+        let object = self.open_object(faults)?;
+        object.members.keys().filter(|name| !known.contains(&name.as_str())).for_each(|name| {
+            let detail = format!("unknown field; known here: {}", known.join(", "));
+            faults.note_at(&Path::Member(&self.path, name), detail);
+        });
+        Some(object)
+    }
+
+    /// Reads an object whose members the caller checks.
+    pub fn open_object(&self, faults: &mut Faults) -> Option<Object<'v, 'p>> {
+        match self.value {
+            Value::Object(members) => Some(Object { members, path: self.path }),
+            _ => self.mismatch("an object", faults),
+        }
+    }
+
+    /// Reads an array.
+    pub fn array(&self, faults: &mut Faults) -> Option<&'v [Value]> {
+        match self.value {
+            Value::Array(items) => Some(items),
+            _ => self.mismatch("an array", faults),
+        }
+    }
+
+    /// The item `index` of the array at this place, whose value is `value`.
+    #[must_use]
+    pub fn item<'s>(&'s self, index: usize, value: &'v Value) -> Place<'v, 's> {
+        Place { value, path: Path::Item(&self.path, index) }
+    }
+
+    /// Reads a string.
+    pub fn string(&self, faults: &mut Faults) -> Option<&'v str> {
+        match self.value {
+            Value::String(text) => Some(text),
+            _ => self.mismatch("a string", faults),
+        }
+    }
+
+    /// Reads `true` or `false`.
+    pub fn boolean(&self, faults: &mut Faults) -> Option<bool> {
+        match self.value {
+            Value::Bool(flag) => Some(*flag),
+            _ => self.mismatch("true or false", faults),
+        }
+    }
+
+    /// Reads a finite number within `range`.
+    pub fn number(&self, range: Range, faults: &mut Faults) -> Option<f64> {
+        let Some(number) = self.value.as_f64().filter(|number| number.is_finite()) else {
+            return self.mismatch(range.describe(), faults);
+        };
+        // Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bits.
+        if range.contains(number) { Some(number + 0.0) } else { self.mismatch(range.describe(), faults) }
+    }
+
+    /// Reads a whole number from `least` to `most`.
+    pub fn integer(&self, least: u64, most: u64, faults: &mut Faults) -> Option<u64> {
+        match self.value.as_u64() {
+            Some(number) if (least..=most).contains(&number) => Some(number),
+            _ => self.mismatch(&format!("a whole number from {least} to {most}"), faults),
+        }
+    }
+
+    /// Reads an index into a collection of `len` things, called `what` in the fault.
+    pub fn index(&self, len: usize, what: &str, faults: &mut Faults) -> Option<u32> {
+        let index = self.value.as_u64().and_then(|index| u32::try_from(index).ok());
+        match index {
+            Some(index) if (index as usize) < len => Some(index),
+            Some(_) => {
+                faults.note(self, format!("there is no {what} {}: there are {len}, counted from 0", self.value));
+                None
+            }
+            None => self.mismatch(&format!("the index of a {what}"), faults),
+        }
+    }
+
+    /// Notes that something else was `expected` here, and reads nothing.
+    pub fn mismatch<T>(&self, expected: &str, faults: &mut Faults) -> Option<T> {
+        faults.note(self, format!("expected {expected}, found {}", Excerpt(self.value)));
+        None
+    }
+}
+
+/// An object in a document.
+#[derive(Clone, Copy, Debug)]
+pub struct Object<'v, 'p> {
+    /// Its members, by name.
+    pub members: &'v Map<String, Value>,
+    /// How it was reached.
+    pub path: Path<'p>,
+}
+
+impl<'v, 'p> Object<'v, 'p> {
+    /// A member that must be there. `null` counts as missing.
+    pub fn required<'s>(&'s self, name: &'s str, faults: &mut Faults) -> Option<Place<'v, 's>> {
+        let place = self.optional(name);
+        if place.is_none() {
+            faults.note_at(&Path::Member(&self.path, name), "is missing");
+        }
+        place
+    }
+
+    /// A member that may be missing or `null`.
+    #[must_use]
+    pub fn optional<'s>(&'s self, name: &'s str) -> Option<Place<'v, 's>> {
+        let value = self.members.get(name).filter(|value| !value.is_null())?;
+        Some(Place { value, path: Path::Member(&self.path, name) })
+    }
+
+    /// Every member, in the order of names.
+    pub fn iter<'s>(&'s self) -> impl Iterator<Item = (&'v str, Place<'v, 's>)> + use<'v, 's, 'p> {
+        self.members.iter().map(|(name, value)| {
+            let path = Path::Member(&self.path, name);
+            (name.as_str(), Place { value, path })
+        })
+    }
+}
+
+/// Which finite numbers are allowed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Range {
+    /// All of them.
+    Finite,
+    /// 0 and above.
+    NonNegative,
+    /// Above 0.
+    Positive,
+    /// 0 to [`MAX_COST`](crate::attribute::MAX_COST).
+    Cost,
+}
+
+impl Range {
+    fn contains(self, number: f64) -> bool {
+        match self {
+            Self::Finite => true,
+            Self::NonNegative => number >= 0.0,
+            Self::Positive => number > 0.0,
+            Self::Cost => (0.0..=MAX_COST).contains(&number),
+        }
+    }
+
+    fn describe(self) -> &'static str {
+        match self {
+            Self::Finite => "a number",
+            Self::NonNegative => "a number of at least 0",
+            Self::Positive => "a number above 0",
+            Self::Cost => "a cost: a number from 0 to 1e150",
+        }
+    }
+}
+
+/// A value as it is shown in a fault: whole if short, else its kind.
+struct Excerpt<'v>(&'v Value);
+
+impl fmt::Display for Excerpt<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        const MAX_SHOWN: usize = 60;
+        match self.0 {
+            Value::Array(items) => write!(f, "an array of {}", items.len()),
+            Value::Object(_) => f.write_str("an object"),
+            Value::String(text) if text.chars().count() > MAX_SHOWN => {
+                let shown: String = text.chars().take(MAX_SHOWN).collect();
+                write!(f, "{}..", Value::String(shown))
+            }
+            other => write!(f, "{other}"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn faults_carry_escaped_pointers_in_document_order() {
+        let value = json!({"a/b": [1, "x"], "c~": true});
+        let mut faults = Faults::default();
+        let root = Place::root(&value);
+        let object = root.object(&["a/b"], &mut faults).unwrap();
+        let items = object.required("a/b", &mut faults).unwrap();
+        for (n, item) in items.array(&mut faults).unwrap().iter().enumerate() {
+            items.item(n, item).number(Range::Finite, &mut faults);
+        }
+        object.required("gone", &mut faults);
+        let pointers: Vec<_> = faults.listed().iter().map(|fault| fault.pointer.as_str()).collect();
+        assert_eq!(pointers, ["/c~0", "/a~1b/1", "/gone"]);
+    }
+
+    #[test]
+    fn a_number_beyond_floats_is_a_fault_with_its_place() {
+        let error = parse(br#"{"a": [0, 1e999]}"#).unwrap_err();
+        let ParseError::Faults(faults) = error else { panic!("{error:?}") };
+        assert_eq!(faults.listed()[0].pointer, "/a/1");
+    }
+
+    #[test]
+    fn nan_is_not_json() {
+        let error = parse(b"{\n\"a\": NaN}").unwrap_err();
+        assert!(matches!(error, ParseError::Syntax { line: 2, .. }), "{error:?}");
+    }
+
+    #[test]
+    fn the_list_of_faults_is_bounded_and_says_so() {
+        let mut faults = Faults::default();
+        for _ in 0..Faults::MAX_LISTED + 5 {
+            faults.note_at(&Path::Root, "no");
+        }
+        assert_eq!((faults.listed().len(), faults.count()), (Faults::MAX_LISTED, Faults::MAX_LISTED + 5));
+        assert!(faults.to_string().ends_with("and 5 more"));
+    }
+}

@@ -1,0 +1,3 @@
+//! The `etude` program.
+
+fn main() {}
