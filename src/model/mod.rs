@@ -1,0 +1,205 @@
+//! Models: what a body can do in its world.
+//!
+//! A [`Definition`] is what a client registers: attributes, actions with costs, and dynamics of one of the
+//! kinds below. It is compiled into a [`Model`], whose [`Graph`] is the same whatever the source, and which searches
+//! run on.
+//!
+//! ```text
+//! JSON --Definition::read--> Definition { Table | Cave } --Model::compile--> Model { schema, actions, states, graph, start }
+//!                                  |
+//!                                  +--canonical JSON--> hash, store
+//! ```
+//!
+//! Nothing here knows of demonstrations.
+
+mod action;
+mod definition;
+mod graph;
+mod states;
+mod table;
+mod wumpus;
+
+use std::sync::Arc;
+
+pub use action::{Action, ActionDocument, ActionIdx};
+pub use definition::{Definition, DefinitionDocument, DynamicsDocument, hash_of};
+pub use graph::{Graph, Transition};
+pub use states::{StateIdx, States};
+pub use table::{ActionReference, StartDocument, Table, TableDocument, TransitionDocument};
+pub use wumpus::{Act, Cave, CaveState, Cell, CellDocument, Heading, PoseDocument, WumpusDocument};
+
+use crate::attribute::{ByAttribute, Scalar, Schema, Value};
+use crate::document::{Faults, Place};
+use crate::interrupt::{Cancelled, Interrupt};
+
+/// What a model may at most be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// Most states; those of a wumpus world are counted as they are reached.
+    pub max_states: usize,
+}
+
+impl Limits {
+    /// One million states: a few hundred MB with their transitions.
+    pub const DEFAULT: Self = Self { max_states: 1_000_000 };
+}
+
+/// Why a definition gives no model.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum CompileError {
+    /// The definition is at fault.
+    #[error(transparent)]
+    Faults(#[from] Faults),
+    /// The caller lost interest.
+    #[error(transparent)]
+    Cancelled(#[from] Cancelled),
+}
+
+/// Where the imitator may start.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Start {
+    /// In this state.
+    State(StateIdx),
+    /// In whichever of these states is closest to the first observation; the lowest index among equals. Not empty.
+    Candidates(Vec<StateIdx>),
+    /// In whichever state is closest to the first observation; the lowest index among equals.
+    Any,
+}
+
+/// A body in its world, ready to be searched.
+#[derive(Debug)]
+pub struct Model {
+    schema: Schema,
+    actions: Vec<Action>,
+    states: States,
+    graph: Graph,
+    start: Start,
+    is_unsafe: Vec<bool>,
+    n_unsafe: usize,
+}
+
+impl Model {
+    /// Compiles `definition`.
+    ///
+    /// # Errors
+    ///
+    /// [`CompileError::Faults`] if a wumpus world has more than `limits.max_states` reachable states,
+    /// [`CompileError::Cancelled`] if `interrupt` said so.
+    pub fn compile(
+        definition: &Definition,
+        limits: Limits,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Self, CompileError> {
+        match definition {
+            Definition::Table(table) => Ok(table.compile()),
+            Definition::Wumpus(cave) => cave.compile(limits, interrupt),
+        }
+    }
+
+    /// The attributes of its states.
+    #[must_use]
+    pub fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    /// The actions of the body, in the order of their indices.
+    #[must_use]
+    pub fn actions(&self) -> &[Action] {
+        &self.actions
+    }
+
+    /// The states.
+    #[must_use]
+    pub fn states(&self) -> &States {
+        &self.states
+    }
+
+    /// The transitions that a body may make: those that have an effect and do not lead into an unsafe state.
+    #[must_use]
+    pub fn graph(&self) -> &Graph {
+        &self.graph
+    }
+
+    /// Where the imitator may start when a request does not say.
+    #[must_use]
+    pub fn start(&self) -> &Start {
+        &self.start
+    }
+
+    /// Whether `state` must never be entered.
+    #[must_use]
+    pub fn is_unsafe(&self, state: StateIdx) -> bool {
+        self.is_unsafe.get(state as usize).copied().unwrap_or(false)
+    }
+
+    /// How many states must never be entered.
+    #[must_use]
+    pub fn n_unsafe(&self) -> usize {
+        self.n_unsafe
+    }
+
+    /// The values of `state`, as they are written outside.
+    #[must_use]
+    pub fn describe(&self, state: StateIdx) -> ByAttribute<Scalar> {
+        let values = self.states.values(state);
+        let written =
+            self.schema.attributes().iter().zip(values).map(|(attribute, value)| attribute.write_value(value));
+        self.schema.by_attribute(written)
+    }
+
+    /// Approximate size in memory, in bytes.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        self.states.size_bytes() + self.graph.size_bytes() + self.is_unsafe.len()
+    }
+
+    /// Reads the start of a request: a state's index, or an object of attribute values that exactly one state has.
+    pub fn read_start(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<StateIdx> {
+        let state = if place.value.is_object() {
+            let wanted = self.read_wanted(place, faults)?;
+            let mut found = (0..self.states.len()).filter(|state| self.has_values(*state, &wanted));
+            match (found.next(), found.next()) {
+                (Some(state), None) => state,
+                (None, _) => {
+                    faults.note(place, "no state of the model has these values");
+                    return None;
+                }
+                (Some(first), Some(second)) => {
+                    let detail = format!("more than one state has these values, among them {first} and {second}");
+                    faults.note(place, detail);
+                    return None;
+                }
+            }
+        } else {
+            place.index(self.states.len() as usize, "state", faults)?
+        };
+        if self.is_unsafe(state) {
+            faults.note(place, format!("state {state} is unsafe"));
+            return None;
+        }
+        Some(state)
+    }
+
+    fn read_wanted(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Option<Value>>> {
+        let n_before = faults.count();
+        let wanted = self.schema.read_observation(place, faults)?;
+        (faults.count() == n_before).then_some(wanted)
+    }
+
+    fn has_values(&self, state: StateIdx, wanted: &[Option<Value>]) -> bool {
+        let mut pairs = self.states.values(state).zip(wanted);
+        pairs.all(|(value, wanted)| wanted.as_ref().is_none_or(|wanted| wanted == value))
+    }
+
+    /// The action at `index`.
+    #[must_use]
+    pub fn action(&self, index: ActionIdx) -> &Action {
+        &self.actions[usize::from(index)]
+    }
+
+    /// The name of the action at `index`, shared.
+    #[must_use]
+    pub fn action_name(&self, index: ActionIdx) -> Arc<str> {
+        self.action(index).name.clone()
+    }
+}

@@ -1,0 +1,96 @@
+//! The states of a model, interned.
+
+use rustc_hash::FxHashMap;
+
+use crate::attribute::Value;
+
+/// Index of a state in its model.
+pub type StateIdx = u32;
+
+/// The states of a model. Each attribute's distinct values are kept once, in its *domain*, and a state is a row
+/// of indices into the domains, so that a distance can be looked up per (observation, value) instead of computed per
+/// state. Several states may have the same values.
+#[derive(Clone, Debug)]
+pub struct States {
+    /// Distinct values by attribute. Shape `[n_attributes][domain size]`.
+    domains: Vec<Vec<Value>>,
+    /// Indices into the domains. Shape `[n_states, n_attributes]`, row by row.
+    rows: Vec<u32>,
+}
+
+impl States {
+    /// States with the given `domains`, from rows of indices into them, one after the other.
+    pub(super) fn new(domains: Vec<Vec<Value>>, rows: Vec<u32>) -> Self {
+        debug_assert!(rows.len().is_multiple_of(domains.len()), "whole rows");
+        Self { domains, rows }
+    }
+
+    /// How many states there are.
+    #[must_use]
+    #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
+    pub fn len(&self) -> StateIdx {
+        (self.rows.len() / self.domains.len()) as StateIdx
+    }
+
+    /// Whether there are none. Never the case in a model.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.rows.is_empty()
+    }
+
+    /// Distinct values of the attribute at `attribute`. States may use all or fewer of them.
+    #[must_use]
+    pub fn domain(&self, attribute: usize) -> &[Value] {
+        &self.domains[attribute]
+    }
+
+    /// The row of `state`: per attribute, the index of its value in the domain. Shape `[n_attributes]`.
+    #[must_use]
+    pub fn row(&self, state: StateIdx) -> &[u32] {
+        let n_attributes = self.domains.len();
+        let from = state as usize * n_attributes;
+        &self.rows[from..from + n_attributes]
+    }
+
+    /// The values of `state`, in attribute order.
+    pub fn values(&self, state: StateIdx) -> impl Iterator<Item = &Value> {
+        self.domains.iter().zip(self.row(state)).map(|(domain, value)| &domain[*value as usize])
+    }
+
+    pub(super) fn size_bytes(&self) -> usize {
+        let domains: usize = self.domains.iter().map(|domain| size_of_val(domain.as_slice())).sum();
+        domains + size_of_val(self.rows.as_slice())
+    }
+}
+
+/// Builds [`States`] from values as they are read.
+pub(super) struct Interner {
+    indices: Vec<FxHashMap<Value, u32>>,
+    states: States,
+}
+
+impl Interner {
+    /// An interner of states with `n_attributes` values.
+    pub(super) fn new(n_attributes: usize) -> Self {
+        let states = States { domains: vec![Vec::new(); n_attributes], rows: Vec::new() };
+        Self { indices: vec![FxHashMap::default(); n_attributes], states }
+    }
+
+    /// Adds a state.
+    pub(super) fn push(&mut self, values: impl IntoIterator<Item = Value>) {
+        for (attribute, value) in values.into_iter().enumerate() {
+            let domain = &mut self.states.domains[attribute];
+            #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
+            let next = domain.len() as u32;
+            let index = *self.indices[attribute].entry(value.clone()).or_insert_with(|| {
+                domain.push(value);
+                next
+            });
+            self.states.rows.push(index);
+        }
+    }
+
+    pub(super) fn finish(self) -> States {
+        self.states
+    }
+}
