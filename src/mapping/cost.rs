@@ -1,0 +1,108 @@
+//! The cost of a mapping, summed without the error of long sums.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::{Move, Problem};
+
+/// What a mapping costs: `C = C_a + C_s`. Dimensionless; finite, at least 0.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Cost {
+    /// The whole, `actions + distance`.
+    #[schema(example = 48.0)]
+    pub total: f64,
+    /// Costs of the actions taken, `C_a`.
+    #[schema(example = 6.0)]
+    pub actions: f64,
+    /// Weighted distances between observed and own states, one per step, `C_s`.
+    #[schema(example = 42.0)]
+    pub distance: f64,
+}
+
+/// Sums the cost of a mapping step by step: exactly, to within an ulp, and then to the 15 significant digits that a float
+/// holds of a decimal. Eighteen actions of 0.3 cost 5.4.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct CostSum {
+    actions: CompensatedSum,
+    distance: CompensatedSum,
+    total: CompensatedSum,
+}
+
+impl CostSum {
+    /// Adds a step's costs, and gives the sums so far.
+    pub(super) fn add(&mut self, action_cost: f64, distance: f64) -> Cost {
+        self.actions.add(action_cost);
+        self.distance.add(distance);
+        self.total.add(action_cost);
+        self.total.add(distance);
+        Cost { total: as_decimal(self.total), actions: as_decimal(self.actions), distance: as_decimal(self.distance) }
+    }
+}
+
+/// The cost of `moves`.
+pub(super) fn cost_of(problem: &Problem<'_>, moves: &[Move]) -> Cost {
+    let mut sum = CostSum::default();
+    moves.iter().fold(Cost::default(), |_, step| {
+        let action_cost = step.action.map_or(0.0, |action| problem.model.action(action).cost);
+        sum.add(action_cost, problem.distances.distance(step.observation as usize, step.state))
+    })
+}
+
+/// A sum with a running compensation for lost low-order bits (Neumaier 1974).
+#[derive(Clone, Copy, Debug, Default)]
+struct CompensatedSum {
+    sum: f64,
+    compensation: f64,
+}
+
+impl CompensatedSum {
+    fn add(&mut self, term: f64) {
+        let sum = self.sum + term;
+        self.compensation +=
+            if self.sum.abs() >= term.abs() { (self.sum - sum) + term } else { (term - sum) + self.sum };
+        self.sum = sum;
+    }
+
+    fn value(self) -> f64 {
+        self.sum + self.compensation
+    }
+}
+
+/// The sum, rounded to 15 significant digits.
+fn as_decimal(sum: CompensatedSum) -> f64 {
+    /// Powers of ten up to here are floats, so that dividing by them rounds correctly.
+    const MAX_EXACT_POWER: i32 = 22;
+    let sum = sum.value();
+    if sum == 0.0 {
+        return sum;
+    }
+    #[expect(clippy::cast_possible_truncation, reason = "the logarithm of a float is below 309")]
+    let n_decimals = 14 - sum.log10().floor() as i32;
+    let scale = 10_f64.powi(n_decimals);
+    if (0..=MAX_EXACT_POWER).contains(&n_decimals) { (sum * scale).round() / scale } else { sum }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn many_small_costs_add_up_exactly() {
+        let mut sum = CostSum::default();
+        let mut cost = Cost::default();
+        for n in 1..=100_u32 {
+            cost = sum.add(0.3, 2.1);
+            let decimal = |tenths: u32| f64::from(tenths) / 10.0;
+            let expected = Cost { total: decimal(24 * n), actions: decimal(3 * n), distance: decimal(21 * n) };
+            assert_eq!(cost, expected, "after {n} steps");
+        }
+        assert_eq!(cost.actions, 30.0);
+    }
+
+    #[test]
+    fn sums_out_of_the_reach_of_decimals_are_left_alone() {
+        for term in [0.0, 1e-12, 1e150] {
+            assert_eq!(CostSum::default().add(0.0, term).total.to_bits(), term.to_bits());
+        }
+    }
+}

@@ -1,0 +1,125 @@
+//! The distance between observations and states, looked up rather than computed.
+
+use rustc_hash::FxHashMap;
+
+use super::Demonstration;
+use crate::attribute::{Attribute, Schema, Value, Weights};
+use crate::model::{StateIdx, States};
+
+/// Weighted terms of the distance for one demonstration. Attributes without weight, and those that were never observed,
+/// take no part.
+///
+/// What an attribute adds depends only on the observed and the state's value, of which there are few: its terms are
+/// computed once per pair of distinct values.
+#[derive(Debug)]
+pub(crate) struct Distances<'m> {
+    states: &'m States,
+    /// In schema order, in which distances are summed.
+    active: Vec<ActiveAttribute<'m>>,
+}
+
+/// An attribute that takes part in the distance.
+#[derive(Debug)]
+struct ActiveAttribute<'m> {
+    position: usize,
+    attribute: &'m Attribute,
+    weight: f64,
+    /// By observation: which of `observed` it saw, plus 1; 0 if it did not see the attribute. Shape `[n_observations]`.
+    rows: Vec<u32>,
+    /// Distinct observed values.
+    observed: Vec<Value>,
+    domain: &'m [Value],
+    /// Shape `[1 + observed.len(), domain.len()]`, the first row zero; empty if that would be too large.
+    table: Vec<f64>,
+}
+
+/// Most entries of all tables together: 64 MB.
+const MAX_TABLE_ENTRIES: usize = 1 << 23;
+
+impl<'m> Distances<'m> {
+    pub(crate) fn new(
+        schema: &'m Schema,
+        states: &'m States,
+        demonstration: &Demonstration,
+        weights: &Weights,
+    ) -> Self {
+        let mut n_entries_left = MAX_TABLE_ENTRIES;
+        let weighted = schema.attributes().iter().zip(weights.as_slice()).enumerate();
+        let active = weighted.filter(|(_, (_, weight))| **weight > 0.0).map(|(position, (attribute, weight))| {
+            let domain = states.domain(position);
+            let (rows, observed) = number_observed(demonstration, position);
+            let n_entries = (1 + observed.len()).saturating_mul(domain.len());
+            let mut active =
+                ActiveAttribute { position, attribute, weight: *weight, rows, observed, domain, table: Vec::new() };
+            if n_entries <= n_entries_left {
+                n_entries_left -= n_entries;
+                active.fill_table();
+            }
+            active
+        });
+        Self { states, active: active.filter(|active| !active.observed.is_empty()).collect() }
+    }
+
+    /// `D(o_i, s)`. Finite, at least 0.
+    #[inline]
+    pub(crate) fn distance(&self, observation: usize, state: StateIdx) -> f64 {
+        let row = self.states.row(state);
+        self.active.iter().map(|active| active.term(observation, row[active.position])).sum()
+    }
+
+    /// The terms of `D(o_i, s)`, in schema order; attributes that take no part are left out.
+    pub(crate) fn terms(&self, observation: usize, state: StateIdx) -> impl Iterator<Item = (usize, f64)> {
+        let row = self.states.row(state);
+        self.active.iter().map(move |active| (active.position, active.term(observation, row[active.position])))
+    }
+
+    /// What the attribute at `position` adds to the distance for the value at `value` of its domain; 0 if it takes
+    /// no part.
+    pub(crate) fn term(&self, position: usize, observation: usize, value: u32) -> f64 {
+        let active = self.active.iter().find(|active| active.position == position);
+        active.map_or(0.0, |active| active.term(observation, value))
+    }
+
+    /// Whether the attribute at `position` takes part.
+    pub(crate) fn is_active(&self, position: usize) -> bool {
+        self.active.iter().any(|active| active.position == position)
+    }
+}
+
+impl ActiveAttribute<'_> {
+    #[inline]
+    fn term(&self, observation: usize, value: u32) -> f64 {
+        let (row, value) = (self.rows[observation] as usize, value as usize);
+        match self.table.get(row * self.domain.len() + value) {
+            Some(term) => *term,
+            None if row == 0 => 0.0,
+            None => self.attribute.term(self.weight, &self.observed[row - 1], &self.domain[value]),
+        }
+    }
+
+    fn fill_table(&mut self) {
+        self.table.reserve_exact((1 + self.observed.len()) * self.domain.len());
+        self.table.extend(std::iter::repeat_n(0.0, self.domain.len()));
+        for observed in &self.observed {
+            let terms = self.domain.iter().map(|own| self.attribute.term(self.weight, observed, own));
+            self.table.extend(terms);
+        }
+    }
+}
+
+/// Numbers the distinct values that a demonstration shows of the attribute at `position`: per observation its
+/// number plus 1, or 0 if it was not seen; and the values.
+fn number_observed(demonstration: &Demonstration, position: usize) -> (Vec<u32>, Vec<Value>) {
+    let mut numbers: FxHashMap<&Value, u32> = FxHashMap::default();
+    let mut observed = Vec::new();
+    let rows = (0..demonstration.len()).map(|i| {
+        let Some(value) = &demonstration.observation(i)[position] else { return 0 };
+        *numbers.entry(value).or_insert_with(|| {
+            observed.push(value.clone());
+            #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
+            let number = observed.len() as u32;
+            number
+        })
+    });
+    (rows.collect(), observed)
+}

@@ -1,0 +1,54 @@
+//! Estimates of what is still to be paid from a node to the end.
+//!
+//! | name | admissible | consistent | made of |
+//! |---|---|---|---|
+//! | `default` | yes | yes | exact costs of small projected problems ([`projection`]) |
+//! | `none` | yes | yes | nothing: A* becomes Dijkstra's algorithm |
+//! | `paper` | no | no | differences and least action cost ([`paper`]) |
+
+pub(super) mod paper;
+pub(super) mod projection;
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::model::StateIdx;
+
+/// An estimate of the cost from a node to the end of the demonstration.
+///
+/// *Admissible*: never above the least cost of a completion; a search with it finds the optimum. *Consistent*: along no
+/// move does it fall by more than the move's cost; a search with it expands no node twice.
+pub(super) trait Heuristic {
+    /// Estimated cost from `(observation, state)` to the end. Finite, at least 0; 0 at the last observation.
+    fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64;
+}
+
+/// Estimates nothing.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Blind;
+
+impl Heuristic for Blind {
+    #[inline]
+    fn cost_to_go(&self, _: usize, _: StateIdx) -> f64 {
+        0.0
+    }
+}
+
+/// Which estimate guides a search.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum HeuristicName {
+    /// Exact costs of the problem projected on its attributes: admissible and consistent.
+    #[default]
+    Default,
+    /// The paper's own estimate, which can miss the optimum; for reproduction.
+    Paper,
+    /// No estimate: Dijkstra's algorithm.
+    None,
+}
+
+impl HeuristicName {
+    /// Every heuristic, by its name in JSON.
+    pub const ALL: [(&'static str, Self); 3] =
+        [("default", Self::Default), ("paper", Self::Paper), ("none", Self::None)];
+}

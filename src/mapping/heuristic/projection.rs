@@ -1,0 +1,322 @@
+//! Lower bounds from projected problems, with costs partitioned among them.
+//!
+//! Keep of every state only a *group* of its attributes, and what is left is a small graph of classes, in which the
+//! demonstration can be followed exactly. Doing so for several disjoint groups and adding up gives a lower bound of the whole
+//! cost, if no cost is counted twice:
+//!
+//! - distances are sums over attributes, so each group pays the terms of its own;
+//! - the cost of an action is split evenly among the groups that the transition changes. A group that it does not
+//!   change moves for nothing, which is the projected `skip`.
+//!
+//! Every move of the real problem is then, in each group, a projected move, and the projected costs add up to at most
+//! the real one. Hence the sum of the exact projected costs-to-go is admissible, and, as it satisfies the triangle inequality of
+//! each projection, consistent (Holte, Felner, Newton, Meshulam & Furcy 2006, on additive pattern databases; Katz & Domshlak 2010,
+//! on cost partitioning).
+
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
+
+use rustc_hash::{FxHashMap, FxHashSet};
+
+use super::Heuristic;
+use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::mapping::Problem;
+use crate::model::{ActionIdx, Model, StateIdx};
+
+/// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
+#[derive(Debug)]
+pub(crate) struct Projections {
+    groups: Vec<Group>,
+    /// Distinct sets of groups that some transition changes.
+    change_sets: Vec<Vec<u16>>,
+}
+
+/// A model, projected on some of its attributes.
+#[derive(Debug)]
+struct Group {
+    /// Positions of the attributes, ascending.
+    attributes: Vec<usize>,
+    /// The class of each state. Shape `[n_states]`.
+    class_of: Vec<ClassIdx>,
+    /// The domain indices of each class's values. Shape `[n_classes, attributes.len()]`.
+    class_rows: Vec<u32>,
+    /// Distinct ways to change the class.
+    edges: Vec<ProjectedEdge>,
+}
+
+type ClassIdx = u32;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+struct ProjectedEdge {
+    from: ClassIdx,
+    to: ClassIdx,
+    action: ActionIdx,
+    /// Which groups change together with this one: an index into the change sets.
+    change_set: u32,
+}
+
+impl Projections {
+    /// Projects `model` on each of its attributes that varies.
+    pub(crate) fn new(model: &Model) -> Self {
+        let states = model.states();
+        let varies = |attribute: &usize| states.domain(*attribute).len() > 1;
+        let mut groups: Vec<Group> =
+            (0..model.schema().len()).filter(varies).map(|attribute| Group::new(model, &[attribute])).collect();
+
+        let mut change_sets: Vec<Vec<u16>> = Vec::new();
+        let mut numbers: FxHashMap<Vec<u16>, u32> = FxHashMap::default();
+        let mut edges: Vec<FxHashSet<ProjectedEdge>> = vec![FxHashSet::default(); groups.len()];
+        let mut changed = Vec::new();
+        for (from, transition) in model.graph().iter() {
+            let is_changed = |group: &Group| group.class(from) != group.class(transition.to);
+            changed.clear();
+            changed.extend(groups.iter().zip(0u16..).filter(|(group, _)| is_changed(group)).map(|(_, number)| number));
+            let change_set = numbers.get(&changed).copied().unwrap_or_else(|| {
+                #[expect(clippy::cast_possible_truncation, reason = "at most one per transition, fewer than 2^32")]
+                let number = change_sets.len() as u32;
+                numbers.insert(changed.clone(), number);
+                change_sets.push(changed.clone());
+                number
+            });
+            for number in &changed {
+                let group = &groups[usize::from(*number)];
+                let (from, to) = (group.class(from), group.class(transition.to));
+                edges[usize::from(*number)].insert(ProjectedEdge { from, to, action: transition.action, change_set });
+            }
+        }
+        for (group, edges) in groups.iter_mut().zip(edges) {
+            group.edges = edges.into_iter().collect();
+            // The order of a hash set must not reach the results.
+            group.edges.sort_unstable();
+        }
+        Self { groups, change_sets }
+    }
+
+    /// Approximate size in memory, in bytes.
+    pub(crate) fn size_bytes(&self) -> usize {
+        self.groups.iter().map(Group::size_bytes).sum()
+    }
+}
+
+impl Group {
+    fn new(model: &Model, attributes: &[usize]) -> Self {
+        let states = model.states();
+        let mut classes: FxHashMap<Vec<u32>, ClassIdx> = FxHashMap::default();
+        let mut class_rows = Vec::new();
+        let mut key = Vec::with_capacity(attributes.len());
+        let class_of = (0..states.len()).map(|state| {
+            let row = states.row(state);
+            key.clear();
+            key.extend(attributes.iter().map(|attribute| row[*attribute]));
+            classes.get(&key).copied().unwrap_or_else(|| {
+                #[expect(clippy::cast_possible_truncation, reason = "at most one per state")]
+                let class = classes.len() as ClassIdx;
+                classes.insert(key.clone(), class);
+                class_rows.extend_from_slice(&key);
+                class
+            })
+        });
+        let class_of = class_of.collect();
+        Self { attributes: attributes.to_vec(), class_of, class_rows, edges: Vec::new() }
+    }
+
+    fn class(&self, state: StateIdx) -> ClassIdx {
+        self.class_of[state as usize]
+    }
+
+    fn n_classes(&self) -> usize {
+        self.class_rows.len() / self.attributes.len()
+    }
+
+    /// What the group's attributes add to the distance of the observation `i` and the class `class`.
+    fn term(&self, problem: &Problem<'_>, i: usize, class: usize) -> f64 {
+        let row = &self.class_rows[class * self.attributes.len()..];
+        let values = self.attributes.iter().zip(row);
+        values.map(|(attribute, value)| problem.distances.term(*attribute, i, *value)).sum()
+    }
+
+    fn size_bytes(&self) -> usize {
+        size_of_val(self.class_of.as_slice())
+            + size_of_val(self.class_rows.as_slice())
+            + size_of_val(self.edges.as_slice())
+    }
+}
+
+/// The sum of exact costs-to-go in the projections, for one problem.
+#[derive(Debug)]
+pub(crate) struct Projected<'m> {
+    tables: Vec<Table<'m>>,
+}
+
+#[derive(Debug)]
+struct Table<'m> {
+    group: &'m Group,
+    /// Shape `[n_observations, n_classes]`.
+    cost_to_go: Vec<f64>,
+}
+
+/// Most entries of a table: 128 MB. A group that would need more is left out, which keeps the bound a bound.
+const MAX_TABLE_ENTRIES: usize = 1 << 24;
+
+impl<'m> Projected<'m> {
+    /// Solves the projected problems, backwards over the demonstration. `None` if `interrupt` said to finish first.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    pub(crate) fn solve(
+        projections: &'m Projections,
+        problem: &Problem<'_>,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<Self>, Cancelled> {
+        let n_observations = problem.demonstration.len();
+        // A group whose attributes weigh nothing would take its share of the actions' costs to no purpose.
+        let is_used = |group: &Group| {
+            group.attributes.iter().any(|attribute| problem.distances.is_active(*attribute))
+                && n_observations.saturating_mul(group.n_classes()) <= MAX_TABLE_ENTRIES
+        };
+        let used: Vec<bool> = projections.groups.iter().map(is_used).collect();
+        let n_sharing: Vec<f64> = projections
+            .change_sets
+            .iter()
+            .map(|groups| f64::from(groups.iter().map(|group| u32::from(used[usize::from(*group)])).sum::<u32>()))
+            .collect();
+        let mut tables = Vec::new();
+        for (group, _) in projections.groups.iter().zip(used).filter(|(_, is_used)| *is_used) {
+            let share =
+                |edge: &ProjectedEdge| problem.model.action(edge.action).cost / n_sharing[edge.change_set as usize];
+            match Table::solve(group, problem, share, interrupt)? {
+                Some(table) => tables.push(table),
+                None => return Ok(None),
+            }
+        }
+        Ok(Some(Self { tables }))
+    }
+}
+
+impl Heuristic for Projected<'_> {
+    #[inline]
+    fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64 {
+        self.tables.iter().map(|table| table.cost_to_go(observation, state)).sum()
+    }
+}
+
+impl<'m> Table<'m> {
+    #[inline]
+    fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64 {
+        self.cost_to_go[observation * self.group.n_classes() + self.group.class(state) as usize]
+    }
+
+    /// With `N_i(v) = term(i+1, v) + H_{i+1}(v)`, what it costs to be next at class `v`:
+    ///
+    /// ```text
+    /// H_n(v) = 0
+    /// H_i(v) = min( N_i(v),                              skip
+    ///               share(v, v') + N_i(v'),              match
+    ///               share(v, v') + term(i, v') + H_i(v') extra )
+    /// ```
+    ///
+    /// The last row refers to the same observation, so each observation is one pass of Dijkstra's algorithm.
+    fn solve(
+        group: &'m Group,
+        problem: &Problem<'_>,
+        share: impl Fn(&ProjectedEdge) -> f64,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<Self>, Cancelled> {
+        let (n_observations, n_classes) = (problem.demonstration.len(), group.n_classes());
+        let predecessors = Predecessors::new(n_classes, &group.edges, share);
+        let mut cost_to_go = vec![0.0; n_observations * n_classes];
+        let terms = |i: usize| (0..n_classes).map(move |class| group.term(problem, i, class));
+        let mut next: Vec<f64> = vec![0.0; n_classes];
+        let mut here: Vec<f64> = terms(problem.last()).collect();
+        let mut open = BinaryHeap::new();
+        for i in (0..problem.last()).rev() {
+            match interrupt.poll() {
+                Signal::Continue => {}
+                Signal::Finish => return Ok(None),
+                Signal::Cancel => return Err(Cancelled),
+            }
+            let (row, row_after) = cost_to_go[i * n_classes..(i + 2) * n_classes].split_at_mut(n_classes);
+            for class in 0..n_classes {
+                next[class] = here[class] + row_after[class];
+            }
+            here.clear();
+            here.extend(terms(i));
+            row.copy_from_slice(&next);
+            for (class, cost) in next.iter().enumerate() {
+                for (from, share) in predecessors.of(class) {
+                    let from = &mut row[*from as usize];
+                    *from = from.min(share + cost);
+                }
+            }
+            open.extend(row.iter().zip(0..).map(|(cost, class)| Open { cost: *cost, class }));
+            while let Some(Open { cost, class }) = open.pop() {
+                if cost > row[class as usize] {
+                    continue;
+                }
+                for (from, share) in predecessors.of(class as usize) {
+                    let extra = share + here[class as usize] + cost;
+                    if extra < row[*from as usize] {
+                        row[*from as usize] = extra;
+                        open.push(Open { cost: extra, class: *from });
+                    }
+                }
+            }
+        }
+        Ok(Some(Self { group, cost_to_go }))
+    }
+}
+
+/// The ways into each class, cheapest of each origin.
+struct Predecessors {
+    /// `offsets[v]..offsets[v + 1]` are the edges into `v`. Shape `[n_classes + 1]`.
+    offsets: Vec<usize>,
+    edges: Vec<(ClassIdx, f64)>,
+}
+
+impl Predecessors {
+    fn new(n_classes: usize, edges: &[ProjectedEdge], share: impl Fn(&ProjectedEdge) -> f64) -> Self {
+        let mut into: Vec<_> = edges.iter().map(|edge| (edge.to, edge.from, share(edge))).collect();
+        into.sort_unstable_by(|a, b| (a.0, a.1).cmp(&(b.0, b.1)).then(a.2.total_cmp(&b.2)));
+        into.dedup_by_key(|(to, from, _)| (*to, *from));
+        let mut offsets = vec![0; n_classes + 1];
+        for (to, _, _) in &into {
+            offsets[*to as usize + 1] += 1;
+        }
+        for class in 0..n_classes {
+            offsets[class + 1] += offsets[class];
+        }
+        Self { offsets, edges: into.into_iter().map(|(_, from, share)| (from, share)).collect() }
+    }
+
+    fn of(&self, class: usize) -> &[(ClassIdx, f64)] {
+        &self.edges[self.offsets[class]..self.offsets[class + 1]]
+    }
+}
+
+/// An entry of the open list; the greatest is the cheapest.
+#[derive(Clone, Copy)]
+struct Open {
+    cost: f64,
+    class: ClassIdx,
+}
+
+impl Ord for Open {
+    fn cmp(&self, other: &Self) -> Ordering {
+        other.cost.total_cmp(&self.cost).then_with(|| other.class.cmp(&self.class))
+    }
+}
+
+impl PartialOrd for Open {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Open {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+
+impl Eq for Open {}

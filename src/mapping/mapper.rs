@@ -1,0 +1,183 @@
+//! A model prepared for mapping.
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::Problem;
+use super::completion::{Extras, complete};
+use super::cost::{Cost, cost_of};
+use super::heuristic::paper::Paper;
+use super::heuristic::projection::{Projected, Projections};
+use super::heuristic::{Blind, Heuristic, HeuristicName};
+use super::search::{Found, Move, search};
+use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
+use crate::model::Model;
+
+/// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Budget {
+    /// Most nodes expanded.
+    pub max_expansions: u64,
+    /// Most nodes kept in memory, about 64 bytes each.
+    pub max_nodes: usize,
+}
+
+impl Budget {
+    /// Any number of expansions, within 16 million nodes: about 1 GB.
+    pub const DEFAULT: Self = Self { max_expansions: u64::MAX, max_nodes: 16_000_000 };
+}
+
+impl Default for Budget {
+    fn default() -> Self {
+        Self::DEFAULT
+    }
+}
+
+/// How a mapping is searched for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Settings {
+    /// What guides the search.
+    pub heuristic: HeuristicName,
+    /// What it may spend.
+    pub budget: Budget,
+}
+
+/// What was proven of a mapping.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Status {
+    /// No mapping costs less.
+    Optimal,
+    /// No mapping costs less than `lower_bound`: a budget ran out, or the heuristic proves nothing.
+    Bounded,
+    /// Nothing: a finite lookahead decided.
+    Local,
+}
+
+impl Status {
+    /// The status, as in JSON.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Optimal => "optimal",
+            Self::Bounded => "bounded",
+            Self::Local => "local",
+        }
+    }
+}
+
+/// The best sequence of imitator states and actions that was found for a demonstration, with its alignment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mapping {
+    /// The steps, from [`Start`](super::MoveKind::Start) to the last observation.
+    pub moves: Vec<Move>,
+    /// What they cost.
+    pub cost: Cost,
+    /// What was proven.
+    pub status: Status,
+    /// No mapping costs less. Equal to `cost.total` if optimal; `None` if local.
+    pub lower_bound: Option<f64>,
+    /// Nodes expanded.
+    pub n_expanded: u64,
+    /// Successors looked at.
+    pub n_generated: u64,
+}
+
+/// A model, and what is computed once per model to search it.
+#[derive(Debug)]
+pub struct Mapper {
+    model: Model,
+    projections: Projections,
+}
+
+impl Mapper {
+    /// Prepares `model`. Takes time and memory proportional to its states and transitions times attributes.
+    #[must_use]
+    pub fn new(model: Model) -> Self {
+        let projections = Projections::new(&model);
+        Self { model, projections }
+    }
+
+    /// The model.
+    #[must_use]
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// Approximate size in memory, in bytes.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        self.model.size_bytes() + self.projections.size_bytes()
+    }
+
+    /// The cheapest mapping of `problem`, which must be of this mapper's model; the best one found if the budget runs out or
+    /// `interrupt` says to finish. Deterministic but for where `interrupt` cuts it off.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    ///
+    /// # Panics
+    ///
+    /// If `problem` is of another model.
+    pub fn map(
+        &self,
+        problem: &Problem<'_>,
+        settings: Settings,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        assert!(std::ptr::eq(problem.model, &raw const self.model), "the problem must be of this mapper's model");
+        let budget = settings.budget;
+        match settings.heuristic {
+            HeuristicName::Default => match Projected::solve(&self.projections, problem, interrupt)? {
+                Some(projected) => admissible(problem, &projected, budget, interrupt),
+                // No time for the estimate, so none for a search either.
+                None => admissible(problem, &Blind, Budget { max_expansions: 0, ..budget }, &mut Uninterrupted),
+            },
+            HeuristicName::None => admissible(problem, &Blind, budget, interrupt),
+            HeuristicName::Paper => {
+                let paper = Paper::new(problem);
+                let found = search(problem, &paper, budget, interrupt)?;
+                // The paper's estimate proves nothing; the projections bound the optimum all the same.
+                let first = problem.distances.distance(0, problem.start);
+                let projected = Projected::solve(&self.projections, problem, interrupt)?;
+                let to_go = projected.map_or(0.0, |projected| projected.cost_to_go(0, problem.start));
+                Ok(conclude(problem, &paper, found, first + to_go))
+            }
+        }
+    }
+}
+
+fn admissible<H: Heuristic>(
+    problem: &Problem<'_>,
+    heuristic: &H,
+    budget: Budget,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Mapping, Cancelled> {
+    let found = search(problem, heuristic, budget, interrupt)?;
+    let lower_bound = if found.is_complete { f64::INFINITY } else { found.least_f };
+    Ok(conclude(problem, heuristic, found, lower_bound))
+}
+
+/// Completes what was found, and says what is proven if no mapping costs less than `lower_bound`.
+fn conclude<H: Heuristic>(problem: &Problem<'_>, heuristic: &H, found: Found, lower_bound: f64) -> Mapping {
+    /// Sums in different orders may differ by rounding; what is closer than this, relatively, is the same.
+    const ROUNDING: f64 = 1e-12;
+    let Found { paths, is_complete, n_expanded, n_generated, .. } = found;
+    let completed = paths.into_iter().flat_map(|path| {
+        let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };
+        ways.iter().map(move |extras| complete(problem, heuristic, *extras, path.clone()))
+    });
+    let costed = completed.map(|moves| (cost_of(problem, &moves), moves));
+    let best = costed.min_by(|(cost, _), (other, _)| cost.total.total_cmp(&other.total));
+    let (cost, moves) = best.expect("a search gives at least one path");
+    let is_optimal = cost.total * (1.0 - ROUNDING) <= lower_bound;
+    Mapping {
+        moves,
+        cost,
+        status: if is_optimal { Status::Optimal } else { Status::Bounded },
+        lower_bound: Some(if is_optimal { cost.total } else { lower_bound }),
+        n_expanded,
+        n_generated,
+    }
+}

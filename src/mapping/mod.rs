@@ -1,0 +1,48 @@
+//! Mapping: the imitator's best way to follow a demonstration.
+//!
+//! A node is a pair `(i, s)` of an observation index and an imitator's state. A mapping starts at `(0, s_0)` at cost
+//! `D(o_0, s_0)`, ends at any `(n, s)`, and consists of these moves:
+//!
+//! | move | from -> to | cost |
+//! |---|---|---|
+//! | `match` | action a: `(i, s) -> (i+1, s')` | `A(a) + D(o_{i+1}, s')` |
+//! | `extra` | action a: `(i, s) -> (i, s')` | `A(a) + D(o_i, s')` |
+//! | `skip` | no action: `(i, s) -> (i+1, s)` | `D(o_{i+1}, s)` |
+//!
+//! That is dynamic time warping of a sequence against a walk in a graph (Gudla & Huber, "Cost-Based Policy Mapping for
+//! Imitation", FLAIRS 2003). Skipping everything is always possible, so a mapping always exists.
+//!
+//! ```text
+//! Problem (model, demonstration, weights, start)
+//!    |                     Projections (per model) --> heuristic
+//!    v                                                     |
+//! Mapper::map ---- search (A*) <---------------------------+
+//!    |                |  budget over: completion (greedy)
+//!    v                v
+//! Mapping (moves, status, lower bound, counts) --> Policy (what a client gets)
+//! ```
+//!
+//! **Ties.** Among mappings of equal cost the search returns the one that it reaches first, which is determined: it
+//! expands nodes in the order of `f`, then the later observation, then the most recently found; keeps the first way found
+//! to a node at its least cost; and finds successors in the order `skip`, then by action `match` before `extra`.
+//! Costs are compared as the sums of floats along the path.
+
+mod completion;
+mod cost;
+mod demonstration;
+mod distances;
+mod heuristic;
+mod mapper;
+mod policy;
+mod problem;
+mod request;
+mod search;
+
+pub use cost::Cost;
+pub use demonstration::Demonstration;
+pub use heuristic::HeuristicName;
+pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
+pub use policy::{Coverage, Policy, SearchReport, Stamp, Step};
+pub use problem::Problem;
+pub use request::{ObservationDocument, ObservedDocument, Request, RequestDocument, StartReference};
+pub use search::{Move, MoveKind};

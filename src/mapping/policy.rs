@@ -1,0 +1,175 @@
+//! Policies: what the imitator executes, and why.
+
+use std::sync::Arc;
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::cost::{Cost, CostSum};
+use super::{Mapping, MoveKind, Problem, Status};
+use crate::attribute::{ByAttribute, Scalar};
+
+/// What produced a policy, as far as its problem and mapping do not tell.
+#[derive(Clone, Debug, Default)]
+pub struct Stamp {
+    /// Under which the policy is stored.
+    pub id: Option<String>,
+    /// Name of the model.
+    pub model: String,
+    /// Hash of the model's content.
+    pub model_hash: String,
+    /// Wall-clock time of the search, in microseconds.
+    pub elapsed_us: u64,
+}
+
+/// What the imitator executes: the mapping's steps and costs, stamped with what produced it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Policy {
+    /// Under which it is stored; `null` if it is not.
+    #[schema(example = "01938d3e-5c7a-7cc0-9f6e-1f2a3b4c5d6e")]
+    pub id: Option<String>,
+    /// Name of the model.
+    #[schema(example = "figure-4")]
+    pub model: String,
+    /// SHA-256 of the model's content.
+    pub model_hash: String,
+    /// The learner whose weights were used, if any.
+    pub learner: Option<String>,
+    /// The version of the learner's weights.
+    pub weights_version: Option<u64>,
+    /// The weights of the distance.
+    #[schema(value_type = BTreeMap<String, f64>)]
+    pub weights: ByAttribute<f64>,
+    /// How many observations past the current one a decision could wait for; `null`: all.
+    pub lookahead: Option<u32>,
+    /// What was proven.
+    pub status: Status,
+    /// What the mapping costs.
+    pub cost: Cost,
+    /// No mapping costs less. `null` if nothing is known.
+    pub lower_bound: Option<f64>,
+    /// The actions to execute, in order.
+    #[schema(value_type = Vec<String>, example = json!(["turn_left", "forward"]))]
+    pub actions: Vec<Arc<str>>,
+    /// Every step, the first being the start.
+    pub steps: Vec<Step>,
+    /// How much of the demonstration was met exactly.
+    pub coverage: Coverage,
+    /// What the search took.
+    pub search: SearchReport,
+}
+
+/// A step of a policy. Executing it means keyed by `(observation, state)`, never by the state alone: a state may be passed
+/// again later.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
+pub struct Step {
+    /// Counted from 0.
+    pub step: u32,
+    /// The observation that the step belongs to, counted from 0.
+    pub observation: u32,
+    /// How it advances.
+    #[serde(rename = "move")]
+    pub kind: MoveKind,
+    /// The action taken, if any.
+    #[schema(value_type = Option<String>)]
+    pub action: Option<Arc<str>>,
+    /// The imitator's state after the step.
+    #[schema(value_type = BTreeMap<String, Scalar>)]
+    pub state: ByAttribute<Scalar>,
+    /// The index of that state in the model.
+    pub state_index: u32,
+    /// Cost of the action.
+    pub action_cost: f64,
+    /// Weighted distance between the observation and the state.
+    pub distance: f64,
+    /// The distance's terms by attribute; those that are 0 are left out.
+    #[schema(value_type = BTreeMap<String, f64>)]
+    pub distance_by_attribute: ByAttribute<f64>,
+    /// Cost of the steps up to and including this one.
+    pub cost: f64,
+}
+
+/// How much of a demonstration was met exactly.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct Coverage {
+    /// How many observations there were.
+    pub observed: u32,
+    /// How many of them some step meets at distance 0.
+    pub exact: u32,
+}
+
+/// What a search took.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+pub struct SearchReport {
+    /// Nodes expanded.
+    pub expanded: u64,
+    /// Successors looked at.
+    pub generated: u64,
+    /// Wall-clock time, in microseconds.
+    pub elapsed_us: u64,
+}
+
+impl Policy {
+    /// The policy of `mapping`, which must be of `problem`.
+    #[must_use]
+    pub fn new(stamp: Stamp, problem: &Problem<'_>, mapping: &Mapping) -> Self {
+        let steps = steps(problem, mapping);
+        let n_observed = problem.demonstration.len();
+        let mut is_exact = vec![false; n_observed];
+        for step in steps.iter().filter(|step| step.distance == 0.0) {
+            is_exact[step.observation as usize] = true;
+        }
+        let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
+        Self {
+            id: stamp.id,
+            model: stamp.model,
+            model_hash: stamp.model_hash,
+            learner: None,
+            weights_version: None,
+            weights: problem.model.schema().by_attribute(problem.weights.as_slice().iter().copied()),
+            lookahead: None,
+            status: mapping.status,
+            cost: mapping.cost,
+            lower_bound: mapping.lower_bound,
+            actions: steps.iter().filter_map(|step| step.action.clone()).collect(),
+            steps,
+            coverage: Coverage {
+                observed: count(n_observed),
+                exact: count(is_exact.iter().filter(|is_exact| **is_exact).count()),
+            },
+            search: SearchReport {
+                expanded: mapping.n_expanded,
+                generated: mapping.n_generated,
+                elapsed_us: stamp.elapsed_us,
+            },
+        }
+    }
+}
+
+fn steps(problem: &Problem<'_>, mapping: &Mapping) -> Vec<Step> {
+    let (model, schema) = (problem.model, problem.model.schema());
+    let mut sum = CostSum::default();
+    let moves = mapping.moves.iter().zip(0..);
+    let steps = moves.map(|(step, number)| {
+        let action_cost = step.action.map_or(0.0, |action| model.action(action).cost);
+        let i = step.observation as usize;
+        let distance = problem.distances.distance(i, step.state);
+        let mut terms = vec![None; schema.len()];
+        for (position, term) in problem.distances.terms(i, step.state).filter(|(_, term)| *term > 0.0) {
+            terms[position] = Some(term);
+        }
+        Step {
+            step: number,
+            observation: step.observation,
+            kind: step.kind,
+            action: step.action.map(|action| model.action_name(action)),
+            state: model.describe(step.state),
+            state_index: step.state,
+            action_cost,
+            distance,
+            distance_by_attribute: schema.by_some_attributes(terms),
+            cost: sum.add(action_cost, distance).total,
+        }
+    });
+    steps.collect()
+}

@@ -1,0 +1,49 @@
+//! What a search is asked.
+
+use super::Demonstration;
+use super::distances::Distances;
+use crate::attribute::Weights;
+use crate::model::{Model, Start, StateIdx};
+
+/// A demonstration to be followed by a body, under given weights, from a given start.
+#[derive(Debug)]
+pub struct Problem<'m> {
+    pub(crate) model: &'m Model,
+    pub(crate) demonstration: Demonstration,
+    pub(crate) weights: Weights,
+    /// `s_0`.
+    pub(crate) start: StateIdx,
+    pub(crate) distances: Distances<'m>,
+}
+
+impl<'m> Problem<'m> {
+    /// A problem. `start` overrides the model's; without either, `s_0` is the candidate closest to `o_0`, the lowest
+    /// index among equals.
+    #[must_use]
+    pub fn new(model: &'m Model, demonstration: Demonstration, weights: Weights, start: Option<StateIdx>) -> Self {
+        let distances = Distances::new(model.schema(), model.states(), &demonstration, &weights);
+        let start = start.unwrap_or_else(|| match model.start() {
+            Start::State(state) => *state,
+            Start::Candidates(candidates) => closest(&distances, candidates.iter().copied()),
+            Start::Any => closest(&distances, (0..model.states().len()).filter(|state| !model.is_unsafe(*state))),
+        });
+        Self { model, demonstration, weights, start, distances }
+    }
+
+    /// Index of the last observation, `n`.
+    pub(crate) fn last(&self) -> usize {
+        self.demonstration.len() - 1
+    }
+
+    /// The least cost of an action; 0 if the body has none.
+    pub(crate) fn least_action_cost(&self) -> f64 {
+        self.model.actions().iter().map(|action| action.cost).reduce(f64::min).unwrap_or(0.0)
+    }
+}
+
+fn closest(distances: &Distances<'_>, candidates: impl Iterator<Item = StateIdx>) -> StateIdx {
+    let measured = candidates.map(|state| (distances.distance(0, state), state));
+    let closest = measured.min_by(|(d, state), (other_d, other)| d.total_cmp(other_d).then(state.cmp(other)));
+    // Readers of models see to it that there is a candidate.
+    closest.map_or(0, |(_, state)| state)
+}

@@ -1,0 +1,268 @@
+//! A* over nodes `(i, s)` (Hart, Nilsson & Raphael 1968).
+
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
+
+use rustc_hash::FxHashMap;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::heuristic::Heuristic;
+use super::{Budget, Problem};
+use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::model::{ActionIdx, StateIdx};
+
+/// How a step advances.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum MoveKind {
+    /// The first step: `s_0` against `o_0`.
+    Start,
+    /// An action, to the next observation.
+    Match,
+    /// An action, under the same observation.
+    Extra,
+    /// No action, to the next observation.
+    Skip,
+}
+
+/// A step of a mapping.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Move {
+    /// How it advances.
+    pub kind: MoveKind,
+    /// The action, unless `kind` is `Start` or `Skip`.
+    pub action: Option<ActionIdx>,
+    /// The observation after the step.
+    pub observation: u32,
+    /// The imitator's state after the step.
+    pub state: StateIdx,
+}
+
+/// What a search found.
+#[derive(Debug)]
+pub(super) struct Found {
+    /// The way from `(0, s_0)` to each of these nodes: one that ends at the last observation if `is_complete`, else the
+    /// most promising ones, all to be completed.
+    pub(super) paths: Vec<Vec<Move>>,
+    /// Whether the search came to its end.
+    pub(super) is_complete: bool,
+    /// Least `f` of what was not yet expanded: no mapping costs less if the heuristic is admissible.
+    pub(super) least_f: f64,
+    /// Nodes expanded, again counted if they were reached more cheaply later.
+    pub(super) n_expanded: u64,
+    /// Successors looked at.
+    pub(super) n_generated: u64,
+}
+
+/// How many nodes are expanded between two looks at the interrupt.
+const POLL_EVERY: u64 = 256;
+
+/// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows. A node is expanded again if a cheaper
+/// way to it is found, so the heuristic need not be consistent.
+///
+/// # Errors
+///
+/// [`Cancelled`] if `interrupt` said so.
+pub(super) fn search<H: Heuristic>(
+    problem: &Problem<'_>,
+    heuristic: &H,
+    budget: Budget,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Found, Cancelled> {
+    let last = problem.last();
+    let (graph, actions) = (problem.model.graph(), problem.model.actions());
+    let mut nodes = Nodes::new(problem.demonstration.len(), graph.n_states());
+    let mut open = BinaryHeap::new();
+    let (mut n_expanded, mut n_generated) = (0, 0);
+
+    let g = problem.distances.distance(0, problem.start);
+    let first = nodes.reach(Way { observation: 0, state: problem.start, g, action: NO_ACTION, parent: 0 });
+    open.extend(first.map(|id| Open { f: g + heuristic.cost_to_go(0, problem.start), g, observation: 0, id }));
+    // The farthest expanded node, and among those the most promising: where a search out of budget goes on greedily.
+    let mut farthest = Open { f: f64::INFINITY, g, observation: 0, id: 0 };
+
+    while let Some(entry) = open.pop() {
+        let node = *nodes.get(entry.id);
+        if entry.g > node.g {
+            continue;
+        }
+        let (i, state) = (node.observation as usize, node.state);
+        let found = |paths, is_complete| Found { paths, is_complete, least_f: entry.f, n_expanded, n_generated };
+        if i == last {
+            return Ok(found(vec![nodes.path(entry.id)], true));
+        }
+        let is_spent = n_expanded >= budget.max_expansions || nodes.len() >= budget.max_nodes;
+        let signal = if n_expanded % POLL_EVERY == 0 { interrupt.poll() } else { Signal::Continue };
+        match signal {
+            Signal::Cancel => return Err(Cancelled),
+            Signal::Continue if !is_spent => {}
+            Signal::Continue | Signal::Finish => {
+                let ends = [entry.id, farthest.id, 0];
+                return Ok(found(ends.map(|id| nodes.path(id)).to_vec(), false));
+            }
+        }
+        n_expanded += 1;
+        if (entry.observation, farthest.f) > (farthest.observation, entry.f) {
+            farthest = entry;
+        }
+
+        let mut reach = |i: usize, state: StateIdx, cost: f64, action: ActionIdx| {
+            n_generated += 1;
+            let g = node.g + cost + problem.distances.distance(i, state);
+            #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
+            let observation = i as u32;
+            if let Some(id) = nodes.reach(Way { observation, state, g, action, parent: entry.id }) {
+                open.push(Open { f: g + heuristic.cost_to_go(i, state), g, observation, id });
+            }
+        };
+        reach(i + 1, state, 0.0, NO_ACTION);
+        for transition in graph.successors(state) {
+            let cost = actions[usize::from(transition.action)].cost;
+            reach(i + 1, transition.to, cost, transition.action);
+            reach(i, transition.to, cost, transition.action);
+        }
+    }
+    unreachable!("every node before the last observation can be left by a skip")
+}
+
+/// Stands for "no action" in a node.
+const NO_ACTION: ActionIdx = ActionIdx::MAX;
+
+/// The cheapest way found so far to a node.
+#[derive(Clone, Copy, Debug)]
+struct Way {
+    /// Cost of the way, `g`.
+    g: f64,
+    /// Where it came from.
+    parent: NodeId,
+    state: StateIdx,
+    observation: u32,
+    /// How it came.
+    action: ActionIdx,
+}
+
+type NodeId = u32;
+
+/// The nodes that were found, and where each is.
+struct Nodes {
+    ways: Vec<Way>,
+    index: NodeIndex,
+    n_states: usize,
+}
+
+/// Finds the id of a node.
+enum NodeIndex {
+    /// By `i * n_states + s`, plus 1; 0 for none. Zeroed pages cost nothing until they are touched.
+    Dense(Vec<NodeId>),
+    /// For problems of which a dense index would be too large.
+    Sparse(FxHashMap<u64, NodeId>),
+}
+
+/// Most entries of a dense index: 256 MB.
+const MAX_DENSE_INDEX: usize = 1 << 26;
+
+impl Nodes {
+    fn new(n_observations: usize, n_states: usize) -> Self {
+        let n_nodes = n_observations.saturating_mul(n_states);
+        let index = if n_nodes <= MAX_DENSE_INDEX {
+            NodeIndex::Dense(vec![0; n_nodes])
+        } else {
+            NodeIndex::Sparse(FxHashMap::default())
+        };
+        Self { ways: Vec::new(), index, n_states }
+    }
+
+    fn len(&self) -> usize {
+        self.ways.len()
+    }
+
+    fn get(&self, id: NodeId) -> &Way {
+        &self.ways[id as usize]
+    }
+
+    /// Takes note of a way to a node. Gives the node's id if the way is cheaper than any before.
+    #[inline]
+    fn reach(&mut self, way: Way) -> Option<NodeId> {
+        #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
+        let next = self.ways.len() as NodeId;
+        let key = way.observation as usize * self.n_states + way.state as usize;
+        let id = match &mut self.index {
+            NodeIndex::Dense(ids) => {
+                let id = ids[key];
+                if id == 0 {
+                    ids[key] = next + 1;
+                    next
+                } else {
+                    id - 1
+                }
+            }
+            NodeIndex::Sparse(ids) => *ids.entry(key as u64).or_insert(next),
+        };
+        if id == next {
+            self.ways.push(way);
+            return Some(id);
+        }
+        let known = &mut self.ways[id as usize];
+        let is_cheaper = way.g < known.g;
+        if is_cheaper {
+            *known = way;
+        }
+        is_cheaper.then_some(id)
+    }
+
+    /// The way from the start to the node `id`.
+    fn path(&self, id: NodeId) -> Vec<Move> {
+        let mut moves = Vec::new();
+        let mut at = self.get(id);
+        loop {
+            let parent = self.get(at.parent);
+            let is_start = at.observation == 0 && at.action == NO_ACTION;
+            let kind = match (at.action == NO_ACTION, at.observation > parent.observation) {
+                _ if is_start => MoveKind::Start,
+                (true, _) => MoveKind::Skip,
+                (false, true) => MoveKind::Match,
+                (false, false) => MoveKind::Extra,
+            };
+            let action = (at.action != NO_ACTION).then_some(at.action);
+            moves.push(Move { kind, action, observation: at.observation, state: at.state });
+            if is_start {
+                moves.reverse();
+                return moves;
+            }
+            at = parent;
+        }
+    }
+}
+
+/// An entry of the open list. The greatest is expanded next: least `f`, then the later observation, then the most
+/// recently found.
+#[derive(Clone, Copy, Debug)]
+struct Open {
+    f: f64,
+    /// The node's `g` when this was pushed: stale if the node has become cheaper.
+    g: f64,
+    observation: u32,
+    id: NodeId,
+}
+
+impl Ord for Open {
+    fn cmp(&self, other: &Self) -> Ordering {
+        let key = |open: &Self| (open.observation, open.id);
+        other.f.total_cmp(&self.f).then_with(|| key(self).cmp(&key(other)))
+    }
+}
+
+impl PartialOrd for Open {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+impl PartialEq for Open {
+    fn eq(&self, other: &Self) -> bool {
+        self.cmp(other).is_eq()
+    }
+}
+
+impl Eq for Open {}

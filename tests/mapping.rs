@@ -1,0 +1,393 @@
+//! The mapping against the independent solver and the published figures.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::too_many_lines,
+    clippy::cast_possible_truncation,
+    reason = "tests may panic, and are read top to bottom"
+)]
+
+mod oracle;
+
+use std::collections::HashMap;
+
+use etude::document::{Faults, Place};
+use etude::interrupt::Uninterrupted;
+use etude::mapping::{Mapper, MoveKind, Policy, Request, Stamp, Status};
+use etude::model::{Act, Definition, Limits, Model};
+use proptest::prelude::*;
+use serde_json::{Value, json};
+
+fn example(path: &str) -> Value {
+    let path = format!("{}/examples/{path}", env!("CARGO_MANIFEST_DIR"));
+    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
+
+fn mapper(model: &Value) -> Mapper {
+    let definition = Definition::read(model, Limits::DEFAULT).unwrap();
+    Mapper::new(Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap())
+}
+
+fn solve(mapper: &Mapper, request: &Value) -> Policy {
+    let mut faults = Faults::default();
+    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let read = Request::read(mapper.model(), &object, &mut faults);
+    let request = faults.check(read).unwrap();
+    let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();
+    Policy::new(Stamp::default(), &request.problem, &mapping)
+}
+
+/// Checks everything that a policy promises about itself, against the model's JSON (`table` dynamics).
+fn check_policy(model: &Value, demonstration: &Value, weights: &Value, policy: &Policy) {
+    let dynamics = &model["dynamics"];
+    let actions: HashMap<&str, f64> = model["actions"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|action| (action["name"].as_str().unwrap(), action["cost"].as_f64().unwrap()))
+        .collect();
+    let is_transition = |from: u32, action: &str, to: u32| {
+        let mut transitions = dynamics["transitions"].as_array().unwrap().iter();
+        transitions.any(|t| t[0] == from && t[1] == action && t[2] == to)
+    };
+    let is_unsafe = |state: u32| dynamics["unsafe"].as_array().is_some_and(|listed| listed.contains(&json!(state)));
+
+    let steps = &policy.steps;
+    let mut total = 0.0;
+    for (n, step) in steps.iter().enumerate() {
+        assert_eq!(step.step as usize, n);
+        assert!(!is_unsafe(step.state_index), "step {n} enters an unsafe state");
+        let observation = &demonstration[step.observation as usize];
+        let state = &dynamics["states"][step.state_index as usize];
+        let d = oracle::distance(model, weights, observation, state);
+        assert!(close(step.distance, d), "step {n}: distance {} is {d} by definition", step.distance);
+        let explained: f64 = step.distance_by_attribute.iter().map(|(_, term)| term).sum();
+        assert!(close(explained, d), "step {n}: the terms add up to {explained}, not {d}");
+        if n == 0 {
+            assert_eq!((step.kind, step.observation, &step.action), (MoveKind::Start, 0, &None));
+        } else {
+            let before = &steps[n - 1];
+            let advance = step.observation - before.observation;
+            match step.kind {
+                MoveKind::Skip => {
+                    assert_eq!((advance, step.state_index, &step.action), (1, before.state_index, &None));
+                }
+                kind => {
+                    let action = step.action.as_deref().unwrap();
+                    assert!(is_transition(before.state_index, action, step.state_index), "step {n} is not legal");
+                    assert!(close(step.action_cost, actions[action]));
+                    assert_eq!(advance, u32::from(kind == MoveKind::Match));
+                    assert_ne!(kind, MoveKind::Start);
+                }
+            }
+        }
+        total += step.action_cost + step.distance;
+        assert!(close(step.cost, total), "step {n}: cumulative cost {} is not {total}", step.cost);
+    }
+    let last = steps.last().unwrap();
+    let n_observations = demonstration.as_array().unwrap().len();
+    assert_eq!(last.observation as usize, n_observations - 1, "the mapping ends at the last observation");
+    assert_eq!(last.cost.to_bits(), policy.cost.total.to_bits());
+    assert!(close(policy.cost.actions + policy.cost.distance, policy.cost.total));
+    let exact: std::collections::BTreeSet<u32> =
+        steps.iter().filter(|step| step.distance == 0.0).map(|step| step.observation).collect();
+    assert_eq!(policy.coverage.exact as usize, exact.len());
+    assert_eq!(policy.coverage.observed as usize, n_observations);
+    let taken: Vec<&str> = steps.iter().filter_map(|step| step.action.as_deref()).collect();
+    assert_eq!(policy.actions.iter().map(|action| &**action).collect::<Vec<_>>(), taken);
+}
+
+fn close(a: f64, b: f64) -> bool {
+    (a - b).abs() <= 1e-9 * (1.0 + a.abs().max(b.abs()))
+}
+
+fn attribute() -> impl Strategy<Value = Value> {
+    let weight = prop_oneof![Just(0.0), Just(1.0), 0.0..5.0];
+    let scale = prop_oneof![Just(1.0), 0.5..3.0];
+    (0..4, weight, scale).prop_map(|(kind, weight, scale)| match kind {
+        0 => json!({"kind": "number", "weight": weight, "scale": scale}),
+        1 => json!({"kind": "cyclic", "labels": ["a", "b", "c", "d", "e"], "weight": weight, "scale": scale}),
+        2 => json!({"kind": "cyclic", "period": 4.5, "weight": weight, "scale": scale}),
+        _ => json!({"kind": "category", "weight": weight}),
+    })
+}
+
+/// A value of an attribute, by a number from 0 to 4.
+fn value(attribute: &Value, n: usize) -> Value {
+    match (attribute["kind"].as_str().unwrap(), &attribute["labels"]) {
+        ("number", _) => json!([0.0, 1.0, 2.5, -1.0, 3.0][n]),
+        ("cyclic", Value::Array(labels)) => labels[n].clone(),
+        ("cyclic", _) => json!([0.0, 1.5, 4.0, -2.0, 11.25][n]),
+        _ => [json!("a"), json!(true), json!(1), json!("b"), json!(false)][n].clone(),
+    }
+}
+
+/// A model with `table` dynamics, a demonstration, weights and a start.
+fn problem() -> impl Strategy<Value = (Value, Value, Value, Option<usize>)> {
+    let attributes = prop::collection::vec(attribute(), 1..4);
+    let costs = prop::collection::vec(prop_oneof![Just(0.0), Just(0.3), Just(1.0), 0.0..2.0], 1..4);
+    (attributes, costs, 1usize..9).prop_flat_map(|(mut attributes, costs, n_states)| {
+        for (k, attribute) in attributes.iter_mut().enumerate() {
+            attribute["name"] = json!(format!("k{k}"));
+        }
+        let n_attributes = attributes.len();
+        let states = prop::collection::vec(prop::collection::vec(0usize..5, n_attributes), n_states);
+        let targets = prop::collection::vec(prop::option::weighted(0.6, 0..n_states), n_states * costs.len());
+        let observations =
+            prop::collection::vec(prop::collection::vec(prop::option::weighted(0.8, 0usize..5), n_attributes), 1..8);
+        let unsafe_states = prop::collection::vec(prop::bool::weighted(0.1), n_states);
+        let starts = (0..3, 0..n_states, prop::option::weighted(0.3, 0..n_states));
+        let weights = prop::option::of((0..n_attributes, prop_oneof![Just(0.0), Just(2.0), 0.0..4.0]));
+        (Just((attributes, costs)), states, targets, observations, unsafe_states, starts, weights).prop_map(build)
+    })
+}
+
+#[expect(clippy::type_complexity, reason = "the parts of a generated problem, used once")]
+fn build(
+    ((attributes, costs), states, targets, observations, unsafe_states, starts, weights): (
+        (Vec<Value>, Vec<f64>),
+        Vec<Vec<usize>>,
+        Vec<Option<usize>>,
+        Vec<Vec<Option<usize>>>,
+        Vec<bool>,
+        (i32, usize, Option<usize>),
+        Option<(usize, f64)>,
+    ),
+) -> (Value, Value, Value, Option<usize>) {
+    let n_states = states.len();
+    let (start_kind, model_start, request_start) = starts;
+    // Whatever may be a start is made safe.
+    let is_unsafe = |s: usize| unsafe_states[s] && s != model_start && Some(s) != request_start && s != 0;
+    let start = match start_kind {
+        0 => Value::Null,
+        1 => json!(model_start),
+        _ => json!([0, model_start]),
+    };
+    let actions: Vec<Value> =
+        costs.iter().enumerate().map(|(a, cost)| json!({"name": format!("a{a}"), "cost": cost})).collect();
+    let transitions: Vec<Value> = targets
+        .iter()
+        .enumerate()
+        .filter_map(|(n, to)| to.map(|to| json!([n / costs.len(), format!("a{}", n % costs.len()), to])))
+        .collect();
+    let states: Vec<Value> = states
+        .iter()
+        .map(|state| state.iter().zip(&attributes).map(|(n, attribute)| value(attribute, *n)).collect())
+        .collect();
+    let demonstration: Value = observations
+        .iter()
+        .enumerate()
+        .map(|(i, observation)| {
+            let seen = |k: usize| observation[k].map(|n| value(&attributes[k], n));
+            if i % 2 == 0 {
+                (0..attributes.len()).map(|k| seen(k).unwrap_or(Value::Null)).collect()
+            } else {
+                let named = (0..attributes.len()).filter_map(|k| seen(k).map(|value| (format!("k{k}"), value)));
+                Value::Object(named.collect())
+            }
+        })
+        .collect();
+    let weights = weights.map_or(json!({}), |(k, weight)| json!({format!("k{k}"): weight}));
+    let unsafe_states: Vec<usize> = (0..n_states).filter(|s| is_unsafe(*s)).collect();
+    let model = json!({
+        "attributes": attributes,
+        "actions": actions,
+        "dynamics":
+            {"kind": "table", "states": states, "transitions": transitions, "start": start, "unsafe": unsafe_states},
+    });
+    (model, demonstration, weights, request_start)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 3000, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn costs_equal_the_independent_solvers((model, demonstration, weights, start) in problem()) {
+        let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
+        let mapper = mapper(&model);
+        for heuristic in ["default", "none"] {
+            let request = json!({
+                "model": "m", "demonstration": demonstration, "weights": weights, "start": start, "heuristic": heuristic,
+            });
+            let policy = solve(&mapper, &request);
+            prop_assert!(close(policy.cost.total, optimum), "{heuristic}: {} against {optimum}", policy.cost.total);
+            prop_assert_eq!(policy.status, Status::Optimal);
+            check_policy(&model, &demonstration, &weights, &policy);
+        }
+    }
+
+    #[test]
+    fn a_budget_and_the_papers_heuristic_still_give_legal_mappings_and_true_bounds(
+        (model, demonstration, weights, start) in problem(),
+        max_expansions in 0u64..12,
+        heuristic in prop_oneof![Just("default"), Just("none"), Just("paper")],
+    ) {
+        let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
+        let mapper = mapper(&model);
+        let request = json!({
+            "model": "m", "demonstration": demonstration, "weights": weights, "start": start,
+            "heuristic": heuristic, "max_expansions": max_expansions,
+        });
+        let policy = solve(&mapper, &request);
+        check_policy(&model, &demonstration, &weights, &policy);
+        let bound = policy.lower_bound.unwrap();
+        prop_assert!(bound <= optimum + 1e-9 * (1.0 + optimum), "bound {bound} above the optimum {optimum}");
+        prop_assert!(optimum <= policy.cost.total + 1e-9 * (1.0 + optimum));
+        prop_assert!(policy.search.expanded <= max_expansions);
+        match policy.status {
+            Status::Optimal => prop_assert!(close(policy.cost.total, optimum) && bound == policy.cost.total),
+            Status::Bounded => prop_assert!(bound < policy.cost.total),
+            Status::Local => prop_assert!(false, "nothing here is local"),
+        }
+    }
+}
+
+/// A cave with up to three wumpi, pits and pieces of gold, a body, and a walk of a full body in the same cave.
+fn cave() -> impl Strategy<Value = (Value, Vec<usize>)> {
+    let cells = |most| prop::collection::vec((0u16..4, 0u16..3), 0..=most);
+    let body = prop::sample::subsequence(Act::ALL.to_vec(), 1..=6);
+    let walk = prop::collection::vec(0usize..6, 0..12);
+    let start = (0u16..4, 0u16..3, 0usize..4);
+    (cells(2), cells(3), cells(3), body, walk, start, 0u8..3).prop_map(
+        |(pits, wumpi, gold, body, walk, start, arrows)| {
+            let (x, y, heading) = start;
+            let away = |cells: Vec<(u16, u16)>| cells.into_iter().filter(|cell| *cell != (x, y)).collect::<Vec<_>>();
+            let actions: Vec<Value> = body.iter().map(|act| json!({"name": act.name(), "cost": 0.3})).collect();
+            let heading = ["east", "north", "west", "south"][heading];
+            let model = json!({
+                "actions": actions,
+                "dynamics": {
+                    "kind": "wumpus", "width": 4, "height": 3, "pits": away(pits), "wumpi": away(wumpi), "gold": gold,
+                    "start": {"x": x, "y": y, "heading": heading}, "arrows": arrows,
+                },
+            });
+            (model, walk)
+        },
+    )
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 150, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn a_cave_is_the_table_of_its_rules((model, walk) in cave()) {
+        let table = oracle::wumpus::as_table(&model);
+        let (cave_mapper, table_mapper) = (mapper(&model), mapper(&table));
+        let (a, b) = (cave_mapper.model(), table_mapper.model());
+        prop_assert_eq!(a.graph().n_states(), b.graph().n_states());
+        prop_assert!(a.graph().iter().eq(b.graph().iter()));
+        prop_assert!((0..a.states().len()).all(|state| a.describe(state) == b.describe(state)));
+
+        // The demonstrator has every action and walks as it likes, death excluded by the table.
+        let mut full = model.clone();
+        full["actions"] = Act::ALL.iter().map(|act| json!({"name": act.name(), "cost": 0.3})).collect();
+        let full = oracle::wumpus::as_table(&full);
+        let mut at = json!(0);
+        let mut demonstration = vec![full["dynamics"]["states"][0].clone()];
+        for act in walk {
+            let transitions = full["dynamics"]["transitions"].as_array().unwrap();
+            let taken = transitions.iter().find(|t| t[0] == at && t[1] == Act::ALL[act].name());
+            at = taken.map_or(at, |t| t[2].clone());
+            demonstration.push(full["dynamics"]["states"][at.as_u64().unwrap() as usize].clone());
+        }
+        let demonstration = Value::from(demonstration);
+        let optimum = oracle::optimal_cost(&table, &demonstration, &json!({}), None);
+        let policy = solve(&cave_mapper, &json!({"model": "m", "demonstration": demonstration}));
+        prop_assert!(close(policy.cost.total, optimum), "{} against {optimum}", policy.cost.total);
+        check_policy(&table, &demonstration, &json!({}), &policy);
+    }
+}
+
+/// The policy for an example, checked against the solver.
+fn example_policy(model: &str, demonstration: &str, weights: &Value) -> Policy {
+    let (model, demonstration) = (example(model), example(demonstration));
+    let request = json!({"model": "m", "demonstration": demonstration, "weights": weights});
+    let policy = solve(&mapper(&model), &request);
+    let table = if model["dynamics"]["kind"] == "wumpus" { oracle::wumpus::as_table(&model) } else { model };
+    check_policy(&table, &demonstration, weights, &policy);
+    assert!(close(policy.cost.total, oracle::optimal_cost(&table, &demonstration, weights, None)));
+    policy
+}
+
+#[test]
+fn the_figures_cost_what_was_published() {
+    let cost =
+        |model: &str, demonstration: &str, weights: &Value| example_policy(model, demonstration, weights).cost.total;
+    assert_eq!(cost("figure-4/model.json", "figure-4/demonstration.json", &json!({})), 48.0);
+    assert_eq!(cost("figure-6/model.json", "figure-6/demonstration.json", &json!({})), 10.0);
+    assert_eq!(cost("figure-6/model.json", "figure-6/demonstration.json", &json!({"gold": 3})), 20.1);
+    assert_eq!(cost("figure-8/model-l1.json", "figure-8/demonstration.json", &json!({})), 14.5);
+    assert_eq!(cost("figure-8/model-l1.json", "figure-8/demonstration.json", &json!({"gold": 6})), 18.6);
+}
+
+#[test]
+fn figure_4_goes_around_the_wumpus_and_carries_the_gold_out() {
+    let policy = example_policy("figure-4/model.json", "figure-4/demonstration.json", &json!({}));
+    assert_eq!((policy.cost.actions, policy.cost.distance), (6.0, 42.0));
+    // From the shot on, the demonstrator has an arrow less than a body that cannot shoot.
+    assert_eq!((policy.coverage.observed, policy.coverage.exact), (16, 1));
+    assert_eq!(policy.actions.last().map(|action| &**action), Some("climb"));
+    assert!(policy.actions.iter().any(|action| &**action == "grab"));
+}
+
+#[test]
+fn a_taxi_that_cannot_drive_west_fetches_the_passenger_and_stays() {
+    let demonstration = "taxi/demonstration.json";
+    let own = example_policy("taxi/model.json", demonstration, &json!({}));
+    assert_eq!((own.cost.total, own.cost.distance), (5.4, 0.0));
+    let no_west = example_policy("taxi/no-west.json", demonstration, &json!({}));
+    assert_eq!((no_west.cost.total, no_west.cost.actions), (71.9, 3.9));
+    let costly = example_policy("taxi/costly-pickup.json", demonstration, &json!({}));
+    assert_eq!((costly.cost.total, costly.cost.distance), (8.1, 0.0));
+}
+
+#[test]
+fn the_demonstrations_are_what_the_demonstrators_actions_do() {
+    let cases = [
+        ("figure-4/demonstrator.json", "figure-4/demonstration.json", "SFFFFFGLLFFFFFC"),
+        ("figure-6/demonstrator.json", "figure-6/demonstration.json", "SFFFGLLFFFC"),
+        ("figure-8/demonstrator-l1.json", "figure-8/demonstration.json", "FFLFFFGLLFFFRFFC"),
+        ("figure-8/demonstrator-l2.json", "figure-8/demonstration.json", "FFLFFFGLLFFFRFFC"),
+        ("figure-8/demonstrator-l3.json", "figure-8/demonstration.json", "FFLFFFGLLFFFRFFC"),
+        ("figure-8/demonstrator-l4.json", "figure-8/demonstration.json", "FFLFFFGLLFFFRFFC"),
+    ];
+    for (model, demonstration, acts) in cases {
+        let table = oracle::wumpus::as_table(&example(model));
+        let demonstration = example(demonstration);
+        let names: Vec<&str> =
+            table["attributes"].as_array().unwrap().iter().map(|a| a["name"].as_str().unwrap()).collect();
+        let mut at = json!(0);
+        for (n, observation) in demonstration.as_array().unwrap().iter().enumerate() {
+            if n > 0 {
+                let act = acts.as_bytes()[n - 1];
+                let name = match act {
+                    b'F' => "forward",
+                    b'L' => "turn_left",
+                    b'R' => "turn_right",
+                    b'S' => "shoot",
+                    b'G' => "grab",
+                    _ => "climb",
+                };
+                let transitions = table["dynamics"]["transitions"].as_array().unwrap();
+                let taken = transitions.iter().find(|t| t[0] == at && t[1] == name).unwrap();
+                at = taken[2].clone();
+            }
+            let state = &table["dynamics"]["states"][at.as_u64().unwrap() as usize];
+            for (k, name) in names.iter().enumerate().filter(|(_, name)| !observation[**name].is_null()) {
+                assert_eq!(observation[*name], state[k], "{model}: observation {n}, {name}");
+            }
+        }
+        assert_eq!(demonstration.as_array().unwrap().len(), acts.len() + 1);
+    }
+}
+
+#[test]
+fn the_papers_heuristic_misses_the_optimum_of_figure_8_at_l3() {
+    let mapper = mapper(&example("figure-8/model-l3.json"));
+    let request = |heuristic: &str| json!({"model": "m", "demonstration": example("figure-8/demonstration.json"), "heuristic": heuristic});
+    let optimal = solve(&mapper, &request("default"));
+    assert_eq!((optimal.cost.total, optimal.status), (14.4, Status::Optimal));
+    let paper = solve(&mapper, &request("paper"));
+    assert_eq!((paper.cost.total, paper.status), (14.5, Status::Bounded));
+    assert!(paper.lower_bound.unwrap() <= optimal.cost.total);
+}
