@@ -7,22 +7,41 @@
 //!
 //! # Architecture
 //!
-//! The core is pure: no I/O, no clock, no randomness of its own. Each module uses only those to its left.
+//! The core, on the left, is pure: no I/O, no clock, no randomness of its own. The shell, on the right, knows the world. Each
+//! module uses only those to its left.
 //!
 //! ```text
-//! document <- attribute <- model <- mapping
+//! interrupt, document <- attribute <- model <- mapping   |   store <- service <- http <- server <- cli
+//!                                                        |   config, telemetry
 //! ```
 //!
 //! | module | is |
 //! |---|---|
 //! | [`document`] | reading JSON with all its faults, each with its pointer |
+//! | [`interrupt`] | how a long computation is stopped from outside |
 //! | [`attribute`] | attributes of states: kinds, values, weights, distance |
 //! | [`model`] | what a body can do: `table` and `wumpus` dynamics, compiled to one state graph |
 //! | [`mapping`] | the cheapest way to follow a demonstration: problem, search, heuristics, policy |
-//! | [`interrupt`] | how a long computation is stopped from outside |
+//! | [`store`] | all SQL: one writer that groups commits, a pool of readers |
+//! | [`service`] | the application: models, policies, the bounded pool that searches run on |
+//! | [`http`] | routes, bodies, problem documents, the OpenAPI description |
+//! | [`server`] | the assembled program, from listening to clean shutdown |
+//! | [`cli`] | the subcommands |
+//! | [`config`], [`telemetry`] | settings, logs and measurements |
+//!
+//! A request for a policy passes `http::policies` (body), `service::policies` (model from `service::cache`, a place in
+//! `service::pool`), [`mapping::Request`] (faults), [`mapping::Mapper`] (search), [`mapping::Policy`] (answer), and
+//! `store::writer` (disk) before it is answered.
 
 pub mod attribute;
+pub mod cli;
+pub mod config;
 pub mod document;
+pub mod http;
 pub mod interrupt;
 pub mod mapping;
 pub mod model;
+pub mod server;
+pub mod service;
+pub mod store;
+pub mod telemetry;

@@ -1,3 +1,7 @@
-//! The `etude` program.
+//! The `etude` program; all of it is in the library.
 
-fn main() {}
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    etude::cli::run()
+}

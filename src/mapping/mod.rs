@@ -42,7 +42,7 @@ pub use cost::Cost;
 pub use demonstration::Demonstration;
 pub use heuristic::HeuristicName;
 pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
-pub use policy::{Coverage, Policy, SearchReport, Stamp, Step};
+pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step};
 pub use problem::Problem;
 pub use request::{ObservationDocument, ObservedDocument, Request, RequestDocument, StartReference};
 pub use search::{Move, MoveKind};

@@ -59,6 +59,57 @@ pub struct Policy {
     pub search: SearchReport,
 }
 
+/// A policy without its steps, as in lists.
+#[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
+pub struct PolicySummary<'p> {
+    /// Under which it is stored.
+    pub id: Option<&'p str>,
+    /// Name of the model.
+    pub model: &'p str,
+    /// SHA-256 of the model's content.
+    pub model_hash: &'p str,
+    /// The learner whose weights were used, if any.
+    pub learner: Option<&'p str>,
+    /// The version of the learner's weights.
+    pub weights_version: Option<u64>,
+    /// The weights of the distance.
+    #[schema(value_type = BTreeMap<String, f64>)]
+    pub weights: &'p ByAttribute<f64>,
+    /// How many observations past the current one a decision could wait for; `null`: all.
+    pub lookahead: Option<u32>,
+    /// What was proven.
+    pub status: Status,
+    /// What the mapping costs.
+    pub cost: Cost,
+    /// No mapping costs less. `null` if nothing is known.
+    pub lower_bound: Option<f64>,
+    /// How much of the demonstration was met exactly.
+    pub coverage: Coverage,
+    /// What the search took.
+    pub search: SearchReport,
+}
+
+impl<'p> PolicySummary<'p> {
+    /// The summary of `policy`.
+    #[must_use]
+    pub fn of(policy: &'p Policy) -> Self {
+        Self {
+            id: policy.id.as_deref(),
+            model: &policy.model,
+            model_hash: &policy.model_hash,
+            learner: policy.learner.as_deref(),
+            weights_version: policy.weights_version,
+            weights: &policy.weights,
+            lookahead: policy.lookahead,
+            status: policy.status,
+            cost: policy.cost,
+            lower_bound: policy.lower_bound,
+            coverage: policy.coverage,
+            search: policy.search,
+        }
+    }
+}
+
 /// A step of a policy. Executing it means keyed by `(observation, state)`, never by the state alone: a state may be passed
 /// again later.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]

@@ -74,6 +74,7 @@ pub struct Model {
     states: States,
     graph: Graph,
     start: Start,
+    n_transitions: usize,
     is_unsafe: Vec<bool>,
     n_unsafe: usize,
 }
@@ -130,6 +131,12 @@ impl Model {
     #[must_use]
     pub fn is_unsafe(&self, state: StateIdx) -> bool {
         self.is_unsafe.get(state as usize).copied().unwrap_or(false)
+    }
+
+    /// How many transitions its definition has, those that a body may not make included.
+    #[must_use]
+    pub fn n_transitions(&self) -> usize {
+        self.n_transitions
     }
 
     /// How many states must never be entered.

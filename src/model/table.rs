@@ -50,6 +50,7 @@ impl Table {
             graph: Graph::new(n_states, edges),
             states: self.states.clone(),
             start: self.start.clone(),
+            n_transitions: self.edges.len(),
             n_unsafe: is_unsafe.iter().filter(|is_unsafe| **is_unsafe).count(),
             is_unsafe,
         }

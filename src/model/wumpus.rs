@@ -299,6 +299,7 @@ impl Cave {
         Ok(Model {
             schema: self.schema(),
             actions: self.actions.clone(),
+            n_transitions: edges.len(),
             graph: Graph::new(found.len(), edges),
             states: States::new(self.domains(), rows),
             start: Start::State(0),

@@ -1,0 +1,144 @@
+//! `etude map`.
+
+use std::fs;
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+use clap::{Args, ValueEnum};
+use serde_json::{Map as Members, Value, json};
+
+use super::{CliError, render};
+use crate::document::{self, Faults, Place};
+use crate::interrupt::{Signal, Uninterrupted};
+use crate::mapping::{Mapper, Policy, Request, Stamp};
+use crate::model::{CompileError, Definition, Limits, Model, hash_of};
+
+#[derive(Args, Debug)]
+pub(super) struct Map {
+    /// The imitator's model: JSON, as for PUT /v1/models; - for standard input.
+    #[arg(long, value_name = "FILE")]
+    model: PathBuf,
+    /// The demonstration: a JSON array of observed states, or a whole request as for POST /v1/policies; - for standard input.
+    #[arg(long, value_name = "FILE")]
+    demonstration: PathBuf,
+    /// Weight of an attribute; may be given for several.
+    #[arg(long = "weight", value_name = "ATTRIBUTE=WEIGHT", value_parser = parse_weight)]
+    weights: Vec<(String, f64)>,
+    /// Where the imitator starts: a state's index, or a JSON object of attribute values.
+    #[arg(long, value_name = "STATE", value_parser = parse_json)]
+    start: Option<Value>,
+    /// What guides the search.
+    #[arg(long, value_enum)]
+    heuristic: Option<HeuristicArg>,
+    /// Most nodes to expand.
+    #[arg(long, value_name = "N")]
+    max_expansions: Option<u64>,
+    /// Most milliseconds to search.
+    #[arg(long, value_name = "MS")]
+    deadline_ms: Option<u64>,
+    /// Print the policy as JSON instead of a table.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum HeuristicArg {
+    Default,
+    Paper,
+    None,
+}
+
+impl Map {
+    pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
+        let model_faults = |faults| CliError::Faults { what: self.model.display().to_string(), faults };
+        let limits = Limits { max_states: usize::MAX };
+        let definition = Definition::read(&read_json(&self.model)?, limits).map_err(model_faults)?;
+        let model = match Model::compile(&definition, limits, &mut Uninterrupted) {
+            Ok(model) => model,
+            Err(CompileError::Faults(faults)) => return Err(model_faults(faults)),
+            Err(CompileError::Cancelled(cancelled)) => return Err(cancelled.into()),
+        };
+        let mapper = Mapper::new(model);
+
+        let request = self.request()?;
+        let mut faults = Faults::default();
+        let object = Place::root(&request).object(&Request::FIELDS, &mut faults);
+        let read = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
+        let what = format!("the request made of {}", self.demonstration.display());
+        let Request { problem, settings, deadline } =
+            faults.check(read).map_err(|faults| CliError::Faults { what, faults })?;
+
+        let started = Instant::now();
+        let mut interrupt = || match deadline {
+            Some(deadline) if started.elapsed() >= deadline => Signal::Finish,
+            _ => Signal::Continue,
+        };
+        let mapping = mapper.map(&problem, settings, &mut interrupt)?;
+        let stamp = Stamp {
+            id: None,
+            model: request["model"].as_str().unwrap_or_default().to_owned(),
+            model_hash: hash_of(&definition.document().text()),
+            elapsed_us: as_micros(started.elapsed()),
+        };
+        let policy = Policy::new(stamp, &problem, &mapping);
+        if self.json {
+            serde_json::to_writer(&mut *out, &policy).map_err(io::Error::from)?;
+            writeln!(out)?;
+        } else {
+            writeln!(out, "{}", render::steps(&policy))?;
+            write!(out, "{}", render::totals(&policy))?;
+        }
+        Ok(())
+    }
+
+    /// The request that the files and options amount to.
+    fn request(&self) -> Result<Value, CliError> {
+        let mut request = match read_json(&self.demonstration)? {
+            Value::Object(request) => request,
+            demonstration => Members::from_iter([("demonstration".to_owned(), demonstration)]),
+        };
+        let name = self.model.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+        request.insert("model".to_owned(), name.into());
+        if !self.weights.is_empty() {
+            let weights = request.entry("weights").or_insert_with(|| json!({}));
+            for (attribute, weight) in &self.weights {
+                weights[attribute] = json!(weight);
+            }
+        }
+        let heuristic = self.heuristic.and_then(|heuristic| heuristic.to_possible_value());
+        let options = [
+            ("start", self.start.clone()),
+            ("heuristic", heuristic.map(|heuristic| heuristic.get_name().into())),
+            ("max_expansions", self.max_expansions.map(Value::from)),
+            ("deadline_ms", self.deadline_ms.map(Value::from)),
+        ];
+        request.extend(options.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))));
+        Ok(request.into())
+    }
+}
+
+fn as_micros(duration: Duration) -> u64 {
+    u64::try_from(duration.as_micros()).unwrap_or(u64::MAX)
+}
+
+fn read_json(path: &Path) -> Result<Value, CliError> {
+    let read = if path == Path::new("-") {
+        let mut text = Vec::new();
+        io::stdin().lock().read_to_end(&mut text).map(|_| text)
+    } else {
+        fs::read(path)
+    };
+    let text = read.map_err(|source| CliError::Read { path: path.to_owned(), source })?;
+    document::parse(&text).map_err(|source| CliError::Parse { path: path.to_owned(), source })
+}
+
+fn parse_weight(text: &str) -> Result<(String, f64), String> {
+    let (attribute, weight) = text.rsplit_once('=').ok_or("expected ATTRIBUTE=WEIGHT")?;
+    let weight: f64 = weight.parse().map_err(|_| format!("expected a number, found {weight:?}"))?;
+    if weight.is_finite() { Ok((attribute.to_owned(), weight)) } else { Err("expected a finite number".to_owned()) }
+}
+
+fn parse_json(text: &str) -> Result<Value, String> {
+    document::parse(text.as_bytes()).map_err(|error| error.to_string())
+}

@@ -1,0 +1,135 @@
+//! The command line.
+
+mod demo;
+mod healthcheck;
+mod map;
+mod openapi;
+mod render;
+mod serve;
+
+use std::error::Error;
+use std::io;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+use crate::document::{Faults, ParseError};
+use crate::server::ServerError;
+use crate::telemetry::{LogConfig, start_logging};
+
+/// Learns a task by watching it done: finds the policy, in an agent's own actions, whose effects follow a demonstration
+/// most closely.
+#[derive(Debug, Parser)]
+#[command(version)]
+struct Cli {
+    #[command(flatten)]
+    log: LogConfig,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run the service.
+    Serve(serve::Serve),
+    /// Map a demonstration from files, without a service.
+    Map(map::Map),
+    /// Start a service, send it the demonstration of figure 4, and show what comes back.
+    Demo,
+    /// Print the OpenAPI description of the service.
+    Openapi,
+    /// Ask a running service whether it is ready; for container health checks.
+    Healthcheck(healthcheck::Healthcheck),
+}
+
+/// Why a command failed.
+#[derive(Debug, thiserror::Error)]
+enum CliError {
+    /// A file cannot be read.
+    #[error("cannot read {}", path.display())]
+    Read {
+        path: PathBuf,
+        #[source]
+        source: io::Error,
+    },
+    /// A file is not JSON.
+    #[error("{}: {source}", path.display())]
+    Parse { path: PathBuf, source: ParseError },
+    /// A file is JSON, but not what was asked for.
+    #[error("{what} has faults:\n{faults}")]
+    Faults { what: String, faults: Faults },
+    /// An option is not what it should be.
+    #[error("{0}")]
+    Option(String),
+    /// The search has no answer.
+    #[error(transparent)]
+    Cancelled(#[from] crate::interrupt::Cancelled),
+    /// The service did not start or run.
+    #[error(transparent)]
+    Server(#[from] ServerError),
+    /// A service could not be asked.
+    #[error("cannot ask {url}")]
+    Http {
+        url: String,
+        #[source]
+        source: reqwest::Error,
+    },
+    /// A service answered something else than expected.
+    #[error("{url} answered {status}: {body}")]
+    Answer { url: String, status: u16, body: String },
+    /// Input or output failed.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// The log filter is none.
+    #[error("--log: {0}")]
+    Log(#[from] tracing_subscriber::filter::ParseError),
+}
+
+/// Runs the program with the arguments of the process.
+#[must_use]
+pub fn run() -> ExitCode {
+    let Cli { log, command } = Cli::parse();
+    // Other commands have their output, which log lines would stand between.
+    let default_filter = if matches!(command, Command::Serve(_)) { "info" } else { "warn" };
+    let done = start_logging(&log, default_filter).map_err(CliError::from).and_then(|()| match command {
+        Command::Serve(serve) => serve.run(),
+        Command::Map(map) => map.run(&mut io::stdout().lock()),
+        Command::Demo => demo::run(&mut io::stdout()),
+        Command::Openapi => openapi::run(&mut io::stdout().lock()),
+        Command::Healthcheck(healthcheck) => healthcheck.run(),
+    });
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        // Whoever read our output has seen enough.
+        Err(CliError::Io(error)) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
+        Err(error) => {
+            report(&error);
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// Writes an error and its causes to standard error.
+fn report(error: &CliError) {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(error) = cause {
+        let message = error.to_string();
+        // Some messages include their cause already.
+        if !text.contains(&message) {
+            text.push_str(": ");
+            text.push_str(&message);
+        }
+        cause = error.source();
+    }
+    #[expect(clippy::print_stderr, reason = "this is where a command's error goes")]
+    {
+        eprintln!("etude: {text}");
+    }
+}
+
+/// A runtime for what is asynchronous.
+fn runtime() -> Result<tokio::runtime::Runtime, CliError> {
+    Ok(tokio::runtime::Builder::new_multi_thread().enable_all().build()?)
+}

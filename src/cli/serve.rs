@@ -1,0 +1,24 @@
+//! `etude serve`.
+
+use clap::Args;
+
+use super::{CliError, runtime};
+use crate::config::ServeConfig;
+use crate::server::{Server, stop_signal};
+
+#[derive(Args, Debug)]
+pub(super) struct Serve {
+    #[command(flatten)]
+    config: ServeConfig,
+}
+
+impl Serve {
+    pub(super) fn run(&self) -> Result<(), CliError> {
+        runtime()?.block_on(async {
+            // Listened for before anything is started, so that no signal is missed.
+            let stop = stop_signal()?;
+            let server = Server::start(&self.config).await?;
+            Ok(server.run(stop).await?)
+        })
+    }
+}

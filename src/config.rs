@@ -1,0 +1,74 @@
+//! How `etude serve` is set up: by flags, or by environment variables of the same meaning.
+
+use std::net::SocketAddr;
+use std::num::NonZeroUsize;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::Args;
+
+use crate::model::Limits;
+use crate::service::{PoolSettings, Settings};
+
+/// Settings of the service.
+#[derive(Args, Clone, Debug)]
+pub struct ServeConfig {
+    /// Address to listen on; port 0 takes a free one and logs it.
+    #[arg(long, env = "ETUDE_LISTEN", default_value = "127.0.0.1:8080")]
+    pub listen: SocketAddr,
+    /// SQLite database; created if missing.
+    #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_name = "FILE")]
+    pub database: PathBuf,
+    /// Searches that run at the same time [default: one per core].
+    #[arg(long, env = "ETUDE_SEARCH_THREADS", value_name = "N")]
+    pub search_threads: Option<NonZeroUsize>,
+    /// Searches that wait for a thread; further ones are answered 503.
+    #[arg(long, env = "ETUDE_SEARCH_QUEUE", default_value_t = 64, value_name = "N")]
+    pub search_queue: usize,
+    /// Largest request body.
+    #[arg(long, env = "ETUDE_MAX_BODY_BYTES", default_value_t = 8 * 1024 * 1024, value_name = "BYTES")]
+    pub max_body_bytes: usize,
+    /// Most states of a model.
+    #[arg(long, env = "ETUDE_MAX_STATES", default_value_t = Limits::DEFAULT.max_states, value_name = "N")]
+    pub max_states: usize,
+    /// Memory for models that are kept ready to be searched.
+    #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", default_value_t = 1024 * 1024 * 1024, value_name = "BYTES")]
+    pub model_cache_bytes: u64,
+    /// How long requests may go on after SIGTERM or SIGINT, such as 500ms, 10s or 1m.
+    #[arg(long, env = "ETUDE_DRAIN_TIMEOUT", default_value = "10s", value_parser = parse_duration, value_name = "TIME")]
+    pub drain_timeout: Duration,
+}
+
+impl ServeConfig {
+    /// The settings of the application.
+    #[must_use]
+    pub fn settings(&self) -> Settings {
+        let n_cores = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
+        Settings {
+            database: self.database.clone(),
+            limits: Limits { max_states: self.max_states },
+            model_cache_bytes: self.model_cache_bytes,
+            pool: PoolSettings {
+                n_threads: self.search_threads.map_or(n_cores, NonZeroUsize::get),
+                max_waiting: self.search_queue,
+            },
+        }
+    }
+}
+
+fn parse_duration(text: &str) -> Result<Duration, String> {
+    let duration: jiff::SignedDuration = text.parse().map_err(|error: jiff::Error| error.to_string())?;
+    Duration::try_from(duration).map_err(|_| "expected a time of at least 0".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_written_with_their_unit() {
+        assert_eq!(parse_duration("1s"), Ok(Duration::from_secs(1)));
+        assert_eq!(parse_duration("500ms"), Ok(Duration::from_millis(500)));
+        assert!(parse_duration("-1s").is_err() && parse_duration("7").is_err());
+    }
+}

@@ -1,0 +1,102 @@
+//! The HTTP contract: routes, bodies, and the only place with status codes.
+//!
+//! ```text
+//! connection -> observe (request id, log, metrics, panics) -> route -> handler -> Etude
+//!                    ^                                                    |
+//!                    +---- Problem (RFC 9457), rendered with its id <-----+
+//! ```
+//!
+//! The OpenAPI description is generated from the handlers of this module; [`openapi`] gives it without a running service.
+
+mod body;
+mod models;
+mod observe;
+mod operation;
+mod paging;
+mod path;
+mod policies;
+mod problem;
+
+use std::sync::Arc;
+
+use axum::Router;
+use axum::middleware;
+use metrics_exporter_prometheus::PrometheusHandle;
+use tokio_util::sync::CancellationToken;
+use utoipa::OpenApi;
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use crate::service::Etude;
+use problem::{Problem, ProblemKind};
+
+/// What handlers work with.
+#[derive(Clone)]
+pub struct Context {
+    /// The application.
+    pub etude: Arc<Etude>,
+    /// Cancelled when the service starts to shut down: no longer ready.
+    pub stopping: CancellationToken,
+    /// Largest body that is read, in bytes.
+    pub max_body_bytes: usize,
+    /// Renders what was measured.
+    pub metrics: PrometheusHandle,
+}
+
+#[derive(OpenApi)]
+#[openapi(
+    info(
+        title = "etude",
+        description = "A service by which an agent learns a task by watching it done: it finds the policy, in the agent's own \
+                       actions, whose effects follow a demonstration most closely.\n\nEvery error is a problem document \
+                       (RFC 9457) whose `type` is listed under its status; for 422 it lists all faults of the body, each \
+                       with its JSON pointer. Every answer carries an `x-request-id`, taken from the request if that has \
+                       one.\n\nLists are read in pages: `limit` items, then `after` the `next` of the page before.",
+        license(name = "MIT OR Apache-2.0", identifier = "MIT OR Apache-2.0"),
+    ),
+    tags(
+        (name = "models", description = "What a body can do in its world"),
+        (name = "policies", description = "Demonstration in, policy out"),
+        (name = "operation", description = "Health and measurements"),
+    ),
+    components(schemas(Problem)),
+)]
+struct Description;
+
+fn routes() -> OpenApiRouter<Context> {
+    OpenApiRouter::with_openapi(Description::openapi())
+        .routes(routes!(models::put_model, models::get_model, models::delete_model))
+        .routes(routes!(models::list_models))
+        .routes(routes!(policies::make_policy, policies::list_policies))
+        .routes(routes!(policies::get_policy))
+        .routes(routes!(operation::livez))
+        .routes(routes!(operation::readyz))
+        .routes(routes!(operation::metrics))
+        .routes(routes!(operation::openapi_yaml))
+}
+
+/// The OpenAPI 3.1 description of the service, as YAML.
+///
+/// # Panics
+///
+/// Never: every description can be written as YAML.
+#[must_use]
+pub fn openapi() -> String {
+    routes().into_openapi().to_yaml().expect("every description can be written as YAML")
+}
+
+/// The whole service as a router.
+pub fn router(context: Context) -> Router {
+    let (router, _) = routes().split_for_parts();
+    router
+        .merge(operation::docs())
+        .fallback(|| async { Problem::new(ProblemKind::NotFound, "there is nothing at this path") })
+        .method_not_allowed_fallback(|| async {
+            Problem::new(
+                ProblemKind::MethodNotAllowed,
+                "this path does not support this method; `Allow` lists those it does",
+            )
+        })
+        .layer(middleware::from_fn(observe::observe))
+        .with_state(context)
+}

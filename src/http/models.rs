@@ -1,0 +1,162 @@
+//! `/v1/models`.
+
+use axum::extract::{Request, State};
+use axum::http::StatusCode;
+use axum::response::Response;
+use jiff::Timestamp;
+use serde::Serialize;
+use serde_json::value::RawValue;
+use utoipa::ToSchema;
+
+use super::Context;
+use super::body::{json, read_json};
+use super::paging::{List, Paging};
+use super::path::PathName;
+use super::problem::Problem;
+use crate::attribute::AttributeDocument;
+use crate::model::{ActionDocument, DefinitionDocument};
+use crate::service::{ModelAnswer, Registered};
+use crate::store::ModelSummary;
+
+/// A registered model.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ModelSummary)]
+struct ModelBody {
+    /// The name it is registered under.
+    #[schema(example = "figure-4")]
+    name: String,
+    /// SHA-256 of its content in canonical form: equal for equal content, however that was written.
+    hash: String,
+    /// The attributes of a state, in order, defaults filled in.
+    attributes: Vec<AttributeDocument>,
+    /// The actions of the body, in order, defaults filled in.
+    actions: Vec<ActionDocument>,
+    /// How much there is of everything.
+    counts: Counts,
+    /// When it was registered.
+    #[schema(value_type = String, format = DateTime)]
+    created_at: Timestamp,
+}
+
+/// How much of everything a model has.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = ModelCounts)]
+struct Counts {
+    /// Attributes.
+    attributes: usize,
+    /// Actions.
+    actions: usize,
+    /// States; of a wumpus world, those that the body can reach.
+    states: u64,
+    /// Transitions.
+    transitions: u64,
+    /// States that must never be entered.
+    #[serde(rename = "unsafe")]
+    n_unsafe: u64,
+}
+
+impl From<ModelSummary> for ModelBody {
+    fn from(summary: ModelSummary) -> Self {
+        Self {
+            name: summary.name,
+            hash: summary.hash,
+            counts: Counts {
+                attributes: summary.attributes.len(),
+                actions: summary.actions.len(),
+                states: summary.n_states,
+                transitions: summary.n_transitions,
+                n_unsafe: summary.n_unsafe,
+            },
+            attributes: summary.attributes,
+            actions: summary.actions,
+            created_at: summary.created_at,
+        }
+    }
+}
+
+/// A registered model, with what it was registered as.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Model)]
+struct WholeModelBody {
+    #[serde(flatten)]
+    summary: ModelBody,
+    /// What it was registered as, in canonical form. Registering this elsewhere gives the same hash.
+    #[schema(value_type = DefinitionDocument)]
+    definition: Box<RawValue>,
+}
+
+/// Register a model under a name.
+#[utoipa::path(
+    put, path = "/v1/models/{model}", tag = "models",
+    params(("model" = String, Path, description = "Its name: 1 to 64 of `a-z A-Z 0-9 . _ -`")),
+    request_body = DefinitionDocument,
+    responses(
+        (status = 201, description = "It is new", body = ModelBody),
+        (status = 200, description = "The same content was there already, under this name", body = ModelBody),
+        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "`conflict`: other content is there under this name", body = Problem, content_type = "application/problem+json"),
+        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn put_model(
+    State(context): State<Context>,
+    PathName(name): PathName,
+    request: Request,
+) -> Result<Response, Problem> {
+    let body = read_json(request, context.max_body_bytes).await?;
+    let (registered, summary) = context.etude.put_model(&name, body, Timestamp::now()).await?;
+    let status = match registered {
+        Registered::New => StatusCode::CREATED,
+        Registered::Already => StatusCode::OK,
+    };
+    Ok(json(status, &ModelBody::from(summary)))
+}
+
+/// A model, with what it was registered as.
+#[utoipa::path(
+    get, path = "/v1/models/{model}", tag = "models",
+    params(("model" = String, Path, description = "Its name")),
+    responses(
+        (status = 200, description = "The model", body = WholeModelBody),
+        (status = 404, description = "`unknown-model`", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn get_model(State(context): State<Context>, PathName(name): PathName) -> Result<Response, Problem> {
+    let ModelAnswer { summary, definition } = context.etude.model(&name).await?;
+    Ok(json(StatusCode::OK, &WholeModelBody { summary: summary.into(), definition }))
+}
+
+/// Models, in the order of their names.
+#[utoipa::path(
+    get, path = "/v1/models", tag = "models",
+    params(Paging),
+    responses(
+        (status = 200, description = "A page of models", body = List<ModelBody>),
+        (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn list_models(State(context): State<Context>, paging: Paging) -> Result<Response, Problem> {
+    let page = context.etude.models(paging.after.as_deref(), paging.limit).await?;
+    Ok(json(StatusCode::OK, &List::of(page, ModelBody::from)))
+}
+
+/// Delete a model. Policies made with it stay.
+#[utoipa::path(
+    delete, path = "/v1/models/{model}", tag = "models",
+    params(("model" = String, Path, description = "Its name")),
+    responses(
+        (status = 204, description = "It is deleted"),
+        (status = 404, description = "`unknown-model`", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn delete_model(
+    State(context): State<Context>,
+    PathName(name): PathName,
+) -> Result<StatusCode, Problem> {
+    context.etude.delete_model(&name).await?;
+    Ok(StatusCode::NO_CONTENT)
+}

@@ -1,0 +1,88 @@
+//! What happens around every request: its id, its log line, its measurements, its problem document.
+
+use std::any::Any;
+use std::panic::AssertUnwindSafe;
+use std::time::Instant;
+
+use axum::extract::{MatchedPath, Request};
+use axum::http::{HeaderMap, HeaderName, HeaderValue};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use futures_util::FutureExt;
+use tracing::{Instrument, Span};
+use uuid::Uuid;
+
+use super::problem::{Problem, ProblemKind};
+
+const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+
+/// Longest request id that is taken from a client.
+const MAX_REQUEST_ID_BYTES: usize = 64;
+
+/// Gives the request an id, logs and measures it, turns panics into problems and problems into documents.
+pub(super) async fn observe(request: Request, next: Next) -> Response {
+    let id = request_id(request.headers());
+    let route = request.extensions().get::<MatchedPath>().map_or("(none)", MatchedPath::as_str).to_owned();
+    let method = request.method().clone();
+    let span = tracing::info_span!("request", request_id = %id, %method, path = request.uri().path());
+    let mut unanswered = Unanswered { span: span.clone(), started: Instant::now(), is_answered: false };
+
+    let answered = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind().await;
+    let mut response = answered.unwrap_or_else(|panic| {
+        span.in_scope(|| tracing::error!(panic = panic_message(panic.as_ref()), "a handler panicked"));
+        Problem::new(ProblemKind::Internal, "an internal error was logged under this request id").into_response()
+    });
+    if let Some(problem) = response.extensions_mut().remove::<Problem>() {
+        let headers = std::mem::take(response.headers_mut());
+        response = problem.render(&id);
+        // What the router added, such as `Allow`; the body's own headers are the document's.
+        for (name, value) in headers.iter().filter(|(name, _)| *name == axum::http::header::ALLOW) {
+            response.headers_mut().insert(name, value.clone());
+        }
+    }
+    if let Ok(id) = HeaderValue::from_str(&id) {
+        response.headers_mut().insert(REQUEST_ID, id);
+    }
+
+    unanswered.is_answered = true;
+    let elapsed = unanswered.started.elapsed();
+    let status = response.status().as_u16();
+    let labels = [("method", method.to_string()), ("route", route), ("status", status.to_string())];
+    metrics::counter!("etude_http_requests_total", &labels).increment(1);
+    metrics::histogram!("etude_http_request_duration_seconds", &labels).record(elapsed.as_secs_f64());
+    let elapsed_us = u64::try_from(elapsed.as_micros()).unwrap_or(u64::MAX);
+    span.in_scope(|| tracing::info!(status, elapsed_us, "answered"));
+    response
+}
+
+/// Takes the client's id if it is short and plain, else makes one.
+fn request_id(headers: &HeaderMap) -> String {
+    let is_plain = |id: &&str| {
+        (1..=MAX_REQUEST_ID_BYTES).contains(&id.len())
+            && id.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._-".contains(&byte))
+    };
+    let given = headers.get(REQUEST_ID).and_then(|id| id.to_str().ok()).filter(is_plain);
+    given.map_or_else(|| Uuid::now_v7().to_string(), str::to_owned)
+}
+
+fn panic_message(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<&str>().copied();
+    text.or_else(|| panic.downcast_ref::<String>().map(String::as_str)).unwrap_or("(no message)")
+}
+
+/// Logs, when it is dropped, that the client went away before its answer.
+struct Unanswered {
+    span: Span,
+    started: Instant,
+    is_answered: bool,
+}
+
+impl Drop for Unanswered {
+    fn drop(&mut self) {
+        if !self.is_answered {
+            let elapsed_us = u64::try_from(self.started.elapsed().as_micros()).unwrap_or(u64::MAX);
+            self.span.in_scope(|| tracing::info!(elapsed_us, "the client went away"));
+            metrics::counter!("etude_http_requests_abandoned_total").increment(1);
+        }
+    }
+}

@@ -1,0 +1,66 @@
+//! Lists in pages.
+
+use axum::extract::{FromRequestParts, Query};
+use axum::http::request::Parts;
+use serde::Serialize;
+use utoipa::{IntoParams, ToSchema};
+
+use super::problem::Problem;
+use crate::document::{Faults, Path};
+use crate::store::Page;
+
+/// Which part of a list is wanted.
+#[derive(Clone, Debug, PartialEq, Eq, IntoParams)]
+#[into_params(parameter_in = Query)]
+pub(super) struct Paging {
+    /// Most items: 1 to 1000.
+    #[param(minimum = 1, maximum = 1000, default = 100, required = false)]
+    pub(super) limit: u32,
+    /// The `next` of the page before; left out for the first page.
+    pub(super) after: Option<String>,
+}
+
+impl Paging {
+    const MAX_LIMIT: u32 = 1000;
+    const DEFAULT_LIMIT: u32 = 100;
+}
+
+impl<S: Send + Sync> FromRequestParts<S> for Paging {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Problem> {
+        let mut faults = Faults::default();
+        let mut note = |name: &str, detail: String| faults.note_at(&Path::Member(&Path::Root, name), detail);
+        let mut paging = Self { limit: Self::DEFAULT_LIMIT, after: None };
+        let query = Query::<Vec<(String, String)>>::try_from_uri(&parts.uri);
+        for (name, value) in query.map(|Query(query)| query).unwrap_or_default() {
+            match name.as_str() {
+                "limit" => match value.parse() {
+                    Ok(limit) if (1..=Self::MAX_LIMIT).contains(&limit) => paging.limit = limit,
+                    _ => {
+                        let expected = format!("expected a whole number from 1 to {}", Self::MAX_LIMIT);
+                        note("limit", format!("{expected}, found {value:?}"));
+                    }
+                },
+                "after" => paging.after = Some(value),
+                _ => note(&name, "unknown query parameter; known here: limit, after".to_owned()),
+            }
+        }
+        if faults.is_empty() { Ok(paging) } else { Err(faults.into()) }
+    }
+}
+
+/// A part of a list.
+#[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
+pub(super) struct List<T> {
+    /// The items, in order.
+    items: Vec<T>,
+    /// What to give as `after` for the next page; `null` on the last page.
+    next: Option<String>,
+}
+
+impl<T> List<T> {
+    pub(super) fn of<U>(page: Page<U>, item: impl Fn(U) -> T) -> Self {
+        Self { items: page.items.into_iter().map(item).collect(), next: page.next }
+    }
+}

@@ -1,0 +1,166 @@
+//! Errors as clients see them (RFC 9457), and the only mapping of errors to status codes.
+
+use std::error::Error;
+
+use axum::http::header::{CONTENT_TYPE, RETRY_AFTER};
+use axum::http::{HeaderValue, StatusCode};
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+use utoipa::ToSchema;
+
+use crate::document::{Fault, Faults, ParseError};
+use crate::service::{self, PoolError, ServiceError};
+
+/// What kind of problem it is: its `type`, title and status.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum ProblemKind {
+    MalformedJson,
+    IncompleteBody,
+    NotFound,
+    UnknownModel,
+    UnknownPolicy,
+    UnknownLearner,
+    MethodNotAllowed,
+    SlowBody,
+    Conflict,
+    TooLarge,
+    UnsupportedMediaType,
+    Invalid,
+    Internal,
+    Busy,
+    Stopping,
+}
+
+impl ProblemKind {
+    /// Slug, title and status.
+    fn describe(self) -> (&'static str, &'static str, StatusCode) {
+        match self {
+            Self::MalformedJson => ("malformed-json", "The body is not JSON", StatusCode::BAD_REQUEST),
+            Self::IncompleteBody => ("incomplete-body", "The body ended early", StatusCode::BAD_REQUEST),
+            Self::NotFound => ("not-found", "There is nothing here", StatusCode::NOT_FOUND),
+            Self::UnknownModel => ("unknown-model", "There is no such model", StatusCode::NOT_FOUND),
+            Self::UnknownPolicy => ("unknown-policy", "There is no such policy", StatusCode::NOT_FOUND),
+            Self::UnknownLearner => ("unknown-learner", "There is no such learner", StatusCode::NOT_FOUND),
+            Self::MethodNotAllowed => {
+                ("method-not-allowed", "The method is not supported here", StatusCode::METHOD_NOT_ALLOWED)
+            }
+            Self::SlowBody => ("slow-body", "The body took too long", StatusCode::REQUEST_TIMEOUT),
+            Self::Conflict => ("conflict", "The name is taken", StatusCode::CONFLICT),
+            Self::TooLarge => ("too-large", "The body is too large", StatusCode::PAYLOAD_TOO_LARGE),
+            Self::UnsupportedMediaType => {
+                ("unsupported-media-type", "The body must be JSON", StatusCode::UNSUPPORTED_MEDIA_TYPE)
+            }
+            Self::Invalid => ("invalid", "The request has faults", StatusCode::UNPROCESSABLE_ENTITY),
+            Self::Internal => ("internal", "Something went wrong here", StatusCode::INTERNAL_SERVER_ERROR),
+            Self::Busy => ("busy", "Too many requests are waiting", StatusCode::SERVICE_UNAVAILABLE),
+            Self::Stopping => ("stopping", "The service is shutting down", StatusCode::SERVICE_UNAVAILABLE),
+        }
+    }
+}
+
+/// A problem document (RFC 9457, `application/problem+json`).
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, ToSchema)]
+pub(super) struct Problem {
+    /// `/problems/` and what kind of problem it is.
+    #[serde(rename = "type")]
+    #[schema(example = "/problems/invalid")]
+    kind: String,
+    /// The kind in words.
+    #[schema(example = "The request has faults")]
+    title: &'static str,
+    /// The HTTP status.
+    #[schema(example = 422)]
+    status: u16,
+    /// What happened this time.
+    detail: String,
+    /// Under which the service has logged this request.
+    request_id: String,
+    /// Every fault of the request, with its place; up to 1000 are listed.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schema(required = false)]
+    errors: Vec<Fault>,
+}
+
+impl Problem {
+    pub(super) fn new(kind: ProblemKind, detail: impl Into<String>) -> Self {
+        let (slug, title, status) = kind.describe();
+        Self {
+            kind: format!("/problems/{slug}"),
+            title,
+            status: status.as_u16(),
+            detail: detail.into(),
+            request_id: String::new(),
+            errors: Vec::new(),
+        }
+    }
+
+    /// The problem of a request with these faults.
+    pub(super) fn invalid(faults: &Faults) -> Self {
+        let count = faults.count();
+        let first = faults.listed().first();
+        let detail = match first {
+            Some(fault) if count == 1 => fault.detail.clone(),
+            _ if count > faults.listed().len() => {
+                format!("{count} faults, of which {} are listed", faults.listed().len())
+            }
+            _ => format!("{count} faults"),
+        };
+        Self { errors: faults.listed().to_vec(), ..Self::new(ProblemKind::Invalid, detail) }
+    }
+
+    /// The document, with the id of the request it answers.
+    pub(super) fn render(mut self, request_id: &str) -> Response {
+        request_id.clone_into(&mut self.request_id);
+        let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+        let body = serde_json::to_vec(&self).unwrap_or_default();
+        let mut response = (status, body).into_response();
+        response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+        if status == StatusCode::SERVICE_UNAVAILABLE {
+            response.headers_mut().insert(RETRY_AFTER, service::RETRY_AFTER.as_secs().into());
+        }
+        response
+    }
+}
+
+/// The response carries the problem to [`observe`](super::observe), which knows the request's id and renders it.
+impl IntoResponse for Problem {
+    fn into_response(self) -> Response {
+        let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
+        let mut response = status.into_response();
+        response.extensions_mut().insert(self);
+        response
+    }
+}
+
+impl From<Faults> for Problem {
+    fn from(faults: Faults) -> Self {
+        Self::invalid(&faults)
+    }
+}
+
+impl From<ServiceError> for Problem {
+    fn from(error: ServiceError) -> Self {
+        let detail = error.to_string();
+        match error {
+            ServiceError::Parse(ParseError::Syntax { .. }) => Self::new(ProblemKind::MalformedJson, detail),
+            ServiceError::Parse(ParseError::Faults(faults)) | ServiceError::Faults(faults) => Self::invalid(&faults),
+            ServiceError::Unknown { kind, pointer, .. } => {
+                let problem = match kind {
+                    "policy" => ProblemKind::UnknownPolicy,
+                    "learner" => ProblemKind::UnknownLearner,
+                    _ => ProblemKind::UnknownModel,
+                };
+                let fault = pointer.map(|pointer| Fault { pointer: pointer.to_owned(), detail: detail.clone() });
+                Self { errors: fault.into_iter().collect(), ..Self::new(problem, detail) }
+            }
+            ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),
+            ServiceError::Pool(PoolError::Busy) => Self::new(ProblemKind::Busy, detail),
+            ServiceError::Pool(PoolError::Stopped) => Self::new(ProblemKind::Stopping, detail),
+            ServiceError::Pool(PoolError::Panicked) | ServiceError::Store(_) | ServiceError::Write(_) => {
+                // The client gets nothing but its request id, under which the log has the rest.
+                tracing::error!(error = &error as &dyn Error, "a request failed");
+                Self::new(ProblemKind::Internal, "an internal error was logged under this request id")
+            }
+        }
+    }
+}

@@ -1,0 +1,174 @@
+//! The assembled program: application, routes and listener, from start to clean end.
+//!
+//! ```text
+//! Server::start -> listening -> stop requested -> not ready, no new connections, requests end (drain time)
+//!                                             -> searches aborted, answered 503 -> store closed
+//! ```
+
+use std::future::IntoFuture;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use axum::serve::ListenerExt;
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use crate::config::ServeConfig;
+use crate::http::{self, Context};
+use crate::service::Etude;
+use crate::store::StoreError;
+use crate::telemetry;
+
+/// How long answers may take to be sent after searches were aborted.
+const ABORT_GRACE: Duration = Duration::from_secs(2);
+
+/// How often measurements are condensed.
+const UPKEEP_EVERY: Duration = Duration::from_secs(5);
+
+/// Why the service did not start or run.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// The address cannot be listened on.
+    #[error("cannot listen on {listen}")]
+    Listen {
+        /// The address.
+        listen: SocketAddr,
+        /// Why not.
+        #[source]
+        source: std::io::Error,
+    },
+    /// The database cannot be used.
+    #[error("cannot use the database {database}")]
+    Store {
+        /// The database.
+        database: String,
+        /// Why not.
+        #[source]
+        source: StoreError,
+    },
+    /// Measurements cannot be set up.
+    #[error("cannot set up measurements")]
+    Measurements(#[from] metrics_exporter_prometheus::BuildError),
+    /// Connections could no longer be accepted.
+    #[error("serving failed")]
+    Serve(#[source] std::io::Error),
+}
+
+/// A service that listens.
+#[derive(Debug)]
+pub struct Server {
+    listener: TcpListener,
+    address: SocketAddr,
+    router: axum::Router,
+    tasks: TaskTracker,
+    stopping: CancellationToken,
+    abort: CancellationToken,
+    drain_timeout: Duration,
+}
+
+impl Server {
+    /// Opens the database and listens. Requests are answered from [`Self::run`] on.
+    ///
+    /// # Errors
+    ///
+    /// If the address, the database or the measurements cannot be had.
+    pub async fn start(config: &ServeConfig) -> Result<Self, ServerError> {
+        let (tasks, stopping, abort) = (TaskTracker::new(), CancellationToken::new(), CancellationToken::new());
+        let metrics = telemetry::measurements()?;
+        let etude = Etude::open(&config.settings(), &tasks, abort.clone()).await;
+        let etude = etude.map_err(|source| {
+            let database = config.database.display().to_string();
+            ServerError::Store { database, source }
+        })?;
+        let listen = |source| ServerError::Listen { listen: config.listen, source };
+        let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
+        let address = listener.local_addr().map_err(listen)?;
+        tasks.spawn(upkeep(metrics.clone(), stopping.clone()));
+        let router = http::router(Context {
+            etude: Arc::new(etude),
+            stopping: stopping.clone(),
+            max_body_bytes: config.max_body_bytes,
+            metrics,
+        });
+        Ok(Self { listener, address, router, tasks, stopping, abort, drain_timeout: config.drain_timeout })
+    }
+
+    /// Where it listens.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+
+    /// Serves until `stop` completes, then lets requests end within the drain time, aborts what is left, and closes the
+    /// database.
+    ///
+    /// # Errors
+    ///
+    /// If connections can no longer be accepted.
+    pub async fn run(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), ServerError> {
+        let Self { listener, address, router, tasks, stopping, abort, drain_timeout } = self;
+        tracing::info!(%address, "listening on http://{address}");
+        let listener = listener.tap_io(|stream| {
+            // Small answers should not wait for more.
+            if let Err(error) = stream.set_nodelay(true) {
+                tracing::debug!(error = &error as &dyn std::error::Error, "could not set TCP_NODELAY");
+            }
+        });
+        let announce = {
+            let stopping = stopping.clone();
+            async move {
+                stop.await;
+                tracing::info!("stopping");
+                stopping.cancel();
+            }
+        };
+        let serving = axum::serve(listener, router).with_graceful_shutdown(announce).into_future();
+        let overtime = async {
+            stopping.cancelled().await;
+            tokio::time::sleep(drain_timeout).await;
+            tracing::warn!("the drain time is over; aborting searches");
+            abort.cancel();
+            tokio::time::sleep(ABORT_GRACE).await;
+        };
+        tokio::select! {
+            served = serving => served.map_err(ServerError::Serve)?,
+            () = overtime => tracing::warn!("closing connections that are still open"),
+        }
+        // With the router went the application, and with it the way to the writer, which writes what waits and ends.
+        abort.cancel();
+        stopping.cancel();
+        tasks.close();
+        // A connection that would not close may still hold the application; the process ends without it.
+        let ended = tokio::time::timeout(ABORT_GRACE, tasks.wait()).await;
+        tracing::info!(is_clean = ended.is_ok(), "stopped");
+        Ok(())
+    }
+}
+
+async fn upkeep(metrics: metrics_exporter_prometheus::PrometheusHandle, stopping: CancellationToken) {
+    let mut ticks = tokio::time::interval(UPKEEP_EVERY);
+    loop {
+        tokio::select! {
+            _ = ticks.tick() => metrics.run_upkeep(),
+            () = stopping.cancelled() => return,
+        }
+    }
+}
+
+/// Completes at SIGTERM or SIGINT.
+///
+/// # Errors
+///
+/// If signals cannot be listened for.
+pub fn stop_signal() -> std::io::Result<impl Future<Output = ()> + Send + 'static> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
+    Ok(async move {
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = interrupt.recv() => {}
+        }
+    })
+}

@@ -1,0 +1,125 @@
+//! The application: what the service does, whatever it is asked through.
+//!
+//! ```text
+//! http, cli --> Etude --> SearchPool  (parsing of large bodies, compiling, searching: bounded, cancellable, off the async threads)
+//!                 |-----> MapperCache (models that are ready to be searched)
+//!                 +-----> Store       (what is durable)
+//! ```
+//!
+//! Everything that is spawned is tracked, and ends with [`Etude::close`].
+
+mod cache;
+mod models;
+mod name;
+mod policies;
+mod pool;
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+pub use models::{ModelAnswer, Registered};
+pub use name::{InvalidName, Name};
+pub use policies::MadePolicy;
+pub use pool::{PoolError, PoolSettings, SearchPool};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use crate::document::{Faults, ParseError};
+use crate::model::Limits;
+use crate::store::{Store, StoreError};
+use cache::MapperCache;
+
+/// How the service is set up.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Where the database is; created if missing.
+    pub database: PathBuf,
+    /// What a model may at most be.
+    pub limits: Limits,
+    /// Most bytes of models kept ready to be searched.
+    pub model_cache_bytes: u64,
+    /// Threads and queue of the searches.
+    pub pool: PoolSettings,
+}
+
+/// Why the service could not do as asked.
+#[derive(Debug, thiserror::Error)]
+pub enum ServiceError {
+    /// The body is not JSON.
+    #[error(transparent)]
+    Parse(#[from] ParseError),
+    /// The body is JSON, but not what was asked for.
+    #[error("{0}")]
+    Faults(#[from] Faults),
+    /// There is nothing of this kind with this name or id.
+    #[error("there is no {kind} {name:?}")]
+    Unknown {
+        /// What was looked for.
+        kind: &'static str,
+        /// By which name or id.
+        name: String,
+        /// Where the request's body names it, if it does.
+        pointer: Option<&'static str>,
+    },
+    /// The name is taken by something else.
+    #[error("model {name:?} exists with other content (hash {existing_hash}); delete it first or use another name")]
+    Conflict {
+        /// The name.
+        name: String,
+        /// The hash of what is there.
+        existing_hash: String,
+    },
+    /// The searches cannot keep up, or the service is shutting down.
+    #[error(transparent)]
+    Pool(#[from] PoolError),
+    /// The store failed.
+    #[error(transparent)]
+    Store(#[from] StoreError),
+    /// What was made could not be written as JSON: a defect.
+    #[error("an answer could not be written")]
+    Write(#[source] serde_json::Error),
+}
+
+/// The application.
+#[derive(Debug)]
+pub struct Etude {
+    store: Store,
+    pool: SearchPool,
+    mappers: MapperCache,
+    limits: Limits,
+}
+
+impl Etude {
+    /// Opens the database and gets ready. Whatever runs in the background runs in `tasks`; searches end when `abort` is
+    /// cancelled.
+    ///
+    /// # Errors
+    ///
+    /// If the database cannot be opened.
+    pub async fn open(settings: &Settings, tasks: &TaskTracker, abort: CancellationToken) -> Result<Self, StoreError> {
+        Ok(Self {
+            store: Store::open(&settings.database, tasks).await?,
+            pool: SearchPool::new(settings.pool, tasks.clone(), abort),
+            mappers: MapperCache::new(settings.model_cache_bytes),
+            limits: settings.limits,
+        })
+    }
+
+    /// Whether the service can do its work.
+    ///
+    /// # Errors
+    ///
+    /// If the database does not answer.
+    pub async fn check(&self) -> Result<(), StoreError> {
+        self.store.check().await
+    }
+
+    /// The pool that searches run on.
+    #[must_use]
+    pub fn pool(&self) -> &SearchPool {
+        &self.pool
+    }
+}
+
+/// How long to wait before trying again when the queue is full.
+pub const RETRY_AFTER: Duration = Duration::from_secs(1);

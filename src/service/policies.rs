@@ -1,0 +1,169 @@
+//! Policies: searched, stored, read.
+
+use std::time::{Duration, Instant};
+
+use jiff::Timestamp;
+use serde::Serialize;
+use serde_json::Value;
+use serde_json::value::RawValue;
+use uuid::Uuid;
+
+use super::{Etude, ServiceError};
+use crate::document::{self, Faults, Place};
+use crate::interrupt::{Cancelled, Interrupt};
+use crate::mapping::{Mapper, Policy, PolicySummary, Request, Stamp};
+use crate::store::{NewPolicy, Page, StoreError};
+
+/// Bodies up to this size are parsed where they arrive, which takes less than a millisecond; larger ones in the pool.
+const MAX_INLINE_BYTES: usize = 64 * 1024;
+
+/// A policy that was just made and stored.
+#[derive(Debug)]
+pub struct MadePolicy {
+    /// Its id.
+    pub id: String,
+    /// The policy: JSON.
+    pub policy: String,
+}
+
+impl Etude {
+    /// Makes a policy for the request in `body` (JSON), and stores it. The request came at `arrived`, from which its deadline
+    /// counts; `now` is the same moment on the calendar.
+    ///
+    /// # Errors
+    ///
+    /// If the body is no request, names no model, or the service cannot do it now.
+    pub async fn make_policy(
+        &self,
+        body: impl AsRef<[u8]> + Send + 'static,
+        arrived: Instant,
+        now: Timestamp,
+    ) -> Result<MadePolicy, ServiceError> {
+        let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
+            document::parse(body.as_ref())
+        } else {
+            self.pool.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
+        };
+        let document = document?;
+        let (envelope, faults) = Envelope::read(&document);
+        // With the help of the model, more faults may be found; so those found without it wait.
+        let Some(envelope) = envelope else { return Err(faults.into()) };
+        let found = match &envelope.learner {
+            Some(learner) => Err(unknown_learner(learner)),
+            None => self.mapper(&envelope.model, "/model").await,
+        };
+        let (model_hash, mapper) = match found {
+            Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
+            found => found?,
+        };
+
+        let id = Uuid::now_v7().to_string();
+        let stamp = Stamp { id: Some(id.clone()), model: envelope.model, model_hash, elapsed_us: 0 };
+        let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
+        let job = move |interrupt: &mut dyn Interrupt| search(&mapper, &document, stamp, interrupt);
+        let Searched { policy, summary } = self.pool.run(deadline, job).await??;
+        let row = NewPolicy { id: id.clone(), summary, policy: policy.clone(), created_at: now };
+        self.store.add_policy(row).await?;
+        Ok(MadePolicy { id, policy })
+    }
+
+    /// The policy with this id: JSON.
+    ///
+    /// # Errors
+    ///
+    /// If there is none.
+    pub async fn policy(&self, id: &str) -> Result<String, ServiceError> {
+        let unknown = || ServiceError::Unknown { kind: "policy", name: id.to_owned(), pointer: None };
+        self.store.policy(id).await?.ok_or_else(unknown)
+    }
+
+    /// At most `limit` policies without their steps (JSON), in the order in which they were stored, from the first after
+    /// the sequence number `after`.
+    ///
+    /// # Errors
+    ///
+    /// If the store failed.
+    pub async fn policies(&self, after: i64, limit: u32) -> Result<Page<Box<RawValue>>, ServiceError> {
+        let Page { items, next } = self.store.policies(after, limit).await?;
+        let read = |row: crate::store::PolicySummaryRow| {
+            RawValue::from_string(row.summary).map_err(|error| StoreError::Corrupt {
+                table: "policies",
+                column: "summary",
+                source: error.into(),
+            })
+        };
+        Ok(Page { items: items.into_iter().map(read).collect::<Result<_, _>>()?, next })
+    }
+}
+
+/// What must be known of a request before its model is at hand.
+struct Envelope {
+    model: String,
+    learner: Option<String>,
+    deadline: Option<Duration>,
+}
+
+impl Envelope {
+    /// Reads what can be read without the model, and gives the names if they could be read. Faults may have been found either
+    /// way.
+    fn read(document: &Value) -> (Option<Self>, Faults) {
+        let mut faults = Faults::default();
+        let root = Place::root(document);
+        let Some(object) = root.object(&Request::FIELDS, &mut faults) else { return (None, faults) };
+        let model = object.required("model", &mut faults).and_then(|place| place.string(&mut faults));
+        let learner = object.optional("learner").map(|place| place.string(&mut faults));
+        object.required("demonstration", &mut faults);
+        let options = Request::read_options(&object, &mut faults);
+        let names = model.zip(learner.map_or(Some(None), |learner| learner.map(Some)));
+        let envelope = names.map(|(model, learner)| Self {
+            model: model.to_owned(),
+            learner: learner.map(str::to_owned),
+            deadline: options.and_then(|(_, deadline)| deadline),
+        });
+        (envelope, faults)
+    }
+}
+
+fn unknown_learner(name: &str) -> ServiceError {
+    ServiceError::Unknown { kind: "learner", name: name.to_owned(), pointer: Some("/learner") }
+}
+
+/// A policy and its summary: JSON.
+struct Searched {
+    policy: String,
+    summary: String,
+}
+
+/// Reads the request against its model, searches, and writes the policy.
+fn search(
+    mapper: &Mapper,
+    document: &Value,
+    stamp: Stamp,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Result<Searched, ServiceError>, Cancelled> {
+    let mut faults = Faults::default();
+    let root = Place::root(document);
+    let object = root.object(&Request::FIELDS, &mut faults);
+    let request = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
+    let Request { problem, settings, .. } = match faults.check(request) {
+        Ok(request) => request,
+        Err(faults) => return Ok(Err(faults.into())),
+    };
+    let started = Instant::now();
+    let mapping = mapper.map(&problem, settings, interrupt)?;
+    let elapsed_us = u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
+    tracing::info!(
+        model = stamp.model,
+        status = mapping.status.name(),
+        cost = mapping.cost.total,
+        expanded = mapping.n_expanded,
+        elapsed_us,
+        "searched"
+    );
+    let policy = Policy::new(Stamp { elapsed_us, ..stamp }, &problem, &mapping);
+    Ok(write(&policy).and_then(|text| Ok(Searched { policy: text, summary: write(&PolicySummary::of(&policy))? })))
+}
+
+fn write(document: &impl Serialize) -> Result<String, ServiceError> {
+    serde_json::to_string(document).map_err(ServiceError::Write)
+}

@@ -1,0 +1,181 @@
+//! The bounded pool that everything CPU-bound runs on.
+//!
+//! A job is admitted if fewer than `n_threads + max_waiting` are in the pool, waits for a thread, and runs there. Whoever waits for
+//! a job may go away at any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`].
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use tokio::sync::Semaphore;
+use tokio_util::sync::{CancellationToken, DropGuard};
+use tokio_util::task::TaskTracker;
+
+use crate::interrupt::{Cancelled, Interrupt, Signal};
+
+/// Size of the pool.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PoolSettings {
+    /// Jobs that run at the same time. At least 1.
+    pub n_threads: usize,
+    /// Jobs that wait; further ones are refused.
+    pub max_waiting: usize,
+}
+
+/// Why a job has no answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum PoolError {
+    /// As many jobs wait as may.
+    #[error("too many requests are waiting to be searched; try again shortly")]
+    Busy,
+    /// The service is shutting down, and the job was stopped.
+    #[error("the service is shutting down")]
+    Stopped,
+    /// The job panicked: a defect. The panic was logged.
+    #[error("the search failed")]
+    Panicked,
+}
+
+/// The pool.
+#[derive(Clone, Debug)]
+pub struct SearchPool {
+    settings: PoolSettings,
+    admitted: Arc<Semaphore>,
+    threads: Arc<Semaphore>,
+    tasks: TaskTracker,
+    abort: CancellationToken,
+}
+
+impl SearchPool {
+    /// A pool whose jobs run in `tasks` and stop when `abort` is cancelled.
+    #[must_use]
+    pub fn new(settings: PoolSettings, tasks: TaskTracker, abort: CancellationToken) -> Self {
+        let n_threads = settings.n_threads.max(1);
+        Self {
+            settings,
+            admitted: Arc::new(Semaphore::new(n_threads + settings.max_waiting)),
+            threads: Arc::new(Semaphore::new(n_threads)),
+            tasks,
+            abort,
+        }
+    }
+
+    /// How many jobs are in the pool, waiting or running.
+    #[must_use]
+    pub fn n_jobs(&self) -> usize {
+        self.settings.n_threads.max(1) + self.settings.max_waiting - self.admitted.available_permits()
+    }
+
+    /// Runs `job` on a thread of the pool. It is told to finish when `deadline` has passed, and to stop when the returned
+    /// future is dropped or the service ends.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Busy`] at once if the queue is full; [`PoolError::Stopped`] if the job was told to stop.
+    pub async fn run<T, F>(&self, deadline: Option<Instant>, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
+        let admitted = Arc::clone(&self.admitted).try_acquire_owned().map_err(|_| PoolError::Busy)?;
+        let cancel = self.abort.child_token();
+        // Dropped with this future: whoever waited is gone.
+        let _gone: DropGuard = cancel.clone().drop_guard();
+        let thread = tokio::select! {
+            thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped)?,
+            () = cancel.cancelled() => return Err(PoolError::Stopped),
+        };
+        let span = tracing::Span::current();
+        let running = self.tasks.spawn_blocking(move || {
+            // Held until the job has really ended, even if nobody waits for it any more.
+            let _held = (admitted, thread);
+            let mut interrupt = Watch { cancel, deadline };
+            span.in_scope(|| job(&mut interrupt))
+        });
+        match running.await {
+            Ok(Ok(answer)) => Ok(answer),
+            Ok(Err(Cancelled)) => Err(PoolError::Stopped),
+            Err(_) => Err(PoolError::Panicked),
+        }
+    }
+}
+
+/// Looks at the token and the clock when asked.
+struct Watch {
+    cancel: CancellationToken,
+    deadline: Option<Instant>,
+}
+
+impl Interrupt for Watch {
+    fn poll(&mut self) -> Signal {
+        if self.cancel.is_cancelled() {
+            return Signal::Cancel;
+        }
+        match self.deadline {
+            Some(deadline) if Instant::now() >= deadline => Signal::Finish,
+            _ => Signal::Continue,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pool(n_threads: usize, max_waiting: usize) -> (SearchPool, CancellationToken) {
+        let abort = CancellationToken::new();
+        (SearchPool::new(PoolSettings { n_threads, max_waiting }, TaskTracker::new(), abort.clone()), abort)
+    }
+
+    fn until_cancelled(interrupt: &mut dyn Interrupt) -> Result<(), Cancelled> {
+        loop {
+            match interrupt.poll() {
+                Signal::Cancel => return Err(Cancelled),
+                Signal::Finish => return Ok(()),
+                Signal::Continue => std::thread::yield_now(),
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn a_dropped_waiter_cancels_its_job_and_frees_the_thread() {
+        let (pool, _abort) = pool(1, 0);
+        let waiting = tokio::spawn({
+            let pool = pool.clone();
+            async move { pool.run(None, until_cancelled).await }
+        });
+        while pool.n_jobs() == 0 {
+            tokio::task::yield_now().await;
+        }
+        waiting.abort();
+        while pool.n_jobs() > 0 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(pool.run(None, |_| Ok(7)).await, Ok(7));
+    }
+
+    #[tokio::test]
+    async fn a_full_queue_refuses_at_once_and_a_shutdown_stops_what_runs() {
+        let (pool, abort) = pool(1, 1);
+        let running = tokio::spawn({
+            let pool = pool.clone();
+            async move { pool.run(None, until_cancelled).await }
+        });
+        let waiting = tokio::spawn({
+            let pool = pool.clone();
+            async move { pool.run(None, until_cancelled).await }
+        });
+        while pool.n_jobs() < 2 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(pool.run(None, |_| Ok(())).await, Err(PoolError::Busy));
+        abort.cancel();
+        assert_eq!(running.await.unwrap(), Err(PoolError::Stopped));
+        assert_eq!(waiting.await.unwrap(), Err(PoolError::Stopped));
+    }
+
+    #[tokio::test]
+    async fn a_passed_deadline_asks_the_job_to_finish() {
+        let (pool, _abort) = pool(1, 0);
+        assert_eq!(pool.run(Some(Instant::now()), until_cancelled).await, Ok(()));
+    }
+}

@@ -1,0 +1,168 @@
+//! All SQL: what is durable, in SQLite.
+//!
+//! ```text
+//! service --Write--> queue --> writer (one task, one connection): groups what is waiting into one transaction
+//!    |                            BEGIN IMMEDIATE .. COMMIT (WAL, synchronous = FULL), then answers every waiter
+//!    +------ reads ------------> pool of readers (query_only)
+//! ```
+//!
+//! A write that was answered is on disk. Rows become domain types here and nowhere else; times are milliseconds since 1970,
+//! documents are JSON text.
+
+mod models;
+mod policies;
+mod writer;
+
+use std::path::Path;
+use std::time::Duration;
+
+pub use models::{ModelRow, ModelSummary, NewModel, PutModel};
+pub use policies::{NewPolicy, PolicySummaryRow};
+use sqlx::migrate::{Migration, MigrationType, Migrator};
+use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
+use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection};
+use tokio_util::task::TaskTracker;
+use writer::Writer;
+
+/// Earlier ones can corrupt a database in WAL mode.
+const LEAST_SQLITE_VERSION: (u32, u32, u32) = (3, 51, 3);
+
+/// How long a connection waits for another process's lock.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Readers at the same time. Reads are short, and there are few cores.
+const N_READERS: u32 = 4;
+
+/// Why the store could not do as told.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// The database failed.
+    #[error("the database failed")]
+    Database(#[from] sqlx::Error),
+    /// The database could not be brought to this version's schema.
+    #[error("the database could not be migrated")]
+    Migrate(#[from] sqlx::migrate::MigrateError),
+    /// The SQLite that this program was linked with is too old.
+    #[error("SQLite {found} can corrupt a database in WAL mode; {}.{}.{} is needed", needed.0, needed.1, needed.2)]
+    Version {
+        /// Its version.
+        found: String,
+        /// The oldest that will do.
+        needed: (u32, u32, u32),
+    },
+    /// A row holds what this program never writes.
+    #[error("table {table} holds an invalid {column}")]
+    Corrupt {
+        /// Where.
+        table: &'static str,
+        /// In which column.
+        column: &'static str,
+        /// What is wrong with it.
+        #[source]
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    /// The store is shutting down, or its writer failed with the error that was given to another waiter.
+    #[error("the store takes no more writes")]
+    Closed,
+}
+
+/// The durable state of the service.
+#[derive(Debug)]
+pub struct Store {
+    readers: SqlitePool,
+    writer: Writer,
+}
+
+impl Store {
+    /// Opens the database at `path`, creating and migrating it as needed. The writer runs in `tasks` until the store is
+    /// dropped.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be opened or migrated, or SQLite is too old.
+    pub async fn open(path: &Path, tasks: &TaskTracker) -> Result<Self, StoreError> {
+        let options = SqliteConnectOptions::new()
+            .filename(path)
+            .create_if_missing(true)
+            .journal_mode(SqliteJournalMode::Wal)
+            .synchronous(SqliteSynchronous::Full)
+            .busy_timeout(BUSY_TIMEOUT)
+            .disable_statement_logging();
+        let mut connection = SqliteConnection::connect_with(&options).await?;
+        check_version(&mut connection).await?;
+        migrator().run_direct(None, &mut connection, false).await?;
+        let readers = SqlitePoolOptions::new()
+            .max_connections(N_READERS)
+            .connect_with(options.create_if_missing(false).pragma("query_only", "ON"))
+            .await?;
+        Ok(Self { readers, writer: Writer::start(connection, tasks) })
+    }
+
+    /// Whether the database answers.
+    ///
+    /// # Errors
+    ///
+    /// If it does not.
+    pub async fn check(&self) -> Result<(), StoreError> {
+        sqlx::query("SELECT 1").execute(&self.readers).await?;
+        Ok(())
+    }
+}
+
+/// Every migration, in order. They are part of the program, so that it runs wherever it is copied to.
+fn migrator() -> Migrator {
+    let migration = |version, description: &'static str, sql: &'static str| {
+        Migration::new(version, description.into(), MigrationType::Simple, sql.into_sql_str(), false)
+    };
+    Migrator {
+        migrations: vec![migration(
+            1,
+            "models and policies",
+            include_str!("../../migrations/0001_models_and_policies.sql"),
+        )]
+        .into(),
+        ..Migrator::DEFAULT
+    }
+}
+
+async fn check_version(connection: &mut SqliteConnection) -> Result<(), StoreError> {
+    let found: String = sqlx::query_scalar("SELECT sqlite_version()").fetch_one(connection).await?;
+    let mut parts = found.split('.').map(|part| part.parse::<u32>().unwrap_or(0));
+    let mut next = || parts.next().unwrap_or(0);
+    let version = (next(), next(), next());
+    if version < LEAST_SQLITE_VERSION {
+        return Err(StoreError::Version { found, needed: LEAST_SQLITE_VERSION });
+    }
+    Ok(())
+}
+
+/// A part of a long list.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Page<T> {
+    /// The items, in order.
+    pub items: Vec<T>,
+    /// The key of the last item, if there are more.
+    pub next: Option<String>,
+}
+
+impl<T> Page<T> {
+    /// Makes a page of at most `limit` of `rows`, of which the query asked for one more than that.
+    fn of(mut rows: Vec<T>, limit: u32, key: impl Fn(&T) -> String) -> Self {
+        let limit = limit as usize;
+        let has_more = rows.len() > limit;
+        rows.truncate(limit);
+        let next = if has_more { rows.last().map(key) } else { None };
+        Self { items: rows, next }
+    }
+}
+
+fn corrupt<E: Into<Box<dyn std::error::Error + Send + Sync>>>(
+    table: &'static str,
+    column: &'static str,
+) -> impl FnOnce(E) -> StoreError {
+    move |source| StoreError::Corrupt { table, column, source: source.into() }
+}
+
+fn timestamp(table: &'static str, column: &'static str, ms: i64) -> Result<jiff::Timestamp, StoreError> {
+    jiff::Timestamp::from_millisecond(ms).map_err(corrupt(table, column))
+}

@@ -1,0 +1,183 @@
+//! The table of models.
+
+use jiff::Timestamp;
+use sqlx::Row;
+use sqlx::SqliteConnection;
+use sqlx::sqlite::SqliteRow;
+
+use super::writer::{Write, Written};
+use super::{Page, Store, StoreError, corrupt, timestamp};
+use crate::attribute::AttributeDocument;
+use crate::model::ActionDocument;
+
+/// What is kept of a model besides its definition.
+#[derive(Clone, Debug, PartialEq)]
+pub struct ModelSummary {
+    /// The name it is registered under.
+    pub name: String,
+    /// SHA-256 of its canonical text.
+    pub hash: String,
+    /// Its attributes, in order.
+    pub attributes: Vec<AttributeDocument>,
+    /// The actions of the body, in order.
+    pub actions: Vec<ActionDocument>,
+    /// How many states it has.
+    pub n_states: u64,
+    /// How many transitions it has.
+    pub n_transitions: u64,
+    /// How many of its states are unsafe.
+    pub n_unsafe: u64,
+    /// When it was registered.
+    pub created_at: Timestamp,
+}
+
+/// A model to be registered.
+#[derive(Clone, Debug)]
+pub struct NewModel {
+    /// What is kept besides the definition.
+    pub summary: ModelSummary,
+    /// Its canonical text.
+    pub definition: String,
+}
+
+/// A model as it is stored.
+#[derive(Clone, Debug)]
+pub struct ModelRow {
+    /// What is kept besides the definition.
+    pub summary: ModelSummary,
+    /// Its canonical text.
+    pub definition: String,
+}
+
+/// What became of a registration.
+#[derive(Clone, Debug, PartialEq)]
+pub enum PutModel {
+    /// It is new.
+    Created(ModelSummary),
+    /// The same content was there already, under the same name.
+    Unchanged(ModelSummary),
+    /// Other content is there under this name; it was left alone.
+    Conflict {
+        /// The hash of what is there.
+        existing_hash: String,
+    },
+}
+
+impl Store {
+    /// Registers a model, unless its name is taken.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn put_model(&self, model: NewModel) -> Result<PutModel, StoreError> {
+        match self.writer.write(Write::PutModel(model)).await? {
+            Written::PutModel(put) => Ok(put),
+            _ => Err(StoreError::Closed),
+        }
+    }
+
+    /// Deletes a model. Says whether there was one.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn delete_model(&self, name: &str) -> Result<bool, StoreError> {
+        match self.writer.write(Write::DeleteModel(name.to_owned())).await? {
+            Written::DeleteModel(existed) => Ok(existed),
+            _ => Err(StoreError::Closed),
+        }
+    }
+
+    /// The model called `name`.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn model(&self, name: &str) -> Result<Option<ModelRow>, StoreError> {
+        let query = sqlx::query("SELECT * FROM models WHERE name = $1").bind(name);
+        let row = query.fetch_optional(&self.readers).await?;
+        let read =
+            |row: SqliteRow| Ok(ModelRow { summary: read_summary(&row)?, definition: row.try_get("definition")? });
+        row.map(read).transpose()
+    }
+
+    /// The hash of the model called `name`.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn model_hash(&self, name: &str) -> Result<Option<String>, StoreError> {
+        let query = sqlx::query_scalar("SELECT hash FROM models WHERE name = $1").bind(name);
+        Ok(query.fetch_optional(&self.readers).await?)
+    }
+
+    /// At most `limit` models in the order of their names, from the first after `after`.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn models(&self, after: Option<&str>, limit: u32) -> Result<Page<ModelSummary>, StoreError> {
+        let query = sqlx::query(
+            "SELECT name, hash, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms
+             FROM models WHERE name > $1 ORDER BY name LIMIT $2",
+        );
+        let query = query.bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
+        let rows = query.fetch_all(&self.readers).await?;
+        let models = rows.iter().map(read_summary).collect::<Result<Vec<_>, _>>()?;
+        Ok(Page::of(models, limit, |model| model.name.clone()))
+    }
+}
+
+fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
+    const TABLE: &str = "models";
+    let count = |column: &'static str| -> Result<u64, StoreError> {
+        u64::try_from(row.try_get::<i64, _>(column)?).map_err(corrupt(TABLE, column))
+    };
+    Ok(ModelSummary {
+        name: row.try_get("name")?,
+        hash: row.try_get("hash")?,
+        attributes: serde_json::from_str(row.try_get("attributes")?).map_err(corrupt(TABLE, "attributes"))?,
+        actions: serde_json::from_str(row.try_get("actions")?).map_err(corrupt(TABLE, "actions"))?,
+        n_states: count("n_states")?,
+        n_transitions: count("n_transitions")?,
+        n_unsafe: count("n_unsafe")?,
+        created_at: timestamp(TABLE, "created_at_ms", row.try_get("created_at_ms")?)?,
+    })
+}
+
+pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> Result<PutModel, StoreError> {
+    let NewModel { summary, definition } = model;
+    let json = |source: serde_json::Error| corrupt("models", "attributes")(source);
+    let count = |count: u64| i64::try_from(count).unwrap_or(i64::MAX);
+    let inserted = sqlx::query(
+        "INSERT INTO models
+             (name, hash, definition, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9) ON CONFLICT (name) DO NOTHING",
+    )
+    .bind(&summary.name)
+    .bind(&summary.hash)
+    .bind(definition)
+    .bind(serde_json::to_string(&summary.attributes).map_err(json)?)
+    .bind(serde_json::to_string(&summary.actions).map_err(json)?)
+    .bind(count(summary.n_states))
+    .bind(count(summary.n_transitions))
+    .bind(count(summary.n_unsafe))
+    .bind(summary.created_at.as_millisecond())
+    .execute(&mut *connection)
+    .await?;
+    if inserted.rows_affected() == 1 {
+        return Ok(PutModel::Created(summary.clone()));
+    }
+    let query = sqlx::query("SELECT * FROM models WHERE name = $1").bind(&summary.name);
+    let existing = read_summary(&query.fetch_one(connection).await?)?;
+    Ok(if existing.hash == summary.hash {
+        PutModel::Unchanged(existing)
+    } else {
+        PutModel::Conflict { existing_hash: existing.hash }
+    })
+}
+
+pub(super) async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<bool, StoreError> {
+    let deleted = sqlx::query("DELETE FROM models WHERE name = $1").bind(name).execute(connection).await?;
+    Ok(deleted.rows_affected() > 0)
+}

@@ -1,0 +1,82 @@
+//! The table of policies.
+
+use jiff::Timestamp;
+use sqlx::{Row, SqliteConnection};
+
+use super::writer::{Write, Written};
+use super::{Page, Store, StoreError, corrupt};
+
+/// A policy to be stored.
+#[derive(Clone, Debug)]
+pub struct NewPolicy {
+    /// Its id, unique.
+    pub id: String,
+    /// JSON: the policy without its steps.
+    pub summary: String,
+    /// JSON: the whole policy.
+    pub policy: String,
+    /// When it was made.
+    pub created_at: Timestamp,
+}
+
+/// A policy without its steps, as it is stored.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PolicySummaryRow {
+    /// The order in which it became durable.
+    pub sequence: i64,
+    /// JSON.
+    pub summary: String,
+}
+
+impl Store {
+    /// Stores a policy.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn add_policy(&self, policy: NewPolicy) -> Result<(), StoreError> {
+        match self.writer.write(Write::AddPolicy(policy)).await? {
+            Written::AddPolicy => Ok(()),
+            _ => Err(StoreError::Closed),
+        }
+    }
+
+    /// The policy with this id: JSON.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn policy(&self, id: &str) -> Result<Option<String>, StoreError> {
+        let query = sqlx::query_scalar("SELECT policy FROM policies WHERE id = $1").bind(id);
+        Ok(query.fetch_optional(&self.readers).await?)
+    }
+
+    /// At most `limit` policies in the order in which they became durable, from the first after the sequence number
+    /// `after`.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn policies(&self, after: i64, limit: u32) -> Result<Page<PolicySummaryRow>, StoreError> {
+        let query =
+            sqlx::query("SELECT sequence, summary FROM policies WHERE sequence > $1 ORDER BY sequence LIMIT $2");
+        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch_all(&self.readers).await?;
+        let read = |row: &sqlx::sqlite::SqliteRow| -> Result<PolicySummaryRow, StoreError> {
+            let sequence = row.try_get("sequence").map_err(corrupt("policies", "sequence"))?;
+            Ok(PolicySummaryRow { sequence, summary: row.try_get("summary")? })
+        };
+        let policies = rows.iter().map(read).collect::<Result<Vec<_>, _>>()?;
+        Ok(Page::of(policies, limit, |policy| policy.sequence.to_string()))
+    }
+}
+
+pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -> Result<(), StoreError> {
+    sqlx::query("INSERT INTO policies (id, summary, policy, created_at_ms) VALUES ($1, $2, $3, $4)")
+        .bind(&policy.id)
+        .bind(&policy.summary)
+        .bind(&policy.policy)
+        .bind(policy.created_at.as_millisecond())
+        .execute(connection)
+        .await?;
+    Ok(())
+}

@@ -1,0 +1,113 @@
+//! The one writer, which groups commits.
+//!
+//! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies
+//! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves.
+
+use sqlx::{Connection, SqliteConnection};
+use tokio::sync::{mpsc, oneshot};
+use tokio_util::task::TaskTracker;
+
+use super::{NewModel, NewPolicy, PutModel, StoreError, models, policies};
+
+/// Most writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
+const MAX_GROUP: usize = 256;
+
+/// Most writes that wait. Beyond this, writers wait to get in line, which slows their clients down.
+const MAX_WAITING: usize = 1024;
+
+/// Something to be written.
+#[derive(Debug)]
+pub(super) enum Write {
+    PutModel(NewModel),
+    DeleteModel(String),
+    AddPolicy(NewPolicy),
+}
+
+/// What became of a [`Write`].
+#[derive(Debug)]
+pub(super) enum Written {
+    PutModel(PutModel),
+    /// Whether there was one.
+    DeleteModel(bool),
+    AddPolicy,
+}
+
+#[derive(Debug)]
+struct Job {
+    write: Write,
+    answer: oneshot::Sender<Result<Written, StoreError>>,
+}
+
+/// The way to the writer.
+#[derive(Debug)]
+pub(super) struct Writer {
+    queue: mpsc::Sender<Job>,
+}
+
+impl Writer {
+    /// Starts the writer in `tasks`. It ends when this handle is dropped and everything waiting has been written.
+    pub(super) fn start(connection: SqliteConnection, tasks: &TaskTracker) -> Self {
+        let (queue, jobs) = mpsc::channel(MAX_WAITING);
+        tasks.spawn(run(connection, jobs));
+        Self { queue }
+    }
+
+    /// Writes, and returns once it is on disk. A caller that goes away does not undo its write.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed; then nothing of `write` was done.
+    pub(super) async fn write(&self, write: Write) -> Result<Written, StoreError> {
+        let (answer, answered) = oneshot::channel();
+        self.queue.send(Job { write, answer }).await.map_err(|_| StoreError::Closed)?;
+        answered.await.map_err(|_| StoreError::Closed)?
+    }
+}
+
+async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>) {
+    let mut group = Vec::with_capacity(MAX_GROUP);
+    while jobs.recv_many(&mut group, MAX_GROUP).await > 0 {
+        match commit(&mut connection, &group).await {
+            Ok(written) => {
+                for (job, written) in group.drain(..).zip(written) {
+                    // Whoever waited may be gone.
+                    let _ = job.answer.send(Ok(written));
+                }
+            }
+            Err(_) if group.len() > 1 => {
+                // One write must not spoil the others: each gets a transaction and an error of its own.
+                for job in group.drain(..) {
+                    let written = commit(&mut connection, std::slice::from_ref(&job)).await;
+                    let _ = job.answer.send(written.and_then(|mut written| written.pop().ok_or(StoreError::Closed)));
+                }
+            }
+            Err(error) => {
+                if let Some(job) = group.pop() {
+                    let _ = job.answer.send(Err(error));
+                }
+            }
+        }
+    }
+    // Checkpoints the log, so that what is left behind is a single file.
+    if let Err(error) = connection.close().await {
+        tracing::warn!(error = &error as &dyn std::error::Error, "the database was not closed cleanly");
+    }
+}
+
+/// Applies `group` in one transaction.
+async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<Written>, StoreError> {
+    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    let mut written = Vec::with_capacity(group.len());
+    for job in group {
+        written.push(match &job.write {
+            Write::PutModel(model) => Written::PutModel(models::put(&mut transaction, model).await?),
+            Write::DeleteModel(name) => Written::DeleteModel(models::delete(&mut transaction, name).await?),
+            Write::AddPolicy(policy) => {
+                policies::add(&mut transaction, policy).await?;
+                Written::AddPolicy
+            }
+        });
+    }
+    transaction.commit().await?;
+    Ok(written)
+}

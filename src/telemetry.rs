@@ -1,0 +1,69 @@
+//! Logs and measurements of the process.
+
+use std::io::IsTerminal;
+use std::sync::{Mutex, PoisonError};
+
+use clap::{Args, ValueEnum};
+use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle};
+use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::ParseError;
+
+/// What is logged, and how. Logs go to standard error.
+#[derive(Args, Clone, Debug)]
+pub struct LogConfig {
+    /// What is logged: a level, or directives such as `etude=debug,sqlx=warn` [default: info for serve, else warn].
+    #[arg(long = "log", env = "ETUDE_LOG", value_name = "FILTER", global = true)]
+    pub filter: Option<String>,
+    /// How lines are written.
+    #[arg(long = "log-format", env = "ETUDE_LOG_FORMAT", value_enum, default_value_t, global = true)]
+    pub format: LogFormat,
+}
+
+/// How log lines are written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum LogFormat {
+    /// For people; in colour on a terminal.
+    #[default]
+    Text,
+    /// One JSON object a line.
+    Json,
+}
+
+/// Starts logging; what `default_filter` says if `config` says nothing.
+///
+/// # Errors
+///
+/// If the filter is none.
+pub fn start_logging(config: &LogConfig, default_filter: &str) -> Result<(), ParseError> {
+    let filter = EnvFilter::try_new(config.filter.as_deref().unwrap_or(default_filter))?;
+    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    match config.format {
+        LogFormat::Text => builder.with_ansi(std::io::stderr().is_terminal()).init(),
+        LogFormat::Json => builder.json().flatten_event(true).with_current_span(true).with_span_list(false).init(),
+    }
+    Ok(())
+}
+
+/// Seconds. From a search of a small world to one that takes minutes.
+const DURATION_BUCKETS: [f64; 14] =
+    [0.000_1, 0.000_3, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0];
+
+/// What is measured in this process. The first call installs the recorder.
+///
+/// # Errors
+///
+/// If the recorder cannot be built.
+pub fn measurements() -> Result<PrometheusHandle, BuildError> {
+    static HANDLE: Mutex<Option<PrometheusHandle>> = Mutex::new(None);
+    let mut installed = HANDLE.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(handle) = &*installed {
+        return Ok(handle.clone());
+    }
+    let durations = Matcher::Suffix("_seconds".to_owned());
+    let recorder = PrometheusBuilder::new().set_buckets_for_metric(durations, &DURATION_BUCKETS)?.build_recorder();
+    let handle = installed.insert(recorder.handle()).clone();
+    if metrics::set_global_recorder(recorder).is_err() {
+        tracing::warn!("another recorder of measurements is installed; /metrics will stay empty");
+    }
+    Ok(handle)
+}
