@@ -61,6 +61,7 @@ pub enum ServerError {
 pub struct Server {
     listener: TcpListener,
     address: SocketAddr,
+    etude: Arc<Etude>,
     router: axum::Router,
     tasks: TaskTracker,
     stopping: CancellationToken,
@@ -86,13 +87,14 @@ impl Server {
         let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
         tasks.spawn(upkeep(metrics.clone(), stopping.clone()));
+        let etude = Arc::new(etude);
         let router = http::router(Context {
-            etude: Arc::new(etude),
+            etude: Arc::clone(&etude),
             stopping: stopping.clone(),
             max_body_bytes: config.max_body_bytes,
             metrics,
         });
-        Ok(Self { listener, address, router, tasks, stopping, abort, drain_timeout: config.drain_timeout })
+        Ok(Self { listener, address, etude, router, tasks, stopping, abort, drain_timeout: config.drain_timeout })
     }
 
     /// Where it listens.
@@ -108,7 +110,7 @@ impl Server {
     ///
     /// If connections can no longer be accepted.
     pub async fn run(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), ServerError> {
-        let Self { listener, address, router, tasks, stopping, abort, drain_timeout } = self;
+        let Self { listener, address, etude, router, tasks, stopping, abort, drain_timeout } = self;
         tracing::info!(%address, "listening on http://{address}");
         let listener = listener.tap_io(|stream| {
             // Small answers should not wait for more.
@@ -136,11 +138,11 @@ impl Server {
             served = serving => served.map_err(ServerError::Serve)?,
             () = overtime => tracing::warn!("closing connections that are still open"),
         }
-        // With the router went the application, and with it the way to the writer, which writes what waits and ends.
         abort.cancel();
         stopping.cancel();
+        etude.close().await;
         tasks.close();
-        // A connection that would not close may still hold the application; the process ends without it.
+        // A search that does not look up would keep the process; it ends without it.
         let ended = tokio::time::timeout(ABORT_GRACE, tasks.wait()).await;
         tracing::info!(is_clean = ended.is_ok(), "stopped");
         Ok(())

@@ -98,8 +98,8 @@ impl Map {
             Value::Object(request) => request,
             demonstration => Members::from_iter([("demonstration".to_owned(), demonstration)]),
         };
-        let name = self.model.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-        request.insert("model".to_owned(), name.into());
+        let stem = || self.model.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+        request.entry("model").or_insert_with(|| stem().into());
         if !self.weights.is_empty() {
             let weights = request.entry("weights").or_insert_with(|| json!({}));
             for (attribute, weight) in &self.weights {

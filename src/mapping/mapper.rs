@@ -136,13 +136,16 @@ impl Mapper {
             },
             HeuristicName::None => admissible(problem, &Blind, budget, interrupt),
             HeuristicName::Paper => {
-                let paper = Paper::new(problem);
-                let found = search(problem, &paper, budget, interrupt)?;
+                let found = search(problem, &Paper::new(problem), budget, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, problem.start);
-                let projected = Projected::solve(&self.projections, problem, interrupt)?;
-                let to_go = projected.map_or(0.0, |projected| projected.cost_to_go(0, problem.start));
-                Ok(conclude(problem, &paper, found, first + to_go))
+                Ok(match Projected::solve(&self.projections, problem, interrupt)? {
+                    Some(projected) => {
+                        let lower_bound = first + projected.cost_to_go(0, problem.start);
+                        conclude(problem, &projected, found, lower_bound)
+                    }
+                    None => conclude(problem, &Blind, found, first),
+                })
             }
         }
     }
@@ -159,7 +162,7 @@ fn admissible<H: Heuristic>(
     Ok(conclude(problem, heuristic, found, lower_bound))
 }
 
-/// Completes what was found, and says what is proven if no mapping costs less than `lower_bound`.
+/// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than `lower_bound`.
 fn conclude<H: Heuristic>(problem: &Problem<'_>, heuristic: &H, found: Found, lower_bound: f64) -> Mapping {
     /// Sums in different orders may differ by rounding; what is closer than this, relatively, is the same.
     const ROUNDING: f64 = 1e-12;

@@ -55,8 +55,9 @@ pub(super) struct Found {
     pub(super) n_generated: u64,
 }
 
-/// How many nodes are expanded between two looks at the interrupt.
-const POLL_EVERY: u64 = 256;
+/// How many nodes are expanded between two looks at the interrupt. With the paper's estimate on a long demonstration, each may
+/// take a millisecond.
+const POLL_EVERY: u64 = 16;
 
 /// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows. A node is expanded again if a cheaper
 /// way to it is found, so the heuristic need not be consistent.

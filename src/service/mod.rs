@@ -114,6 +114,11 @@ impl Etude {
         self.store.check().await
     }
 
+    /// Closes the store. Whoever still asks for something gets an error.
+    pub async fn close(&self) {
+        self.store.close().await;
+    }
+
     /// The pool that searches run on.
     #[must_use]
     pub fn pool(&self) -> &SearchPool {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use jiff::Timestamp;
+use jiff::{Timestamp, Unit};
 use serde_json::value::RawValue;
 
 use super::{Etude, Name, ServiceError};
@@ -55,7 +55,8 @@ impl Etude {
             n_states: model.graph().n_states() as u64,
             n_transitions: model.n_transitions() as u64,
             n_unsafe: model.n_unsafe() as u64,
-            created_at: now,
+            // As exact as it is stored.
+            created_at: now.round(Unit::Millisecond).unwrap_or(now),
         };
         let hash = summary.hash.clone();
         let (registered, summary) = match self.store.put_model(NewModel { summary, definition }).await? {

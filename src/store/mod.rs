@@ -75,7 +75,7 @@ pub struct Store {
 
 impl Store {
     /// Opens the database at `path`, creating and migrating it as needed. The writer runs in `tasks` until the store is
-    /// dropped.
+    /// closed.
     ///
     /// # Errors
     ///
@@ -96,6 +96,13 @@ impl Store {
             .connect_with(options.create_if_missing(false).pragma("query_only", "ON"))
             .await?;
         Ok(Self { readers, writer: Writer::start(connection, tasks) })
+    }
+
+    /// Takes no more reads or writes. Once the writer has ended, all that was written stands in a single file.
+    pub async fn close(&self) {
+        // The last connection to be closed folds in the log; that must be the writer's.
+        self.readers.close().await;
+        self.writer.close();
     }
 
     /// Whether the database answers.

@@ -5,6 +5,7 @@
 
 use sqlx::{Connection, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
+use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::{NewModel, NewPolicy, PutModel, StoreError, models, policies};
@@ -42,14 +43,21 @@ struct Job {
 #[derive(Debug)]
 pub(super) struct Writer {
     queue: mpsc::Sender<Job>,
+    closing: CancellationToken,
 }
 
 impl Writer {
-    /// Starts the writer in `tasks`. It ends when this handle is dropped and everything waiting has been written.
+    /// Starts the writer in `tasks`. It ends when it is closed or dropped, and everything waiting has been written.
     pub(super) fn start(connection: SqliteConnection, tasks: &TaskTracker) -> Self {
         let (queue, jobs) = mpsc::channel(MAX_WAITING);
-        tasks.spawn(run(connection, jobs));
-        Self { queue }
+        let closing = CancellationToken::new();
+        tasks.spawn(run(connection, jobs, closing.clone()));
+        Self { queue, closing }
+    }
+
+    /// Takes no more writes, and ends once everything waiting has been written.
+    pub(super) fn close(&self) {
+        self.closing.cancel();
     }
 
     /// Writes, and returns once it is on disk. A caller that goes away does not undo its write.
@@ -64,9 +72,17 @@ impl Writer {
     }
 }
 
-async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>) {
+async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, closing: CancellationToken) {
     let mut group = Vec::with_capacity(MAX_GROUP);
-    while jobs.recv_many(&mut group, MAX_GROUP).await > 0 {
+    loop {
+        tokio::select! {
+            n_jobs = jobs.recv_many(&mut group, MAX_GROUP) => if n_jobs == 0 { break },
+            () = closing.cancelled(), if !jobs.is_closed() => {
+                // What waits is still received.
+                jobs.close();
+                continue;
+            }
+        }
         match commit(&mut connection, &group).await {
             Ok(written) => {
                 for (job, written) in group.drain(..).zip(written) {

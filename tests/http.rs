@@ -1,0 +1,482 @@
+//! The HTTP contract, from outside.
+
+#![expect(clippy::unwrap_used, reason = "tests may panic")]
+
+mod service;
+
+use std::io::{Read, Write};
+use std::net::{Shutdown, TcpStream};
+
+use reqwest::Method;
+use reqwest::header::{ALLOW, CONTENT_TYPE, LOCATION, RETRY_AFTER};
+use serde_json::{Value, json};
+use service::{Service, answer, example};
+
+fn corridor() -> Value {
+    json!({
+        "attributes": [
+            {"name": "x", "kind": "number", "scale": 1, "weight": 1},
+            {"name": "heading", "kind": "cyclic", "labels": ["east", "north", "west", "south"]},
+            {"name": "door", "kind": "category"},
+        ],
+        "actions": [{"name": "forward", "cost": 0.5}],
+        "dynamics": {
+            "kind": "table", "states": [[0, "east", "open"], [1, "east", "open"]],
+            "transitions": [[0, "forward", 1]], "start": 0, "unsafe": [],
+        },
+    })
+}
+
+/// The pointers of a 422.
+fn pointers(problem: &Value) -> Vec<&str> {
+    let errors = problem["errors"].as_array().unwrap();
+    errors.iter().map(|error| error["pointer"].as_str().unwrap()).collect()
+}
+
+#[tokio::test]
+async fn a_model_is_registered_read_listed_and_deleted() {
+    let service = Service::start(&[]).await;
+    let (status, created) = service.put("/v1/models/corridor", &corridor()).await;
+    assert_eq!(status, 201, "{created}");
+    assert_eq!(created["counts"], json!({"attributes": 3, "actions": 1, "states": 2, "transitions": 1, "unsafe": 0}));
+    assert_eq!(created["attributes"][0], json!({"name": "x", "kind": "number", "scale": 1.0, "weight": 1.0}));
+    assert_eq!(created["hash"].as_str().unwrap().len(), 64);
+
+    // The same content, written otherwise: defaults left out, the action by its index.
+    let mut same = corridor();
+    same["attributes"][0] = json!({"kind": "number", "name": "x"});
+    same["dynamics"]["transitions"] = json!([[0, 0, 1]]);
+    same["dynamics"].as_object_mut().unwrap().remove("unsafe");
+    let (status, again) = service.put("/v1/models/corridor", &same).await;
+    assert_eq!((status, &again), (200, &created));
+
+    let mut other = corridor();
+    other["actions"][0]["cost"] = json!(0.6);
+    let (status, problem) = service.put("/v1/models/corridor", &other).await;
+    assert_eq!((status, &problem["type"]), (409, &json!("/problems/conflict")));
+
+    let (status, whole) = service.get("/v1/models/corridor").await;
+    assert_eq!((status, &whole["hash"]), (200, &created["hash"]));
+    let (status, copy) = service.put("/v1/models/copy", &whole["definition"]).await;
+    assert_eq!((status, &copy["hash"]), (201, &created["hash"]));
+
+    let (_, list) = service.get("/v1/models").await;
+    let names: Vec<_> = list["items"].as_array().unwrap().iter().map(|model| model["name"].as_str().unwrap()).collect();
+    assert_eq!((names, &list["next"]), (vec!["copy", "corridor"], &Value::Null));
+
+    assert_eq!(service.delete("/v1/models/corridor").await.0, 204);
+    let (status, problem) = service.delete("/v1/models/corridor").await;
+    assert_eq!((status, &problem["type"]), (404, &json!("/problems/unknown-model")));
+    assert_eq!(service.get("/v1/models/corridor").await.0, 404);
+    assert_eq!(service.put("/v1/models/corridor", &other).await.0, 201);
+}
+
+#[tokio::test]
+async fn lists_are_paged_without_gaps_or_repetitions() {
+    let service = Service::start(&[]).await;
+    for n in 0..7 {
+        assert_eq!(service.put(&format!("/v1/models/m{n}"), &corridor()).await.0, 201);
+        let request = json!({"model": format!("m{n}"), "demonstration": [[0, "east", "open"]]});
+        assert_eq!(service.post("/v1/policies", &request).await.0, 201);
+    }
+    for (path, name) in [("/v1/models", "name"), ("/v1/policies", "model")] {
+        let mut seen = Vec::new();
+        let mut query = "?limit=3".to_owned();
+        loop {
+            let (status, page) = service.get(&format!("{path}{query}")).await;
+            assert_eq!(status, 200, "{page}");
+            seen.extend(page["items"].as_array().unwrap().iter().map(|item| item[name].clone()));
+            let Some(next) = page["next"].as_str() else { break };
+            query = format!("?limit=3&after={next}");
+        }
+        assert_eq!(seen, ["m0", "m1", "m2", "m3", "m4", "m5", "m6"]);
+        for query in ["?limit=0", "?limit=1001", "?limit=x", "?page=2"] {
+            let (status, problem) = service.get(&format!("{path}{query}")).await;
+            assert_eq!((status, pointers(&problem).len()), (422, 1), "{query}: {problem}");
+        }
+    }
+    assert_eq!(service.get("/v1/policies?after=x").await.0, 422);
+}
+
+#[tokio::test]
+async fn a_demonstration_gives_a_policy_that_can_be_read_again() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let response = service.send(Method::POST, "/v1/policies", &example("figure-4/request.json")).await;
+    let location = response.headers()[LOCATION].to_str().unwrap().to_owned();
+    let (status, policy) = answer(response).await;
+    assert_eq!(status, 201, "{policy}");
+    assert_eq!(location, format!("/v1/policies/{}", policy["id"].as_str().unwrap()));
+    assert_eq!(policy["cost"], json!({"total": 48.0, "actions": 6.0, "distance": 42.0}));
+    assert_eq!((&policy["status"], &policy["lower_bound"]), (&json!("optimal"), &json!(48.0)));
+    assert_eq!(service.get(&location).await, (200, policy.clone()));
+
+    let (_, list) = service.get("/v1/policies").await;
+    assert_eq!((&list["items"][0]["id"], &list["items"][0]["cost"]), (&policy["id"], &policy["cost"]));
+    assert_eq!(list["items"][0]["steps"], Value::Null);
+
+    let (status, problem) = service.get("/v1/policies/nothing").await;
+    assert_eq!((status, &problem["type"]), (404, &json!("/problems/unknown-policy")));
+}
+
+/// A policy's text without what differs from request to request.
+fn comparable(mut policy: Value) -> String {
+    policy["id"] = Value::Null;
+    policy["search"]["elapsed_us"] = json!(0);
+    serde_json::to_string_pretty(&policy).unwrap() + "\n"
+}
+
+#[tokio::test]
+async fn the_same_request_gives_the_same_bytes_before_and_after_a_restart() {
+    let mut service = Service::start(&[]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let request = example("figure-4/request.json");
+    let first = service.post("/v1/policies", &request).await.1;
+    let again = service.post("/v1/policies", &request).await.1;
+    let directory = service.stop().await;
+    service = Service::start_in(directory, &[]).await;
+    // Now from the stored definition.
+    let restarted = service.post("/v1/policies", &request).await.1;
+    assert_eq!(comparable(first.clone()), comparable(again));
+    assert_eq!(comparable(first.clone()), comparable(restarted));
+    assert_eq!(service.get(&format!("/v1/policies/{}", first["id"].as_str().unwrap())).await.1, first);
+    // The same text is what `etude map` prints, in a release build too: see .ci/run.
+    let expected = include_str!("../examples/figure-4/policy.json");
+    let expected: Value = serde_json::from_str(expected).unwrap();
+    assert_eq!(comparable(first), comparable(expected));
+}
+
+#[tokio::test]
+async fn all_faults_of_a_model_are_told_at_once() {
+    let service = Service::start(&[]).await;
+    let model = json!({
+        "attributes": [
+            {"name": "x", "kind": "number", "scale": 0, "color": "red"},
+            {"name": "heading", "kind": "cyclic", "labels": ["east", "north"], "weight": -1},
+            {"name": "door", "kind": "gate"},
+            {"name": "mood", "kind": "category", "scale": 2},
+            {"name": "mood", "kind": "cyclic"},
+        ],
+        "actions": [{"name": "forward", "cost": -0.5}, {"name": "back"}, {"name": "back", "price": 1}],
+        "dynamics": {
+            "kind": "table",
+            "states": [[0, "up", 1, 2.5, 0], [1, "east"], "nothing"],
+            "transitions": [[0, "fly", 1], [0, "back", 3], [0, "back"], [-1, 7, 0]],
+            "start": 9, "unsafe": [3],
+        },
+        "extra": true,
+    });
+    let (status, problem) = service.put("/v1/models/m", &model).await;
+    assert_eq!(status, 422);
+    let mut found = pointers(&problem);
+    found.sort_unstable();
+    assert_eq!(
+        found,
+        [
+            "/actions/0/cost",
+            "/actions/2",
+            "/actions/2/price",
+            "/attributes/0/color",
+            "/attributes/0/scale",
+            "/attributes/1/weight",
+            "/attributes/2/kind",
+            "/attributes/3/scale",
+            "/attributes/4",
+            "/attributes/4/name",
+            "/dynamics/start",
+            "/dynamics/states/0/3",
+            "/dynamics/states/1",
+            "/dynamics/states/2",
+            "/dynamics/transitions/0/1",
+            "/dynamics/transitions/1/2",
+            "/dynamics/transitions/2",
+            "/dynamics/transitions/3/0",
+            "/dynamics/transitions/3/1",
+            "/dynamics/unsafe/0",
+            "/extra",
+        ]
+    );
+    assert_eq!(service.get("/v1/models").await.1["items"], json!([]), "nothing was registered");
+}
+
+#[tokio::test]
+async fn all_faults_of_a_cave_are_told_at_once() {
+    let service = Service::start(&[]).await;
+    let model = json!({
+        "attributes": [],
+        "actions": [{"name": "fly"}],
+        "dynamics": {
+            "kind": "wumpus", "width": 0, "height": 3, "pits": [[0, 3]], "wumpi": [[0]], "gold": [["a", 1]],
+            "start": {"x": 0, "y": 0, "heading": "up"}, "arrows": -1, "bats": 2,
+        },
+    });
+    let (status, problem) = service.put("/v1/models/m", &model).await;
+    assert_eq!(status, 422);
+    let mut found = pointers(&problem);
+    found.sort_unstable();
+    assert_eq!(
+        found,
+        [
+            "/actions/0/name",
+            "/attributes",
+            "/dynamics/arrows",
+            "/dynamics/bats",
+            "/dynamics/gold/0/0",
+            "/dynamics/pits/0/1",
+            "/dynamics/start/heading",
+            "/dynamics/width",
+            "/dynamics/wumpi/0",
+        ]
+    );
+    let deadly = json!({"dynamics": {"kind": "wumpus", "width": 2, "height": 2, "wumpi": [[0, 0]]}});
+    assert_eq!(pointers(&service.put("/v1/models/m", &deadly).await.1), ["/dynamics/start"]);
+}
+
+#[tokio::test]
+async fn all_faults_of_a_request_are_told_at_once() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/corridor", &corridor()).await;
+    let request = json!({
+        "model": "corridor",
+        "demonstration": [{"x": "a", "heading": "up", "speed": 1}, [0, "east"], 7, [0, null, 0.5], {"door": ["open"]}],
+        "weights": {"x": -1, "mood": 1, "door": "heavy"},
+        "start": 2, "lookahead": 0, "heuristic": "magic", "max_expansions": -1, "deadline_ms": 0.5, "hurry": true,
+    });
+    let (status, problem) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, &problem["type"]), (422, &json!("/problems/invalid")));
+    let mut found = pointers(&problem);
+    found.sort_unstable();
+    assert_eq!(
+        found,
+        [
+            "/deadline_ms",
+            "/demonstration/0/heading",
+            "/demonstration/0/speed",
+            "/demonstration/0/x",
+            "/demonstration/1",
+            "/demonstration/2",
+            "/demonstration/3/2",
+            "/demonstration/4/door",
+            "/heuristic",
+            "/hurry",
+            "/lookahead",
+            "/max_expansions",
+            "/start",
+            "/weights/door",
+            "/weights/mood",
+            "/weights/x",
+        ]
+    );
+    let post = async |request: Value| service.post("/v1/policies", &request).await;
+    assert_eq!(pointers(&post(json!({"model": "corridor", "demonstration": []})).await.1), ["/demonstration"]);
+    assert_eq!(pointers(&post(json!({"model": "corridor"})).await.1), ["/demonstration"]);
+    assert_eq!(pointers(&post(json!({"model": 1, "learner": 2})).await.1), ["/model", "/learner", "/demonstration"]);
+    assert_eq!(pointers(&post(json!([])).await.1), [""]);
+    let start = json!({"model": "corridor", "demonstration": [[0, null, null]], "start": {"heading": "east"}});
+    assert_eq!(pointers(&post(start).await.1), ["/start"], "two states face east");
+
+    // What is unknown is not found, unless there is more to say.
+    let (status, problem) = post(json!({"model": "nothing", "demonstration": [{}]})).await;
+    assert_eq!(
+        (status, &problem["type"], pointers(&problem)),
+        (404, &json!("/problems/unknown-model"), vec!["/model"])
+    );
+    assert_eq!(post(json!({"model": "nothing", "demonstration": [{}], "hurry": 1})).await.0, 422);
+    let (status, problem) = post(json!({"model": "corridor", "learner": "nobody", "demonstration": [{}]})).await;
+    assert_eq!((status, &problem["type"]), (404, &json!("/problems/unknown-learner")));
+    assert_eq!(service.get("/v1/policies").await.1["items"], json!([]), "nothing was stored");
+}
+
+#[tokio::test]
+async fn a_start_is_an_index_or_the_values_of_one_state() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/corridor", &corridor()).await;
+    for start in [json!(1), json!({"x": 1}), json!({"x": 1, "heading": "east", "door": "open"})] {
+        let request = json!({"model": "corridor", "demonstration": [{"x": 0}], "start": start});
+        let (status, policy) = service.post("/v1/policies", &request).await;
+        assert_eq!((status, &policy["steps"][0]["state_index"]), (201, &json!(1)), "{policy}");
+    }
+}
+
+/// Sends a body as it is.
+async fn send_text(service: &Service, path: &str, content_type: &str, body: impl Into<reqwest::Body>) -> (u16, Value) {
+    let request = service.client.put(service.url(path)).header(CONTENT_TYPE, content_type).body(body);
+    answer(request.send().await.unwrap()).await
+}
+
+#[tokio::test]
+async fn a_body_that_is_no_json_is_refused_with_its_place() {
+    let service = Service::start(&[]).await;
+    let put = async |body: &'static str| send_text(&service, "/v1/models/m", "application/json", body).await;
+    for body in ["", "{", "{\"a\": NaN}", "{\"a\": Infinity}", "nonsense", "{} {}", "\"\\ud800\""] {
+        let (status, problem) = put(body).await;
+        assert_eq!((status, &problem["type"]), (400, &json!("/problems/malformed-json")), "{body}: {problem}");
+        assert!(problem["detail"].as_str().unwrap().contains("line 1, column"), "{problem}");
+    }
+    let (status, problem) = put("{\"actions\": [{\"name\": \"a\", \"cost\": 1e999}]}").await;
+    assert_eq!((status, pointers(&problem)), (422, vec!["/actions/0/cost"]));
+    let deep = "[".repeat(100_000);
+    assert_eq!(send_text(&service, "/v1/models/m", "application/json", deep).await.0, 400);
+    let invalid_utf8 = b"{\"\xff\": 1}".to_vec();
+    assert_eq!(send_text(&service, "/v1/models/m", "application/json", invalid_utf8).await.0, 400);
+    let (status, problem) = send_text(&service, "/v1/models/m", "text/plain", corridor().to_string()).await;
+    assert_eq!((status, &problem["type"]), (415, &json!("/problems/unsupported-media-type")));
+    let typed = "application/json; charset=utf-8";
+    assert_eq!(send_text(&service, "/v1/models/m", typed, corridor().to_string()).await.0, 201);
+}
+
+#[tokio::test]
+async fn a_body_over_the_limit_is_refused_announced_or_not() {
+    let service = Service::start(&[]).await;
+    let million: Vec<Value> = (0..1_000_000).map(|n| json!([n])).collect();
+    let model = json!({
+        "attributes": [{"name": "x", "kind": "number"}], "actions": [],
+        "dynamics": {"kind": "table", "states": million, "transitions": []},
+    });
+    let body = model.to_string();
+    let (status, problem) = send_text(&service, "/v1/models/m", "application/json", body.clone()).await;
+    assert_eq!((status, &problem["type"]), (413, &json!("/problems/too-large")));
+    let chunks: Vec<std::io::Result<String>> =
+        body.as_bytes().chunks(100_000).map(|chunk| Ok(String::from_utf8(chunk.to_vec()).unwrap())).collect();
+    let streamed = reqwest::Body::wrap_stream(futures_util::stream::iter(chunks));
+    assert_eq!(send_text(&service, "/v1/models/m", "application/json", streamed).await.0, 413);
+    assert_eq!(service.get("/v1/models").await.1["items"], json!([]));
+
+    let small = Service::start(&["--max-states", "100"]).await;
+    let hundred_and_one: Vec<Value> = (0..101).map(|n| json!([n])).collect();
+    let mut model = model;
+    model["dynamics"]["states"] = hundred_and_one.into();
+    assert_eq!(pointers(&small.put("/v1/models/m", &model).await.1), ["/dynamics/states"]);
+    let cave = json!({"dynamics": {"kind": "wumpus", "width": 9, "height": 9}});
+    assert_eq!(pointers(&small.put("/v1/models/m", &cave).await.1), ["/dynamics"]);
+}
+
+/// Writes bytes to the service and reads until it closes.
+fn talk(service: &Service, request: &[u8], then: Shutdown) -> String {
+    let mut stream = TcpStream::connect(service.address).unwrap();
+    stream.write_all(request).unwrap();
+    stream.shutdown(then).unwrap();
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).unwrap();
+    answer
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_body_cut_off_in_the_middle_is_refused_and_changes_nothing() {
+    let service = Service::start(&[]).await;
+    let body = corridor().to_string();
+    let head = format!(
+        "PUT /v1/models/m HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\ncontent-length: {}\r\n\r\n",
+        body.len()
+    );
+    let cut = format!("{head}{}", &body[..body.len() / 2]);
+    let answered = tokio::task::block_in_place(|| talk(&service, cut.as_bytes(), Shutdown::Write));
+    assert!(answered.is_empty() || answered.contains("/problems/incomplete-body"), "{answered}");
+    assert_eq!(service.get("/v1/models").await.1["items"], json!([]));
+}
+
+#[tokio::test]
+async fn unknown_paths_and_methods_are_problems_too() {
+    let service = Service::start(&[]).await;
+    for path in ["/", "/v1", "/v2/models", "/v1/models/a/b", "/v1/models/"] {
+        let (status, problem) = service.get(path).await;
+        assert_eq!((status, &problem["type"]), (404, &json!("/problems/not-found")), "{path}");
+    }
+    let response = service.send(Method::PATCH, "/v1/models/m", &Value::Null).await;
+    assert_eq!(response.headers()[CONTENT_TYPE], "application/problem+json");
+    let allowed = response.headers()[ALLOW].to_str().unwrap().to_owned();
+    for method in ["GET", "PUT", "DELETE"] {
+        assert!(allowed.contains(method), "{allowed}");
+    }
+    let (status, problem) = answer(response).await;
+    assert_eq!((status, &problem["type"]), (405, &json!("/problems/method-not-allowed")));
+    for name in ["a%20b", "%FF", &"x".repeat(65)] {
+        let (status, problem) = service.put(&format!("/v1/models/{name}"), &corridor()).await;
+        assert_eq!((status, &problem["type"]), (422, &json!("/problems/invalid")), "{name}");
+    }
+}
+
+#[tokio::test]
+async fn every_answer_carries_a_request_id_and_problems_repeat_it() {
+    let service = Service::start(&[]).await;
+    let given = service.client.get(service.url("/v1/models/m")).header("x-request-id", "mine-1").send().await.unwrap();
+    assert_eq!(given.headers()["x-request-id"], "mine-1");
+    assert_eq!(answer(given).await.1["request_id"], "mine-1");
+    let odd = service.client.get(service.url("/livez")).header("x-request-id", "not{plain}").send().await.unwrap();
+    let made = odd.headers()["x-request-id"].to_str().unwrap();
+    assert_eq!((odd.status().as_u16(), made.len()), (200, 36), "{made}");
+}
+
+#[tokio::test]
+async fn operators_find_what_they_need() {
+    let service = Service::start(&[]).await;
+    assert_eq!(service.get("/livez").await, (200, json!("alive\n")));
+    assert_eq!(service.get("/readyz").await, (200, json!("ready\n")));
+    let (status, yaml) = service.get("/openapi.yaml").await;
+    assert!(status == 200 && yaml.as_str().unwrap().starts_with("openapi: 3.1.0"));
+    let (status, page) = service.get("/docs/").await;
+    assert!(status == 200 && page.as_str().unwrap().contains("swagger"), "{page}");
+    // Nothing that the page loads comes from elsewhere.
+    assert!(!page.as_str().unwrap().contains("https://"), "{page}");
+    let (status, metrics) = service.get("/metrics").await;
+    assert!(status == 200 && metrics.as_str().unwrap().contains("etude_http_request_duration_seconds_bucket"));
+}
+
+/// A request that takes minutes: the paper's heuristic looks at every observation ahead, for every node.
+fn slow_request() -> Value {
+    let demonstration = example("figure-4/demonstration.json");
+    let demonstration: Vec<Value> = demonstration.as_array().unwrap().iter().cycle().take(20_000).cloned().collect();
+    json!({"model": "figure-4", "demonstration": demonstration, "heuristic": "paper"})
+}
+
+#[tokio::test]
+async fn a_client_that_goes_away_cancels_its_search() {
+    let service = Service::start(&["--search-threads", "1", "--search-queue", "0"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let request = service.client.post(service.url("/v1/policies")).json(&slow_request());
+    let waiting = tokio::spawn(request.send());
+    while service.measurement("etude_search_jobs").await < 1.0 {
+        tokio::task::yield_now().await;
+    }
+
+    // Meanwhile nobody else gets in, and is told when to try again.
+    let response = service.send(Method::POST, "/v1/policies", &example("figure-4/request.json")).await;
+    assert_eq!(response.headers()[RETRY_AFTER], "1");
+    let (status, problem) = answer(response).await;
+    assert_eq!((status, &problem["type"]), (503, &json!("/problems/busy")));
+
+    waiting.abort();
+    while service.measurement("etude_search_jobs").await > 0.0 {
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(service.post("/v1/policies", &example("figure-4/request.json")).await.0, 201);
+}
+
+#[tokio::test]
+async fn a_deadline_gives_the_best_mapping_so_far_and_a_bound() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let mut request = slow_request();
+    request["deadline_ms"] = json!(50);
+    let (status, policy) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, &policy["status"]), (201, &json!("bounded")), "{}", policy["detail"]);
+    let (bound, total) = (policy["lower_bound"].as_f64().unwrap(), policy["cost"]["total"].as_f64().unwrap());
+    assert!(0.0 <= bound && bound < total);
+    assert_eq!(policy["steps"].as_array().unwrap().last().unwrap()["observation"], 19_999);
+}
+
+#[tokio::test]
+async fn a_shutdown_answers_what_still_runs_and_closes_the_database() {
+    let service = Service::start(&["--drain-timeout", "0s"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let request = service.client.post(service.url("/v1/policies")).json(&slow_request());
+    let waiting = tokio::spawn(request.send());
+    while service.measurement("etude_search_jobs").await < 1.0 {
+        tokio::task::yield_now().await;
+    }
+    let directory = service.stop().await;
+    let (status, problem) = answer(waiting.await.unwrap().unwrap()).await;
+    assert_eq!((status, &problem["type"]), (503, &json!("/problems/stopping")));
+    let left: Vec<_> = std::fs::read_dir(directory.path()).unwrap().map(|file| file.unwrap().file_name()).collect();
+    assert_eq!(left, ["etude.db"], "the write-ahead log was folded in");
+}

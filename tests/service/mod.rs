@@ -1,0 +1,107 @@
+//! Spawns the whole application on a free port, with a database of its own.
+
+#![allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its part of this module")]
+
+use std::net::SocketAddr;
+use std::path::Path;
+
+use clap::Parser;
+use etude::config::ServeConfig;
+use etude::server::Server;
+use reqwest::{Client, Method, Response};
+use serde_json::Value;
+use tempfile::TempDir;
+use tokio::sync::oneshot;
+use tokio::task::JoinHandle;
+
+#[derive(Parser)]
+struct Flags {
+    #[command(flatten)]
+    config: ServeConfig,
+}
+
+/// A running service.
+pub(crate) struct Service {
+    pub(crate) address: SocketAddr,
+    pub(crate) client: Client,
+    pub(crate) directory: TempDir,
+    stop: oneshot::Sender<()>,
+    running: JoinHandle<()>,
+}
+
+impl Service {
+    /// Starts a service with the default settings, but for `flags`.
+    pub(crate) async fn start(flags: &[&str]) -> Self {
+        Self::start_in(tempfile::tempdir().unwrap(), flags).await
+    }
+
+    /// Starts a service whose database is in `directory`.
+    pub(crate) async fn start_in(directory: TempDir, flags: &[&str]) -> Self {
+        let database = directory.path().join("etude.db");
+        let own = ["etude", "--listen", "127.0.0.1:0", "--database", database.to_str().unwrap()];
+        let flags = Flags::parse_from(own.iter().chain(flags));
+        let server = Server::start(&flags.config).await.unwrap();
+        let address = server.address();
+        let (stop, stopped) = oneshot::channel::<()>();
+        let running = tokio::spawn(async move {
+            server.run(async { drop(stopped.await) }).await.unwrap();
+        });
+        let client = Client::builder().no_proxy().build().unwrap();
+        Self { address, client, directory, stop, running }
+    }
+
+    /// Stops the service and waits for its end. Gives the directory of its database back.
+    pub(crate) async fn stop(self) -> TempDir {
+        drop(self.client);
+        drop(self.stop);
+        self.running.await.unwrap();
+        self.directory
+    }
+
+    pub(crate) fn url(&self, path: &str) -> String {
+        format!("http://{}{path}", self.address)
+    }
+
+    /// Sends a request with a JSON body, or with none if it is null.
+    pub(crate) async fn send(&self, method: Method, path: &str, body: &Value) -> Response {
+        let request = self.client.request(method, self.url(path));
+        let request = if body.is_null() { request } else { request.json(body) };
+        request.send().await.unwrap()
+    }
+
+    pub(crate) async fn get(&self, path: &str) -> (u16, Value) {
+        answer(self.send(Method::GET, path, &Value::Null).await).await
+    }
+
+    pub(crate) async fn put(&self, path: &str, body: &Value) -> (u16, Value) {
+        answer(self.send(Method::PUT, path, body).await).await
+    }
+
+    pub(crate) async fn post(&self, path: &str, body: &Value) -> (u16, Value) {
+        answer(self.send(Method::POST, path, body).await).await
+    }
+
+    pub(crate) async fn delete(&self, path: &str) -> (u16, Value) {
+        answer(self.send(Method::DELETE, path, &Value::Null).await).await
+    }
+
+    /// A measurement of `/metrics`, without labels; 0 if it was not made yet.
+    pub(crate) async fn measurement(&self, name: &str) -> f64 {
+        let text = self.client.get(self.url("/metrics")).send().await.unwrap().text().await.unwrap();
+        let line = text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
+        line.map_or(0.0, |value| value.parse().unwrap())
+    }
+}
+
+/// Status and body of an answer; a body that is not JSON is given as a string.
+pub(crate) async fn answer(response: Response) -> (u16, Value) {
+    let status = response.status().as_u16();
+    let text = response.text().await.unwrap();
+    (status, serde_json::from_str(&text).unwrap_or(Value::String(text)))
+}
+
+/// A document of the examples.
+pub(crate) fn example(path: &str) -> Value {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples").join(path);
+    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+}
