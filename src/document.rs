@@ -355,7 +355,7 @@ pub enum Range {
     NonNegative,
     /// Above 0.
     Positive,
-    /// 0 to [`MAX_COST`](crate::attribute::MAX_COST).
+    /// 0 to [`MAX_COST`].
     Cost,
 }
 

@@ -52,7 +52,6 @@ pub struct Context {
                        (RFC 9457) whose `type` is listed under its status; for 422 it lists all faults of the body, each \
                        with its JSON pointer. Every answer carries an `x-request-id`, taken from the request if that has \
                        one.\n\nLists are read in pages: `limit` items, then `after` the `next` of the page before.",
-        license(name = "MIT OR Apache-2.0", identifier = "MIT OR Apache-2.0"),
     ),
     tags(
         (name = "models", description = "What a body can do in its world"),
