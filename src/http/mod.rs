@@ -63,7 +63,10 @@ pub struct Context {
 struct Description;
 
 fn routes() -> OpenApiRouter<Context> {
-    OpenApiRouter::with_openapi(Description::openapi())
+    let mut description = Description::openapi();
+    // Taken from Cargo.toml, which names none.
+    description.info.license = None;
+    OpenApiRouter::with_openapi(description)
         .routes(routes!(models::put_model, models::get_model, models::delete_model))
         .routes(routes!(models::list_models))
         .routes(routes!(policies::make_policy, policies::list_policies))
