@@ -465,6 +465,39 @@ async fn a_deadline_gives_the_best_mapping_so_far_and_a_bound() {
     assert_eq!(policy["steps"].as_array().unwrap().last().unwrap()["observation"], 19_999);
 }
 
+/// Reads a policy until it is refined.
+async fn refined(service: &Service, id: &str) -> Value {
+    loop {
+        let (_, policy) = service.get(&format!("/v1/policies/{id}")).await;
+        if let Some(refined_by) = policy["refined_by"].as_str() {
+            return service.get(&format!("/v1/policies/{refined_by}")).await.1;
+        }
+        tokio::task::yield_now().await;
+    }
+}
+
+#[tokio::test]
+async fn a_policy_with_a_lookahead_is_local_and_is_refined_in_the_background() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let mut request = example("figure-4/request.json");
+    request["lookahead"] = json!(1);
+    let (status, local) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, &local["status"], &local["lookahead"]), (201, &json!("local"), &json!(1)));
+    assert_eq!((&local["lower_bound"], &local["refined_by"]), (&Value::Null, &Value::Null));
+    assert!(local["cost"]["total"].as_f64().unwrap() > 48.0);
+    let refined = refined(&service, local["id"].as_str().unwrap()).await;
+    assert_eq!((&refined["refines"], &refined["status"]), (&local["id"], &json!("optimal")));
+    assert_eq!((&refined["cost"]["total"], &refined["lookahead"]), (&json!(48.0), &Value::Null));
+    let (_, list) = service.get("/v1/policies").await;
+    assert_eq!(list["items"][0]["refined_by"], refined["id"]);
+
+    // A lookahead that reaches the end decides nothing early.
+    request["lookahead"] = json!(15);
+    let (_, policy) = service.post("/v1/policies", &request).await;
+    assert_eq!((&policy["status"], &policy["cost"]["total"]), (&json!("optimal"), &json!(48.0)));
+}
+
 #[tokio::test]
 async fn a_shutdown_answers_what_still_runs_and_closes_the_database() {
     let service = Service::start(&["--drain-timeout", "0s"]).await;

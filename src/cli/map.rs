@@ -2,7 +2,9 @@
 
 use std::fs;
 use std::io::{self, Read, Write};
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use clap::{Args, ValueEnum};
@@ -28,6 +30,9 @@ pub(super) struct Map {
     /// Where the imitator starts: a state's index, or a JSON object of attribute values.
     #[arg(long, value_name = "STATE", value_parser = parse_json)]
     start: Option<Value>,
+    /// Map as a stream with this lookahead would; left out: the global optimum.
+    #[arg(long, value_name = "OBSERVATIONS")]
+    lookahead: Option<u32>,
     /// What guides the search.
     #[arg(long, value_enum)]
     heuristic: Option<HeuristicArg>,
@@ -59,29 +64,30 @@ impl Map {
             Err(CompileError::Faults(faults)) => return Err(model_faults(faults)),
             Err(CompileError::Cancelled(cancelled)) => return Err(cancelled.into()),
         };
-        let mapper = Mapper::new(model);
+        let mapper = Arc::new(Mapper::new(model));
 
         let request = self.request()?;
         let mut faults = Faults::default();
         let object = Place::root(&request).object(&Request::FIELDS, &mut faults);
         let read = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
         let what = format!("the request made of {}", self.demonstration.display());
-        let Request { problem, settings, deadline } =
-            faults.check(read).map_err(|faults| CliError::Faults { what, faults })?;
+        let asked = faults.check(read).map_err(|faults| CliError::Faults { what, faults })?;
 
         let started = Instant::now();
-        let mut interrupt = || match deadline {
+        let mut interrupt = || match asked.deadline {
             Some(deadline) if started.elapsed() >= deadline => Signal::Finish,
             _ => Signal::Continue,
         };
-        let mapping = mapper.map(&problem, settings, &mut interrupt)?;
+        let mapping = asked.solve(&mapper, &mut interrupt)?;
         let stamp = Stamp {
             id: None,
             model: request["model"].as_str().unwrap_or_default().to_owned(),
             model_hash: hash_of(&definition.document().text()),
+            lookahead: asked.lookahead.map(NonZeroU32::get),
             elapsed_us: as_micros(started.elapsed()),
+            ..Stamp::default()
         };
-        let policy = Policy::new(stamp, &problem, &mapping);
+        let policy = Policy::new(stamp, &asked.problem, &mapping);
         if self.json {
             serde_json::to_writer(&mut *out, &policy).map_err(io::Error::from)?;
             writeln!(out)?;
@@ -109,6 +115,7 @@ impl Map {
         let heuristic = self.heuristic.and_then(|heuristic| heuristic.to_possible_value());
         let options = [
             ("start", self.start.clone()),
+            ("lookahead", self.lookahead.map(Value::from)),
             ("heuristic", heuristic.map(|heuristic| heuristic.get_name().into())),
             ("max_expansions", self.max_expansions.map(Value::from)),
             ("deadline_ms", self.deadline_ms.map(Value::from)),

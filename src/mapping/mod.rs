@@ -48,5 +48,7 @@ pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
 pub use online::{CommittedStep, OnlineMapping};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step};
 pub use problem::Problem;
-pub use request::{ObservationDocument, ObservedDocument, Request, RequestDocument, StartReference};
+pub use request::{
+    ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,
+};
 pub use search::{Move, MoveKind};

@@ -19,6 +19,10 @@ pub struct Stamp {
     pub model: String,
     /// Hash of the model's content.
     pub model_hash: String,
+    /// How many observations past the current one a decision could wait for; `None`: all.
+    pub lookahead: Option<u32>,
+    /// The policy that this one refines, if any.
+    pub refines: Option<String>,
     /// Wall-clock time of the search, in microseconds.
     pub elapsed_us: u64,
 }
@@ -58,6 +62,10 @@ pub struct Policy {
     pub coverage: Coverage,
     /// What the search took.
     pub search: SearchReport,
+    /// The policy, decided by a finite lookahead, of which this is the global optimum.
+    pub refines: Option<String>,
+    /// The global optimum, found in the background, of what a finite lookahead decided here.
+    pub refined_by: Option<String>,
 }
 
 /// A policy without its steps, as in lists.
@@ -88,6 +96,10 @@ pub struct PolicySummary<'p> {
     pub coverage: Coverage,
     /// What the search took.
     pub search: SearchReport,
+    /// The policy, decided by a finite lookahead, of which this is the global optimum.
+    pub refines: Option<&'p str>,
+    /// The global optimum, found in the background, of what a finite lookahead decided here.
+    pub refined_by: Option<&'p str>,
 }
 
 impl<'p> PolicySummary<'p> {
@@ -107,6 +119,8 @@ impl<'p> PolicySummary<'p> {
             lower_bound: policy.lower_bound,
             coverage: policy.coverage,
             search: policy.search,
+            refines: policy.refines.as_deref(),
+            refined_by: policy.refined_by.as_deref(),
         }
     }
 }
@@ -179,7 +193,7 @@ impl Policy {
             learner: None,
             weights_version: None,
             weights: problem.model.schema().by_attribute(problem.weights.as_slice().iter().copied()),
-            lookahead: None,
+            lookahead: stamp.lookahead,
             status: mapping.status,
             cost: mapping.cost,
             lower_bound: mapping.lower_bound,
@@ -194,6 +208,8 @@ impl Policy {
                 generated: mapping.n_generated,
                 elapsed_us: stamp.elapsed_us,
             },
+            refines: stamp.refines,
+            refined_by: None,
         }
     }
 }

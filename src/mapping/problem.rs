@@ -26,6 +26,24 @@ impl<'m> Problem<'m> {
         Self { model, demonstration, weights, start, distances }
     }
 
+    /// The demonstration.
+    #[must_use]
+    pub fn demonstration(&self) -> &Demonstration {
+        &self.demonstration
+    }
+
+    /// The weights of the distance.
+    #[must_use]
+    pub fn weights(&self) -> &Weights {
+        &self.weights
+    }
+
+    /// Where the imitator starts, `s_0`.
+    #[must_use]
+    pub fn start(&self) -> StateIdx {
+        self.start
+    }
+
     /// Index of the last observation, `n`.
     pub(crate) fn last(&self) -> usize {
         self.demonstration.len() - 1

@@ -13,6 +13,7 @@ mod models;
 mod name;
 mod policies;
 mod pool;
+mod refiner;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -28,6 +29,7 @@ use crate::document::{Faults, ParseError};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
 use cache::MapperCache;
+use refiner::Refiner;
 
 /// How the service is set up.
 #[derive(Clone, Debug)]
@@ -86,6 +88,7 @@ pub struct Etude {
     store: Store,
     pool: SearchPool,
     mappers: MapperCache,
+    refiner: Refiner,
     limits: Limits,
 }
 
@@ -101,6 +104,7 @@ impl Etude {
             store: Store::open(&settings.database, tasks).await?,
             pool: SearchPool::new(settings.pool, tasks.clone(), abort),
             mappers: MapperCache::new(settings.model_cache_bytes),
+            refiner: Refiner::default(),
             limits: settings.limits,
         })
     }

@@ -1,5 +1,7 @@
 //! Policies: searched, stored, read.
 
+use std::num::NonZeroU32;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
@@ -11,8 +13,9 @@ use uuid::Uuid;
 use super::{Etude, ServiceError};
 use crate::document::{self, Faults, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{Mapper, Policy, PolicySummary, Request, Stamp};
-use crate::store::{NewPolicy, Page, StoreError};
+use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Status};
+use crate::model::Model;
+use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
 /// Bodies up to this size are parsed where they arrive, which takes less than a millisecond; larger ones in the pool.
 const MAX_INLINE_BYTES: usize = 64 * 1024;
@@ -58,12 +61,15 @@ impl Etude {
         };
 
         let id = Uuid::now_v7().to_string();
-        let stamp = Stamp { id: Some(id.clone()), model: envelope.model, model_hash, elapsed_us: 0 };
+        let stamp = Stamp { id: Some(id.clone()), model: envelope.model, model_hash, ..Stamp::default() };
         let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
         let job = move |interrupt: &mut dyn Interrupt| search(&mapper, &document, stamp, interrupt);
-        let Searched { policy, summary } = self.pool.run(deadline, job).await??;
-        let row = NewPolicy { id: id.clone(), summary, policy: policy.clone(), created_at: now };
-        self.store.add_policy(row).await?;
+        let Searched { policy, row, refinement } = self.pool.run(deadline, job).await??;
+        let is_refined = refinement.is_some();
+        self.store.add_policy(row.at(now), refinement).await?;
+        if is_refined {
+            self.refiner.wake();
+        }
         Ok(MadePolicy { id, policy })
     }
 
@@ -118,7 +124,7 @@ impl Envelope {
         let envelope = names.map(|(model, learner)| Self {
             model: model.to_owned(),
             learner: learner.map(str::to_owned),
-            deadline: options.and_then(|(_, deadline)| deadline),
+            deadline: options.and_then(|options| options.deadline),
         });
         (envelope, faults)
     }
@@ -128,40 +134,90 @@ fn unknown_learner(name: &str) -> ServiceError {
     ServiceError::Unknown { kind: "learner", name: name.to_owned(), pointer: Some("/learner") }
 }
 
-/// A policy and its summary: JSON.
+/// What a search gave.
 struct Searched {
+    /// The policy: JSON.
+    policy: String,
+    row: PolicyText,
+    /// What is to be done about the policy, if it is local.
+    refinement: Option<NewRefinement>,
+}
+
+/// A policy as it will be stored.
+pub(super) struct PolicyText {
+    id: String,
     policy: String,
     summary: String,
 }
 
+impl PolicyText {
+    /// Writes a policy that has an id.
+    pub(super) fn of(policy: &Policy) -> Result<Self, ServiceError> {
+        let id = policy.id.clone().unwrap_or_default();
+        Ok(Self { id, policy: write(policy)?, summary: write(&PolicySummary::of(policy))? })
+    }
+
+    pub(super) fn at(self, created_at: Timestamp) -> NewPolicy {
+        let Self { id, policy, summary } = self;
+        NewPolicy { id, summary, policy, created_at }
+    }
+}
+
 /// Reads the request against its model, searches, and writes the policy.
 fn search(
-    mapper: &Mapper,
+    mapper: &Arc<Mapper>,
     document: &Value,
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
-    let mut faults = Faults::default();
-    let root = Place::root(document);
-    let object = root.object(&Request::FIELDS, &mut faults);
-    let request = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
-    let Request { problem, settings, .. } = match faults.check(request) {
+    let request = match read_request(mapper.model(), document) {
         Ok(request) => request,
         Err(faults) => return Ok(Err(faults.into())),
     };
     let started = Instant::now();
-    let mapping = mapper.map(&problem, settings, interrupt)?;
-    let elapsed_us = u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
+    let mapping = request.solve(mapper, interrupt)?;
+    let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
+    report(&stamp, &mapping);
+    let policy = Policy::new(stamp, &request.problem, &mapping);
+    Ok(searched(&policy, document))
+}
+
+fn searched(policy: &Policy, document: &Value) -> Result<Searched, ServiceError> {
+    let row = PolicyText::of(policy)?;
+    let refinement = (policy.status == Status::Local).then(|| {
+        let mut request = document.clone();
+        request["lookahead"] = Value::Null;
+        NewRefinement { policy_id: row.id.clone(), model_hash: policy.model_hash.clone(), request: request.to_string() }
+    });
+    Ok(Searched { policy: row.policy.clone(), row, refinement })
+}
+
+/// Reads a request against its model.
+pub(super) fn read_request<'m>(model: &'m Model, document: &Value) -> Result<Request<'m>, Faults> {
+    let mut faults = Faults::default();
+    let root = Place::root(document);
+    let object = root.object(&Request::FIELDS, &mut faults);
+    let request = object.and_then(|object| Request::read(model, &object, &mut faults));
+    faults.check(request)
+}
+
+/// Logs what a search gave.
+pub(super) fn report(stamp: &Stamp, mapping: &Mapping) {
+    metrics::counter!("etude_searches_total", "status" => mapping.status.name()).increment(1);
+    #[expect(clippy::cast_precision_loss, reason = "searches take less than centuries")]
+    metrics::histogram!("etude_search_duration_seconds").record(stamp.elapsed_us as f64 / 1e6);
     tracing::info!(
         model = stamp.model,
         status = mapping.status.name(),
         cost = mapping.cost.total,
         expanded = mapping.n_expanded,
-        elapsed_us,
+        elapsed_us = stamp.elapsed_us,
         "searched"
     );
-    let policy = Policy::new(Stamp { elapsed_us, ..stamp }, &problem, &mapping);
-    Ok(write(&policy).and_then(|text| Ok(Searched { policy: text, summary: write(&PolicySummary::of(&policy))? })))
+}
+
+pub(super) fn as_micros(since: Instant) -> u64 {
+    u64::try_from(since.elapsed().as_micros()).unwrap_or(u64::MAX)
 }
 
 fn write(document: &impl Serialize) -> Result<String, ServiceError> {

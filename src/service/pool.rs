@@ -6,7 +6,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
@@ -77,6 +77,32 @@ impl SearchPool {
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
         let admitted = Arc::clone(&self.admitted).try_acquire_owned().map_err(|_| PoolError::Busy)?;
+        self.run_admitted(Some(admitted), deadline, job).await
+    }
+
+    /// Runs `job` when there is a thread for it, however many wait. For callers that are bounded in number themselves.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the job was told to stop.
+    pub async fn run_patiently<T, F>(&self, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
+        self.run_admitted(None, None, job).await
+    }
+
+    async fn run_admitted<T, F>(
+        &self,
+        admitted: Option<OwnedSemaphorePermit>,
+        deadline: Option<Instant>,
+        job: F,
+    ) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
         let cancel = self.abort.child_token();
         // Dropped with this future: whoever waited is gone.
         let _gone: DropGuard = cancel.clone().drop_guard();

@@ -11,6 +11,8 @@
 
 mod models;
 mod policies;
+mod refinements;
+mod sessions;
 mod writer;
 
 use std::path::Path;
@@ -18,6 +20,8 @@ use std::time::Duration;
 
 pub use models::{ModelRow, ModelSummary, NewModel, PutModel};
 pub use policies::{NewPolicy, PolicySummaryRow};
+pub use refinements::{NewRefinement, RefinementEnd};
+pub use sessions::{NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus};
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection};
@@ -122,11 +126,10 @@ fn migrator() -> Migrator {
         Migration::new(version, description.into(), MigrationType::Simple, sql.into_sql_str(), false)
     };
     Migrator {
-        migrations: vec![migration(
-            1,
-            "models and policies",
-            include_str!("../../migrations/0001_models_and_policies.sql"),
-        )]
+        migrations: vec![
+            migration(1, "models and policies", include_str!("../../migrations/0001_models_and_policies.sql")),
+            migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
+        ]
         .into(),
         ..Migrator::DEFAULT
     }

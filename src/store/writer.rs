@@ -8,7 +8,12 @@ use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::{NewModel, NewPolicy, PutModel, StoreError, models, policies};
+use jiff::Timestamp;
+
+use super::{
+    NewModel, NewObservations, NewPolicy, NewRefinement, NewSession, PutModel, RefinementEnd, SessionEnd, StoreError,
+    models, policies, refinements, sessions,
+};
 
 /// Most writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
 const MAX_GROUP: usize = 256;
@@ -21,7 +26,13 @@ const MAX_WAITING: usize = 1024;
 pub(super) enum Write {
     PutModel(NewModel),
     DeleteModel(String),
-    AddPolicy(NewPolicy),
+    AddPolicy(NewPolicy, Option<NewRefinement>),
+    EndRefinement(Box<RefinementEnd>),
+    OpenSession(NewSession),
+    AddObservations(NewObservations),
+    EndSession(Box<SessionEnd>),
+    /// Those last active before this time.
+    ExpireSessions(Timestamp),
 }
 
 /// What became of a [`Write`].
@@ -30,7 +41,8 @@ pub(super) enum Written {
     PutModel(PutModel),
     /// Whether there was one.
     DeleteModel(bool),
-    AddPolicy,
+    /// Whether things were as expected, so that it was done.
+    Done(bool),
 }
 
 #[derive(Debug)]
@@ -118,9 +130,26 @@ async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<
         written.push(match &job.write {
             Write::PutModel(model) => Written::PutModel(models::put(&mut transaction, model).await?),
             Write::DeleteModel(name) => Written::DeleteModel(models::delete(&mut transaction, name).await?),
-            Write::AddPolicy(policy) => {
+            Write::AddPolicy(policy, refinement) => {
                 policies::add(&mut transaction, policy).await?;
-                Written::AddPolicy
+                if let Some(refinement) = refinement {
+                    refinements::add(&mut transaction, refinement).await?;
+                }
+                Written::Done(true)
+            }
+            Write::EndRefinement(end) => {
+                refinements::end(&mut transaction, end).await?;
+                Written::Done(true)
+            }
+            Write::OpenSession(session) => {
+                sessions::open(&mut transaction, session).await?;
+                Written::Done(true)
+            }
+            Write::AddObservations(observations) => Written::Done(sessions::add(&mut transaction, observations).await?),
+            Write::EndSession(end) => Written::Done(sessions::end(&mut transaction, end).await?),
+            Write::ExpireSessions(before) => {
+                sessions::expire(&mut transaction, *before).await?;
+                Written::Done(true)
             }
         });
     }
