@@ -44,4 +44,5 @@ pub mod model;
 pub mod server;
 pub mod service;
 pub mod store;
+pub mod stream;
 pub mod telemetry;

@@ -16,18 +16,22 @@ mod paging;
 mod path;
 mod policies;
 mod problem;
+mod stream;
 
 use std::sync::Arc;
 
 use axum::Router;
 use axum::middleware;
 use metrics_exporter_prometheus::PrometheusHandle;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 use utoipa::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::service::Etude;
+use crate::stream::Limits;
 use problem::{Problem, ProblemKind};
 
 /// What handlers work with.
@@ -41,6 +45,23 @@ pub struct Context {
     pub max_body_bytes: usize,
     /// Renders what was measured.
     pub metrics: PrometheusHandle,
+    /// What a stream may use.
+    pub stream_limits: Limits,
+    /// One for each stream that may run.
+    pub stream_places: Arc<Semaphore>,
+    /// The streams that run.
+    pub streams: TaskTracker,
+}
+
+impl Context {
+    /// A place for one more stream, until it is dropped.
+    fn admit_stream(&self) -> Result<OwnedSemaphorePermit, Problem> {
+        if self.stopping.is_cancelled() {
+            return Err(Problem::new(ProblemKind::Stopping, "the service is shutting down"));
+        }
+        let place = Arc::clone(&self.stream_places).try_acquire_owned();
+        place.map_err(|_| Problem::new(ProblemKind::Busy, "as many streams run as may"))
+    }
 }
 
 #[derive(OpenApi)]
@@ -56,6 +77,7 @@ pub struct Context {
     tags(
         (name = "models", description = "What a body can do in its world"),
         (name = "policies", description = "Demonstration in, policy out"),
+        (name = "streams", description = "Policy steps while the demonstration is still running"),
         (name = "operation", description = "Health and measurements"),
     ),
     components(schemas(Problem)),
@@ -71,6 +93,9 @@ fn routes() -> OpenApiRouter<Context> {
         .routes(routes!(models::list_models))
         .routes(routes!(policies::make_policy, policies::list_policies))
         .routes(routes!(policies::get_policy))
+        .routes(routes!(stream::websocket, stream::ndjson))
+        .routes(routes!(stream::list_sessions))
+        .routes(routes!(stream::get_session))
         .routes(routes!(operation::livez))
         .routes(routes!(operation::readyz))
         .routes(routes!(operation::metrics))

@@ -20,6 +20,7 @@ pub(super) enum ProblemKind {
     UnknownModel,
     UnknownPolicy,
     UnknownLearner,
+    UnknownSession,
     MethodNotAllowed,
     SlowBody,
     Conflict,
@@ -41,6 +42,7 @@ impl ProblemKind {
             Self::UnknownModel => ("unknown-model", "There is no such model", StatusCode::NOT_FOUND),
             Self::UnknownPolicy => ("unknown-policy", "There is no such policy", StatusCode::NOT_FOUND),
             Self::UnknownLearner => ("unknown-learner", "There is no such learner", StatusCode::NOT_FOUND),
+            Self::UnknownSession => ("unknown-session", "There is no such session", StatusCode::NOT_FOUND),
             Self::MethodNotAllowed => {
                 ("method-not-allowed", "The method is not supported here", StatusCode::METHOD_NOT_ALLOWED)
             }
@@ -148,6 +150,7 @@ impl From<ServiceError> for Problem {
                 let problem = match kind {
                     "policy" => ProblemKind::UnknownPolicy,
                     "learner" => ProblemKind::UnknownLearner,
+                    "session" => ProblemKind::UnknownSession,
                     _ => ProblemKind::UnknownModel,
                 };
                 let fault = pointer.map(|pointer| Fault { pointer: pointer.to_owned(), detail: detail.clone() });

@@ -14,6 +14,7 @@ mod name;
 mod policies;
 mod pool;
 mod refiner;
+mod sessions;
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -22,6 +23,7 @@ pub use models::{ModelAnswer, Registered};
 pub use name::{InvalidName, Name};
 pub use policies::MadePolicy;
 pub use pool::{PoolError, PoolSettings, SearchPool};
+pub use sessions::{Ended, Observation, Resumed, Session, SessionError};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -30,6 +32,7 @@ use crate::model::Limits;
 use crate::store::{Store, StoreError};
 use cache::MapperCache;
 use refiner::Refiner;
+use sessions::Owners;
 
 /// How the service is set up.
 #[derive(Clone, Debug)]
@@ -40,6 +43,8 @@ pub struct Settings {
     pub limits: Limits,
     /// Most bytes of models kept ready to be searched.
     pub model_cache_bytes: u64,
+    /// How long a session may be idle before it expires.
+    pub session_idle_timeout: Duration,
     /// Threads and queue of the searches.
     pub pool: PoolSettings,
 }
@@ -89,6 +94,8 @@ pub struct Etude {
     pool: SearchPool,
     mappers: MapperCache,
     refiner: Refiner,
+    owners: Owners,
+    session_idle_timeout: Duration,
     limits: Limits,
 }
 
@@ -105,6 +112,8 @@ impl Etude {
             pool: SearchPool::new(settings.pool, tasks.clone(), abort),
             mappers: MapperCache::new(settings.model_cache_bytes),
             refiner: Refiner::default(),
+            owners: Owners::default(),
+            session_idle_timeout: settings.session_idle_timeout,
             limits: settings.limits,
         })
     }

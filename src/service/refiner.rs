@@ -73,7 +73,14 @@ impl Etude {
                     Stamp { id: Some(id), model, model_hash, refines: Some(policy_id.clone()), ..Stamp::default() };
                 let local_cost = local.cost.total;
                 let job = move |interrupt: &mut dyn Interrupt| refine(&mapper, &document, local_cost, stamp, interrupt);
-                self.pool.run_patiently(job).await??
+                match self.pool.run_patiently(job).await? {
+                    // What cannot be read will not be read later either.
+                    Err(error @ (ServiceError::Parse(_) | ServiceError::Faults(_))) => {
+                        tracing::error!(error = &error as &dyn std::error::Error, policy_id, "cannot be refined");
+                        None
+                    }
+                    refined => refined?,
+                }
             }
             // Without its model, the policy stays what it is.
             Ok(_) | Err(ServiceError::Unknown { .. }) => None,
