@@ -513,3 +513,22 @@ async fn a_shutdown_answers_what_still_runs_and_closes_the_database() {
     let left: Vec<_> = std::fs::read_dir(directory.path()).unwrap().map(|file| file.unwrap().file_name()).collect();
     assert_eq!(left, ["etude.db"], "the write-ahead log was folded in");
 }
+
+#[tokio::test]
+async fn a_database_that_another_process_holds_is_no_internal_error() {
+    use sqlx::{ConnectOptions, Connection};
+    let service = Service::start(&[]).await;
+    let path = service.directory.path().join("etude.db");
+    let mut other = sqlx::sqlite::SqliteConnectOptions::new().filename(path).connect().await.unwrap();
+    let held = other.begin_with("BEGIN IMMEDIATE").await.unwrap();
+    let put = async |name: &str| service.send(Method::PUT, &format!("/v1/models/{name}"), &corridor()).await;
+    // Both wait for the lock once, not one after the other.
+    let (first, second) = tokio::join!(put("a"), put("b"));
+    for response in [first, second] {
+        assert_eq!(response.headers()[RETRY_AFTER], "1");
+        assert_eq!(answer(response).await.1["type"], "/problems/not-ready");
+    }
+    held.rollback().await.unwrap();
+    assert_eq!(put("a").await.status(), 201);
+    assert_eq!(service.get("/readyz").await.0, 200);
+}

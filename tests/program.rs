@@ -130,7 +130,10 @@ impl Process {
 #[test]
 fn sigterm_and_sigint_end_the_service_cleanly() {
     let directory = tempfile::tempdir().unwrap();
-    for (signal, flags) in [("-TERM", ["--log-format", "text"]), ("-INT", ["--log-format", "json"])] {
+    for (signal, flags) in [
+        ("-TERM", ["--log-format", "text", "--log", "etude=debug"]),
+        ("-INT", ["--log-format", "json", "--log", "etude=debug"]),
+    ] {
         let service = Process::start(&directory.path().join("etude.db"), &flags);
         let healthy = run(&["healthcheck", "--listen", &service.address]);
         assert!(healthy.status.success(), "{}", text(&healthy.stderr));

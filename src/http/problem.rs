@@ -10,6 +10,7 @@ use utoipa::ToSchema;
 
 use crate::document::{Fault, Faults, ParseError};
 use crate::service::{self, PoolError, ServiceError};
+use crate::store::StoreError;
 
 /// What kind of problem it is: its `type`, title and status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -29,6 +30,7 @@ pub(super) enum ProblemKind {
     Invalid,
     Internal,
     Busy,
+    NotReady,
     Stopping,
 }
 
@@ -55,6 +57,7 @@ impl ProblemKind {
             Self::Invalid => ("invalid", "The request has faults", StatusCode::UNPROCESSABLE_ENTITY),
             Self::Internal => ("internal", "Something went wrong here", StatusCode::INTERNAL_SERVER_ERROR),
             Self::Busy => ("busy", "Too many requests are waiting", StatusCode::SERVICE_UNAVAILABLE),
+            Self::NotReady => ("not-ready", "The database cannot be used now", StatusCode::SERVICE_UNAVAILABLE),
             Self::Stopping => ("stopping", "The service is shutting down", StatusCode::SERVICE_UNAVAILABLE),
         }
     }
@@ -158,7 +161,10 @@ impl From<ServiceError> for Problem {
             }
             ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),
             ServiceError::Pool(PoolError::Busy) => Self::new(ProblemKind::Busy, detail),
-            ServiceError::Pool(PoolError::Stopped) => Self::new(ProblemKind::Stopping, detail),
+            ServiceError::Store(StoreError::Locked) => Self::new(ProblemKind::NotReady, detail),
+            ServiceError::Store(StoreError::Closed) | ServiceError::Pool(PoolError::Stopped) => {
+                Self::new(ProblemKind::Stopping, detail)
+            }
             ServiceError::Pool(PoolError::Panicked) | ServiceError::Store(_) | ServiceError::Write(_) => {
                 // The client gets nothing but its request id, under which the log has the rest.
                 tracing::error!(error = &error as &dyn Error, "a request failed");

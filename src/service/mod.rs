@@ -22,7 +22,7 @@ use std::time::Duration;
 pub use models::{ModelAnswer, Registered};
 pub use name::{InvalidName, Name};
 pub use policies::MadePolicy;
-pub use pool::{PoolError, PoolSettings, SearchPool};
+pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
 pub use sessions::{Ended, Observation, Resumed, Session, SessionError};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;

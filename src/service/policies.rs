@@ -42,10 +42,11 @@ impl Etude {
         arrived: Instant,
         now: Timestamp,
     ) -> Result<MadePolicy, ServiceError> {
+        let place = self.pool.admit()?;
         let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
             document::parse(body.as_ref())
         } else {
-            self.pool.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
+            place.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
         };
         let document = document?;
         let (envelope, faults) = Envelope::read(&document);
@@ -53,7 +54,7 @@ impl Etude {
         let Some(envelope) = envelope else { return Err(faults.into()) };
         let found = match &envelope.learner {
             Some(learner) => Err(unknown_learner(learner)),
-            None => self.mapper(&envelope.model, "/model").await,
+            None => self.mapper(&envelope.model, "/model", Some(&place)).await,
         };
         let (model_hash, mapper) = match found {
             Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
@@ -64,7 +65,9 @@ impl Etude {
         let stamp = Stamp { id: Some(id.clone()), model: envelope.model, model_hash, ..Stamp::default() };
         let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
         let job = move |interrupt: &mut dyn Interrupt| search(&mapper, &document, stamp, interrupt);
-        let Searched { policy, row, refinement } = self.pool.run(deadline, job).await??;
+        let Searched { policy, row, refinement } = place.run(deadline, job).await??;
+        // The disk is no concern of those who wait for a thread.
+        drop(place);
         let is_refined = refinement.is_some();
         self.store.add_policy(row.at(now), refinement).await?;
         if is_refined {

@@ -64,7 +64,7 @@ impl Etude {
         };
         let document = document::parse(request.as_bytes())?;
         let model = document["model"].as_str().unwrap_or_default().to_owned();
-        let refined = match self.mapper(&model, "/model").await {
+        let refined = match self.mapper(&model, "/model", None).await {
             Ok((hash, mapper)) if hash == model_hash => {
                 let local = self.policy(&policy_id).await?;
                 let local: Policy = serde_json::from_str(&local).map_err(ServiceError::Write)?;

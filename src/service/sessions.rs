@@ -123,7 +123,7 @@ impl Etude {
         if let Some(name) = learner {
             return Err(ServiceError::Unknown { kind: "learner", name, pointer: Some("/learner") }.into());
         }
-        let (model_hash, mapper) = self.mapper(&model, "/model").await?;
+        let (model_hash, mapper) = self.mapper(&model, "/model", None).await?;
         let opening = object.as_ref().and_then(|object| Opening::read(&mapper, object, &mut faults));
         let Opening { weights, lookahead, start } = faults.check(opening)?;
 
@@ -170,7 +170,7 @@ impl Etude {
         if row.status == SessionStatus::Expired {
             return Err(SessionError::NotOpen);
         }
-        let (hash, mapper) = self.mapper(&row.model, "/model").await?;
+        let (hash, mapper) = self.mapper(&row.model, "/model", None).await?;
         if hash != row.model_hash {
             let name = format!("{} with hash {}", row.model, row.model_hash);
             return Err(ServiceError::Unknown { kind: "model", name, pointer: None }.into());

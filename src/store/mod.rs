@@ -42,7 +42,10 @@ const N_READERS: u32 = 4;
 pub enum StoreError {
     /// The database failed.
     #[error("the database failed")]
-    Database(#[from] sqlx::Error),
+    Database(#[source] sqlx::Error),
+    /// Another process has held the database for too long; later it may go through.
+    #[error("the database is locked by another process")]
+    Locked,
     /// The database could not be brought to this version's schema.
     #[error("the database could not be migrated")]
     Migrate(#[from] sqlx::migrate::MigrateError),
@@ -65,9 +68,18 @@ pub enum StoreError {
         #[source]
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// The store is shutting down, or its writer failed with the error that was given to another waiter.
+    /// The store is shutting down.
     #[error("the store takes no more writes")]
     Closed,
+}
+
+impl From<sqlx::Error> for StoreError {
+    fn from(error: sqlx::Error) -> Self {
+        /// Primary result code of SQLite; extended codes have it in their low byte.
+        const SQLITE_BUSY: u32 = 5;
+        let code = error.as_database_error().and_then(|error| error.code()?.parse::<u32>().ok());
+        if code.is_some_and(|code| code & 0xff == SQLITE_BUSY) { Self::Locked } else { Self::Database(error) }
+    }
 }
 
 /// The durable state of the service.
@@ -95,6 +107,8 @@ impl Store {
         let mut connection = SqliteConnection::connect_with(&options).await?;
         check_version(&mut connection).await?;
         migrator().run_direct(None, &mut connection, false).await?;
+        // A database that cannot be written to should be told of now, not with the first request.
+        connection.begin_with("BEGIN IMMEDIATE").await?.rollback().await?;
         let readers = SqlitePoolOptions::new()
             .max_connections(N_READERS)
             .connect_with(options.create_if_missing(false).pragma("query_only", "ON"))
@@ -115,7 +129,7 @@ impl Store {
     ///
     /// If it does not.
     pub async fn check(&self) -> Result<(), StoreError> {
-        sqlx::query("SELECT 1").execute(&self.readers).await?;
+        sqlx::query("SELECT count(*) FROM (SELECT 1 FROM models LIMIT 1)").execute(&self.readers).await?;
         Ok(())
     }
 }

@@ -102,6 +102,12 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
                     let _ = job.answer.send(Ok(written));
                 }
             }
+            Err(StoreError::Locked) => {
+                // Each on its own would wait as long again.
+                for job in group.drain(..) {
+                    let _ = job.answer.send(Err(StoreError::Locked));
+                }
+            }
             Err(_) if group.len() > 1 => {
                 // One write must not spoil the others: each gets a transaction and an error of its own.
                 for job in group.drain(..) {
