@@ -80,6 +80,7 @@ impl Map {
             model: request["model"].as_str().unwrap_or_default().to_owned(),
             model_hash: hash_of(&definition.document().text()),
             elapsed_us: as_micros(started.elapsed()),
+            ..Stamp::default()
         };
         let policy = Policy::new(stamp, &problem, &mapping);
         if self.json {

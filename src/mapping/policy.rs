@@ -18,6 +18,10 @@ pub struct Stamp {
     pub model: String,
     /// Hash of the model's content.
     pub model_hash: String,
+    /// The learner whose weights were used, if any.
+    pub learner: Option<String>,
+    /// The version of the learner's weights.
+    pub weights_version: Option<u64>,
     /// Wall-clock time of the search, in microseconds.
     pub elapsed_us: u64,
 }
@@ -175,8 +179,8 @@ impl Policy {
             id: stamp.id,
             model: stamp.model,
             model_hash: stamp.model_hash,
-            learner: None,
-            weights_version: None,
+            learner: stamp.learner,
+            weights_version: stamp.weights_version,
             weights: problem.model.schema().by_attribute(problem.weights.as_slice().iter().copied()),
             lookahead: None,
             status: mapping.status,

@@ -8,7 +8,10 @@ use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::{NewModel, NewPolicy, PutModel, StoreError, models, policies};
+use super::{
+    FailTrial, NewLearner, NewModel, NewPolicy, NewReward, NewTrial, PutLearner, PutModel, PutReward, StoreError,
+    WeightsRow, learners, models, policies, trials,
+};
 
 /// Most writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
 const MAX_GROUP: usize = 256;
@@ -22,6 +25,18 @@ pub(super) enum Write {
     PutModel(NewModel),
     DeleteModel(String),
     AddPolicy(NewPolicy),
+    PutLearner(NewLearner),
+    DeleteLearner(String),
+    AddWeights {
+        learner: i64,
+        weights: WeightsRow,
+    },
+    AddTrial(NewTrial),
+    FailTrial {
+        id: String,
+        reason: Option<String>,
+    },
+    PutReward(NewReward),
 }
 
 /// What became of a [`Write`].
@@ -31,6 +46,15 @@ pub(super) enum Written {
     /// Whether there was one.
     DeleteModel(bool),
     AddPolicy,
+    PutLearner(PutLearner),
+    /// The sequence number of the deleted one, if there was one.
+    DeleteLearner(Option<i64>),
+    /// Whether it was the next version.
+    AddWeights(bool),
+    /// Whether its learner was there.
+    AddTrial(bool),
+    FailTrial(Box<FailTrial>),
+    PutReward(Box<PutReward>),
 }
 
 #[derive(Debug)]
@@ -110,20 +134,53 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
     }
 }
 
-/// Applies `group` in one transaction.
+/// Applies `group` in one transaction: rewards last, all together. Nobody was answered yet, so that any order is one in which
+/// they may have come.
 async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<Written>, StoreError> {
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     let mut written = Vec::with_capacity(group.len());
+    let mut rewards = Vec::new();
     for job in group {
         written.push(match &job.write {
-            Write::PutModel(model) => Written::PutModel(models::put(&mut transaction, model).await?),
-            Write::DeleteModel(name) => Written::DeleteModel(models::delete(&mut transaction, name).await?),
-            Write::AddPolicy(policy) => {
-                policies::add(&mut transaction, policy).await?;
-                Written::AddPolicy
+            Write::PutReward(reward) => {
+                rewards.push(reward);
+                None
             }
+            write => Some(apply(&mut transaction, write).await?),
         });
     }
+    if !rewards.is_empty() {
+        let put = trials::reward_all(&mut transaction, &rewards).await?;
+        let waiting = written.iter_mut().filter(|written| written.is_none());
+        for (written, put) in waiting.zip(put) {
+            *written = Some(Written::PutReward(Box::new(put)));
+        }
+    }
     transaction.commit().await?;
-    Ok(written)
+    Ok(written.into_iter().flatten().collect())
+}
+
+/// Applies a single write.
+async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Written, StoreError> {
+    Ok(match write {
+        Write::PutModel(model) => Written::PutModel(models::put(connection, model).await?),
+        Write::DeleteModel(name) => Written::DeleteModel(models::delete(connection, name).await?),
+        Write::AddPolicy(policy) => {
+            policies::add(connection, policy).await?;
+            Written::AddPolicy
+        }
+        Write::PutLearner(learner) => Written::PutLearner(learners::put(connection, learner).await?),
+        Write::DeleteLearner(name) => Written::DeleteLearner(learners::delete(connection, name).await?),
+        Write::AddWeights { learner, weights } => {
+            Written::AddWeights(learners::add_weights(connection, *learner, weights).await?)
+        }
+        Write::AddTrial(trial) => Written::AddTrial(trials::add(connection, trial).await?),
+        Write::FailTrial { id, reason } => {
+            Written::FailTrial(Box::new(trials::fail(connection, id, reason.as_deref()).await?))
+        }
+        Write::PutReward(reward) => {
+            let mut put = trials::reward_all(connection, &[reward]).await?;
+            Written::PutReward(Box::new(put.pop().ok_or(StoreError::Closed)?))
+        }
+    })
 }
