@@ -88,6 +88,7 @@ impl Server {
         let address = listener.local_addr().map_err(listen)?;
         tasks.spawn(upkeep(metrics.clone(), stopping.clone()));
         let etude = Arc::new(etude);
+        tasks.spawn(Arc::clone(&etude).learn_periodically(config.learn_every, stopping.clone()));
         let router = http::router(Context {
             etude: Arc::clone(&etude),
             stopping: stopping.clone(),

@@ -9,6 +9,7 @@
 //! The OpenAPI description is generated from the handlers of this module; [`openapi`] gives it without a running service.
 
 mod body;
+mod learners;
 mod models;
 mod observe;
 mod operation;
@@ -16,6 +17,7 @@ mod paging;
 mod path;
 mod policies;
 mod problem;
+mod trials;
 
 use std::sync::Arc;
 
@@ -56,6 +58,8 @@ pub struct Context {
     tags(
         (name = "models", description = "What a body can do in its world"),
         (name = "policies", description = "Demonstration in, policy out"),
+        (name = "learners", description = "Which attributes matter, learned from rewards"),
+        (name = "trials", description = "Weights drawn from a learner, the policy that they gave, and the reward that it earned"),
         (name = "operation", description = "Health and measurements"),
     ),
     components(schemas(Problem)),
@@ -68,6 +72,15 @@ fn routes() -> OpenApiRouter<Context> {
         .routes(routes!(models::list_models))
         .routes(routes!(policies::make_policy, policies::list_policies))
         .routes(routes!(policies::get_policy))
+        .routes(routes!(learners::put_learner, learners::get_learner, learners::delete_learner))
+        .routes(routes!(learners::list_learners))
+        .routes(routes!(learners::get_weights))
+        .routes(routes!(learners::list_weights))
+        .routes(routes!(learners::learn))
+        .routes(routes!(trials::make_trial, trials::list_trials))
+        .routes(routes!(trials::get_trial))
+        .routes(routes!(trials::put_reward))
+        .routes(routes!(trials::fail_trial))
         .routes(routes!(operation::livez))
         .routes(routes!(operation::readyz))
         .routes(routes!(operation::metrics))

@@ -20,9 +20,13 @@ pub(super) enum ProblemKind {
     UnknownModel,
     UnknownPolicy,
     UnknownLearner,
+    UnknownTrial,
+    UnknownVersion,
     MethodNotAllowed,
     SlowBody,
     Conflict,
+    AlreadyRewarded,
+    TrialFailed,
     TooLarge,
     UnsupportedMediaType,
     Invalid,
@@ -41,11 +45,15 @@ impl ProblemKind {
             Self::UnknownModel => ("unknown-model", "There is no such model", StatusCode::NOT_FOUND),
             Self::UnknownPolicy => ("unknown-policy", "There is no such policy", StatusCode::NOT_FOUND),
             Self::UnknownLearner => ("unknown-learner", "There is no such learner", StatusCode::NOT_FOUND),
+            Self::UnknownTrial => ("unknown-trial", "There is no such trial", StatusCode::NOT_FOUND),
+            Self::UnknownVersion => ("unknown-version", "There is no such version", StatusCode::NOT_FOUND),
             Self::MethodNotAllowed => {
                 ("method-not-allowed", "The method is not supported here", StatusCode::METHOD_NOT_ALLOWED)
             }
             Self::SlowBody => ("slow-body", "The body took too long", StatusCode::REQUEST_TIMEOUT),
             Self::Conflict => ("conflict", "The name is taken", StatusCode::CONFLICT),
+            Self::AlreadyRewarded => ("already-rewarded", "The trial has a reward", StatusCode::CONFLICT),
+            Self::TrialFailed => ("trial-failed", "The trial has failed", StatusCode::CONFLICT),
             Self::TooLarge => ("too-large", "The body is too large", StatusCode::PAYLOAD_TOO_LARGE),
             Self::UnsupportedMediaType => {
                 ("unsupported-media-type", "The body must be JSON", StatusCode::UNSUPPORTED_MEDIA_TYPE)
@@ -148,12 +156,16 @@ impl From<ServiceError> for Problem {
                 let problem = match kind {
                     "policy" => ProblemKind::UnknownPolicy,
                     "learner" => ProblemKind::UnknownLearner,
+                    "trial" => ProblemKind::UnknownTrial,
                     _ => ProblemKind::UnknownModel,
                 };
                 let fault = pointer.map(|pointer| Fault { pointer: pointer.to_owned(), detail: detail.clone() });
                 Self { errors: fault.into_iter().collect(), ..Self::new(problem, detail) }
             }
             ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),
+            ServiceError::UnknownVersion { .. } => Self::new(ProblemKind::UnknownVersion, detail),
+            ServiceError::AlreadyRewarded { .. } => Self::new(ProblemKind::AlreadyRewarded, detail),
+            ServiceError::TrialFailed { .. } => Self::new(ProblemKind::TrialFailed, detail),
             ServiceError::Pool(PoolError::Busy) => Self::new(ProblemKind::Busy, detail),
             ServiceError::Pool(PoolError::Stopped) => Self::new(ProblemKind::Stopping, detail),
             ServiceError::Pool(PoolError::Panicked) | ServiceError::Store(_) | ServiceError::Write(_) => {

@@ -169,12 +169,11 @@ fn read_per_attribute(
     for (name, member) in place.open_object(faults)?.iter() {
         let number = member.number(Range::Cost, faults);
         let Some(names) = names else { continue };
-        match names.iter().position(|other| **other == *name) {
-            Some(position) => numbers[position] = number.unwrap_or(default),
-            None => {
-                let path = Path::Member(&place.path, name);
-                faults.note_at(&path, format!("unknown attribute {name:?}; the learner has {}", names.join(", ")));
-            }
+        if let Some(position) = names.iter().position(|other| **other == *name) {
+            numbers[position] = number.unwrap_or(default);
+        } else {
+            let path = Path::Member(&place.path, name);
+            faults.note_at(&path, format!("unknown attribute {name:?}; the learner has {}", names.join(", ")));
         }
     }
     Some(numbers)

@@ -9,25 +9,31 @@
 //! Everything that is spawned is tracked, and ends with [`Etude::close`].
 
 mod cache;
+mod learner_task;
+mod learners;
 mod models;
 mod name;
 mod policies;
 mod pool;
+mod trials;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
+pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, Registered};
 pub use name::{InvalidName, Name};
 pub use policies::MadePolicy;
 pub use pool::{PoolError, PoolSettings, SearchPool};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
+pub use trials::TrialAnswer;
 
 use crate::document::{Faults, ParseError};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
 use cache::MapperCache;
+use trials::TrialNumbers;
 
 /// How the service is set up.
 #[derive(Clone, Debug)]
@@ -62,12 +68,36 @@ pub enum ServiceError {
         pointer: Option<&'static str>,
     },
     /// The name is taken by something else.
-    #[error("model {name:?} exists with other content (hash {existing_hash}); delete it first or use another name")]
+    #[error("{kind} {name:?} exists with other content (hash {existing_hash}); delete it first or use another name")]
     Conflict {
+        /// What it is the name of.
+        kind: &'static str,
         /// The name.
         name: String,
         /// The hash of what is there.
         existing_hash: String,
+    },
+    /// The learner never had this version of its weights.
+    #[error("the weights of learner {name:?} have no version {version}")]
+    UnknownVersion {
+        /// The learner.
+        name: String,
+        /// What was asked for.
+        version: u64,
+    },
+    /// The trial has a reward, and that is not changed.
+    #[error("trial {trial} has earned {existing} already")]
+    AlreadyRewarded {
+        /// The trial.
+        trial: String,
+        /// What it has earned.
+        existing: f64,
+    },
+    /// The trial has failed, and takes neither a reward nor another reason.
+    #[error("trial {trial} has failed")]
+    TrialFailed {
+        /// The trial.
+        trial: String,
     },
     /// The searches cannot keep up, or the service is shutting down.
     #[error(transparent)]
@@ -87,6 +117,9 @@ pub struct Etude {
     pool: SearchPool,
     mappers: MapperCache,
     limits: Limits,
+    trial_numbers: TrialNumbers,
+    /// Held while rewards are folded.
+    learning: tokio::sync::Mutex<()>,
 }
 
 impl Etude {
@@ -102,6 +135,8 @@ impl Etude {
             pool: SearchPool::new(settings.pool, tasks.clone(), abort),
             mappers: MapperCache::new(settings.model_cache_bytes),
             limits: settings.limits,
+            trial_numbers: TrialNumbers::default(),
+            learning: tokio::sync::Mutex::new(()),
         })
     }
 

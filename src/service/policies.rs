@@ -8,7 +8,9 @@ use serde_json::Value;
 use serde_json::value::RawValue;
 use uuid::Uuid;
 
+use super::learners::Ready;
 use super::{Etude, ServiceError};
+use crate::attribute::Weights;
 use crate::document::{self, Faults, Place};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::{Mapper, Policy, PolicySummary, Request, Stamp};
@@ -39,32 +41,57 @@ impl Etude {
         arrived: Instant,
         now: Timestamp,
     ) -> Result<MadePolicy, ServiceError> {
-        let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
-            document::parse(body.as_ref())
-        } else {
-            self.pool.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
-        };
-        let document = document?;
+        let document = self.parse(body).await?;
         let (envelope, faults) = Envelope::read(&document);
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
-        let found = match &envelope.learner {
-            Some(learner) => Err(unknown_learner(learner)),
-            None => self.mapper(&envelope.model, "/model").await,
+        let found = async {
+            let learner = match &envelope.learner {
+                Some(learner) => Some(self.ready(learner, Some("/learner")).await?),
+                None => None,
+            };
+            Ok((learner, self.mapper(&envelope.model, "/model").await?))
         };
-        let (model_hash, mapper) = match found {
+        let (learner, (model_hash, mapper)) = match found.await {
             Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
             found => found?,
         };
 
         let id = Uuid::now_v7().to_string();
-        let stamp = Stamp { id: Some(id.clone()), model: envelope.model, model_hash, elapsed_us: 0 };
+        let stamp = Stamp {
+            id: Some(id.clone()),
+            model: envelope.model,
+            model_hash,
+            learner: learner.as_ref().map(|ready| ready.name.clone()),
+            weights_version: learner.as_ref().map(|ready| ready.weights.version),
+            elapsed_us: 0,
+        };
         let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
-        let job = move |interrupt: &mut dyn Interrupt| search(&mapper, &document, stamp, interrupt);
+        let job = move |interrupt: &mut dyn Interrupt| {
+            let schema = mapper.model().schema();
+            let base = |faults: &mut Faults| match &learner {
+                None => Some(schema.weights()),
+                Some(Ready { learner, weights, .. }) => {
+                    let learned = learner.weights_for(schema, &weights.distribution.mean);
+                    learned.map_err(|missing| faults.append(Faults::one("/learner", missing.to_string()))).ok()
+                }
+            };
+            search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)
+        };
         let Searched { policy, summary } = self.pool.run(deadline, job).await??;
         let row = NewPolicy { id: id.clone(), summary, policy: policy.clone(), created_at: now };
         self.store.add_policy(row).await?;
         Ok(MadePolicy { id, policy })
+    }
+
+    /// Parses a body.
+    pub(super) async fn parse(&self, body: impl AsRef<[u8]> + Send + 'static) -> Result<Value, ServiceError> {
+        let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
+            document::parse(body.as_ref())
+        } else {
+            self.pool.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
+        };
+        Ok(document?)
     }
 
     /// The policy with this id: JSON.
@@ -124,27 +151,25 @@ impl Envelope {
     }
 }
 
-fn unknown_learner(name: &str) -> ServiceError {
-    ServiceError::Unknown { kind: "learner", name: name.to_owned(), pointer: Some("/learner") }
-}
-
 /// A policy and its summary: JSON.
-struct Searched {
-    policy: String,
-    summary: String,
+pub(super) struct Searched {
+    pub(super) policy: String,
+    pub(super) summary: String,
 }
 
-/// Reads the request against its model, searches, and writes the policy.
-fn search(
+/// Reads the request against its model, with weights from `base` where it names none, searches, and writes the policy.
+pub(super) fn search(
     mapper: &Mapper,
     document: &Value,
+    fields: &[&str],
+    base: impl FnOnce(&mut Faults) -> Option<Weights>,
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
     let mut faults = Faults::default();
     let root = Place::root(document);
-    let object = root.object(&Request::FIELDS, &mut faults);
-    let request = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
+    let object = root.object(fields, &mut faults);
+    let request = object.and_then(|object| Request::read_over(mapper.model(), &object, base, &mut faults));
     let Request { problem, settings, .. } = match faults.check(request) {
         Ok(request) => request,
         Err(faults) => return Ok(Err(faults.into())),
@@ -164,6 +189,6 @@ fn search(
     Ok(write(&policy).and_then(|text| Ok(Searched { policy: text, summary: write(&PolicySummary::of(&policy))? })))
 }
 
-fn write(document: &impl Serialize) -> Result<String, ServiceError> {
+pub(super) fn write(document: &impl Serialize) -> Result<String, ServiceError> {
     serde_json::to_string(document).map_err(ServiceError::Write)
 }

@@ -191,8 +191,7 @@ impl Store {
         after: Option<u64>,
         limit: u32,
     ) -> Result<Page<WeightsRow>, StoreError> {
-        let query =
-            sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version > $2 ORDER BY version LIMIT $3");
+        let query = sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version > $2 ORDER BY version LIMIT $3");
         let query = query.bind(learner).bind(after.map_or(-1, as_integer)).bind(i64::from(limit) + 1);
         let rows = query.fetch_all(&self.readers).await?;
         let weights = rows.iter().map(read_weights).collect::<Result<Vec<_>, _>>()?;

@@ -27,15 +27,9 @@ pub(super) enum Write {
     AddPolicy(NewPolicy),
     PutLearner(NewLearner),
     DeleteLearner(String),
-    AddWeights {
-        learner: i64,
-        weights: WeightsRow,
-    },
+    AddWeights { learner: i64, weights: WeightsRow },
     AddTrial(NewTrial),
-    FailTrial {
-        id: String,
-        reason: Option<String>,
-    },
+    FailTrial { id: String, reason: Option<String> },
     PutReward(NewReward),
 }
 

@@ -59,8 +59,7 @@ impl WumpusWorld {
     #[must_use]
     pub fn execute(&self, acts: impl IntoIterator<Item = Act>) -> Outcome {
         let Self { cave, rewards } = self;
-        let mut outcome =
-            Outcome { reward: 0.0, n_executed: 0, n_gold: 0, is_dead: false, state: cave.first_state() };
+        let mut outcome = Outcome { reward: 0.0, n_executed: 0, n_gold: 0, is_dead: false, state: cave.first_state() };
         for act in acts {
             outcome.state = cave.after(outcome.state, act);
             outcome.n_executed += 1;
