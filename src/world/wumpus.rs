@@ -55,6 +55,12 @@ impl WumpusWorld {
         Self { cave, rewards }
     }
 
+    /// The rules and things.
+    #[must_use]
+    pub fn cave(&self) -> &Cave {
+        &self.cave
+    }
+
     /// Executes `acts` from the start, until the agent is dead or outside.
     #[must_use]
     pub fn execute(&self, acts: impl IntoIterator<Item = Act>) -> Outcome {
