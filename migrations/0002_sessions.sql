@@ -7,6 +7,9 @@ CREATE TABLE sessions (
     weights         TEXT    NOT NULL, -- JSON: one number per attribute, in the model's order
     lookahead       INTEGER,          -- NULL: only proven steps are committed before the end
     start           INTEGER,          -- state index; NULL: the model's
+    learner         TEXT,             -- whose weights are used, if any
+    weights_version INTEGER,          -- of that learner
+    trial_id        TEXT,             -- the trial that is explored, if any
     status          TEXT    NOT NULL CHECK (status IN ('open', 'done', 'expired')),
     n_observations  INTEGER NOT NULL,
     policy_id       TEXT,

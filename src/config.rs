@@ -48,6 +48,9 @@ pub struct ServeConfig {
         long, env = "ETUDE_SLOW_READER_TIMEOUT", default_value = "10s", value_parser = parse_duration, value_name = "TIME"
     )]
     pub slow_reader_timeout: Duration,
+    /// How often rewards are folded into the weights of their learners, such as 100ms or 1s; above 0.
+    #[arg(long, env = "ETUDE_LEARN_EVERY", default_value = "1s", value_parser = parse_period, value_name = "TIME")]
+    pub learn_every: Duration,
     /// How long requests may go on after SIGTERM or SIGINT, such as 500ms, 10s or 1m.
     #[arg(long, env = "ETUDE_DRAIN_TIMEOUT", default_value = "10s", value_parser = parse_duration, value_name = "TIME")]
     pub drain_timeout: Duration,
@@ -89,6 +92,11 @@ const STREAM_FRAME_BYTES: usize = 262_144;
 fn parse_duration(text: &str) -> Result<Duration, String> {
     let duration: jiff::SignedDuration = text.parse().map_err(|error: jiff::Error| error.to_string())?;
     Duration::try_from(duration).map_err(|_| "expected a time of at least 0".to_owned())
+}
+
+fn parse_period(text: &str) -> Result<Duration, String> {
+    parse_duration(text)
+        .and_then(|period| if period.is_zero() { Err("expected a time above 0".to_owned()) } else { Ok(period) })
 }
 
 #[cfg(test)]

@@ -357,6 +357,8 @@ pub enum Range {
     Positive,
     /// 0 to [`MAX_COST`].
     Cost,
+    /// 0 to 1.
+    Fraction,
 }
 
 impl Range {
@@ -366,6 +368,7 @@ impl Range {
             Self::NonNegative => number >= 0.0,
             Self::Positive => number > 0.0,
             Self::Cost => (0.0..=MAX_COST).contains(&number),
+            Self::Fraction => (0.0..=1.0).contains(&number),
         }
     }
 
@@ -375,6 +378,7 @@ impl Range {
             Self::NonNegative => "a number of at least 0",
             Self::Positive => "a number above 0",
             Self::Cost => "a cost: a number from 0 to 1e150",
+            Self::Fraction => "a number from 0 to 1",
         }
     }
 }

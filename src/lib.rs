@@ -11,8 +11,8 @@
 //! module uses only those to its left.
 //!
 //! ```text
-//! interrupt, document <- attribute <- model <- mapping   |   store <- service <- http <- server <- cli
-//!                                                        |   config, telemetry
+//! interrupt, document <- attribute <- model <- mapping <- learning <- world <- experiment   |   store <- service <- http <- server <- cli
+//!                                                                                           |   config, telemetry
 //! ```
 //!
 //! | module | is |
@@ -22,6 +22,9 @@
 //! | [`attribute`] | attributes of states: kinds, values, weights, distance |
 //! | [`model`] | what a body can do: `table` and `wumpus` dynamics, compiled to one state graph |
 //! | [`mapping`] | the cheapest way to follow a demonstration: problem, search, heuristics, policy |
+//! | [`learning`] | which attributes matter: a weight distribution, drawn from and learned from rewards |
+//! | [`world`] | simulators that execute a policy and give its reward |
+//! | [`experiment`] | the paper's figures |
 //! | [`store`] | all SQL: one writer that groups commits, a pool of readers |
 //! | [`service`] | the application: models, policies, the bounded pool that searches run on |
 //! | [`http`] | routes, bodies, problem documents, the OpenAPI description |
@@ -32,13 +35,19 @@
 //! A request for a policy passes `http::policies` (body), `service::policies` (model from `service::cache`, a place in
 //! `service::pool`), [`mapping::Request`] (faults), [`mapping::Mapper`] (search), [`mapping::Policy`] (answer), and
 //! `store::writer` (disk) before it is answered.
+//!
+//! A trial goes the same way through `service::trials`, with weights that a [`learning::Learner`] draws. Its reward is accepted by
+//! `store::writer`, which numbers rewards in one log per learner; `service::learner_task` folds what is new in the log into
+//! the next version of the weights.
 
 pub mod attribute;
 pub mod cli;
 pub mod config;
 pub mod document;
+pub mod experiment;
 pub mod http;
 pub mod interrupt;
+pub mod learning;
 pub mod mapping;
 pub mod model;
 pub mod server;
@@ -46,3 +55,4 @@ pub mod service;
 pub mod store;
 pub mod stream;
 pub mod telemetry;
+pub mod world;

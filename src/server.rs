@@ -92,6 +92,7 @@ impl Server {
         tasks.spawn(Arc::clone(&etude).refine_until(stopping.clone()));
         tasks.spawn(Arc::clone(&etude).expire_until(stopping.clone()));
         let streams = TaskTracker::new();
+        tasks.spawn(Arc::clone(&etude).learn_periodically(config.learn_every, stopping.clone()));
         let router = http::router(Context {
             etude: Arc::clone(&etude),
             stopping: stopping.clone(),

@@ -480,3 +480,44 @@ async fn no_more_streams_run_than_may() {
     let (status, problem) = service.get("/v1/stream").await;
     assert_eq!((status, &problem["type"]), (422, &json!("/problems/invalid")), "not a websocket: {problem}");
 }
+
+#[tokio::test]
+async fn a_stream_follows_a_learners_weights_or_explores_and_is_rewarded() {
+    let (service, demonstration) = figure_4().await;
+    let learner = json!({"attributes": ["x", "gold"], "mean": {"x": 2, "gold": 3}, "sd": 0.5, "seed": 7});
+    assert_eq!(service.put("/v1/learners/gold", &learner).await.0, 201);
+
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "open", "model": "figure-4", "learner": "gold", "weights": {"y": 4}})).await;
+    let opened = client.receive().await;
+    let weights = &opened["weights"];
+    assert_eq!((&weights["x"], &weights["y"], &weights["gold"]), (&json!(2.0), &json!(4.0), &json!(3.0)));
+    assert_eq!(opened["trial"], Value::Null);
+
+    let mut client = Client::connect(&service).await;
+    let explore = json!({"type": "open", "model": "figure-4", "learner": "gold", "explore": true});
+    client.send(explore).await;
+    let opened = client.receive().await;
+    let trial = format!("/v1/trials/{}", opened["trial"].as_str().unwrap());
+    let (_, active) = service.get(&trial).await;
+    assert_eq!((&active["number"], &active["status"], &active["policy"]), (&json!(1), &json!("active"), &Value::Null));
+    assert_eq!(active["weights"]["gold"], opened["weights"]["gold"]);
+    assert_ne!(opened["weights"]["gold"], json!(3.0), "drawn, not the mean");
+    client.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    client.send(json!({"type": "end", "seq": 16})).await;
+    let done = client.receive_until("done").await.pop().unwrap();
+    client.send(json!({"type": "observe", "seq": 16, "states": [{}]})).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/ended");
+    client.send(json!({"type": "reward", "reward": 974})).await;
+    let rewarded = client.receive().await;
+    assert_eq!((&rewarded["type"], &rewarded["reward_order"]), (&json!("rewarded"), &json!(1)));
+    assert_eq!(client.closed().await, 1000);
+
+    let (_, rewarded) = service.get(&trial).await;
+    assert_eq!((&rewarded["reward"], &rewarded["policy_id"]), (&json!(974.0), &done["policy_id"]));
+    assert_eq!((&rewarded["policy"]["learner"], &rewarded["policy"]["weights_version"]), (&json!("gold"), &json!(0)));
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "open", "model": "figure-4", "learner": "nobody"})).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/unknown-learner");
+    assert_eq!(client.closed().await, 4404);
+}

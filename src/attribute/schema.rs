@@ -71,17 +71,26 @@ impl Schema {
 
     /// Reads weights by attribute name; those not named keep their default.
     pub fn read_weights(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Weights> {
-        let object = place.open_object(faults)?;
         let mut weights = self.weights();
+        for (position, weight) in self.read_named_weights(place, faults)? {
+            weights.set(position, weight);
+        }
+        Some(weights)
+    }
+
+    /// Reads weights by attribute name: positions and weights of those that are named.
+    pub fn read_named_weights(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<(usize, f64)>> {
+        let object = place.open_object(faults)?;
+        let mut named = Vec::new();
         for (name, member) in object.iter() {
             let weight = member.number(Range::NonNegative, faults);
             match (self.position(name), weight) {
-                (Some(position), Some(weight)) => weights.set(position, weight),
+                (Some(position), Some(weight)) => named.push((position, weight)),
                 (None, _) => self.note_unknown(name, &member, faults),
                 (Some(_), None) => {}
             }
         }
-        Some(weights)
+        Some(named)
     }
 
     /// Reads an observation: an object by attribute name, or an array in attribute order. Shape

@@ -9,6 +9,7 @@ use reqwest::Client;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
+use super::client::answer;
 use super::{CliError, render, runtime};
 use crate::config::ServeConfig;
 use crate::mapping::Policy;
@@ -76,16 +77,4 @@ async fn show(address: SocketAddr, out: &mut impl Write) -> Result<(), CliError>
 
 fn document(text: &str) -> Result<Value, CliError> {
     serde_json::from_str(text).map_err(|error| CliError::Io(error.into()))
-}
-
-/// Sends a request and reads the answer.
-async fn answer<T: serde::de::DeserializeOwned>(url: &str, request: reqwest::RequestBuilder) -> Result<T, CliError> {
-    let http = |source| CliError::Http { url: url.to_owned(), source };
-    let answer = request.send().await.map_err(http)?;
-    let status = answer.status();
-    if status.is_success() {
-        return answer.json().await.map_err(http);
-    }
-    let body = answer.text().await.map_err(http)?;
-    Err(CliError::Answer { url: url.to_owned(), status: status.as_u16(), body })
 }

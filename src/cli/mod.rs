@@ -1,6 +1,8 @@
 //! The command line.
 
+mod client;
 mod demo;
+mod experiment;
 mod healthcheck;
 mod map;
 mod openapi;
@@ -37,6 +39,8 @@ enum Command {
     Map(map::Map),
     /// Start a service, send it the demonstration of figure 4, and show what comes back.
     Demo,
+    /// Reproduce the paper's experiments: pictures and tables of its figures 4, 7 and 8.
+    Experiment(experiment::Experiment),
     /// Print the OpenAPI description of the service.
     Openapi,
     /// Ask a running service whether it is ready; for container health checks.
@@ -78,6 +82,12 @@ enum CliError {
     /// A service answered something else than expected.
     #[error("{url} answered {status}: {body}")]
     Answer { url: String, status: u16, body: String },
+    /// An experiment failed.
+    #[error(transparent)]
+    Experiment(crate::experiment::LocalError),
+    /// A figure could not be drawn.
+    #[error(transparent)]
+    Plot(#[from] crate::experiment::plot::PlotError),
     /// Input or output failed.
     #[error(transparent)]
     Io(#[from] io::Error),
@@ -96,6 +106,7 @@ pub fn run() -> ExitCode {
         Command::Serve(serve) => serve.run(),
         Command::Map(map) => map.run(&mut io::stdout().lock()),
         Command::Demo => demo::run(&mut io::stdout()),
+        Command::Experiment(experiment) => experiment.run(&mut io::stdout().lock()),
         Command::Openapi => openapi::run(&mut io::stdout().lock()),
         Command::Healthcheck(healthcheck) => healthcheck.run(),
     });

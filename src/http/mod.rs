@@ -9,6 +9,7 @@
 //! The OpenAPI description is generated from the handlers of this module; [`openapi`] gives it without a running service.
 
 mod body;
+mod learners;
 mod models;
 mod observe;
 mod operation;
@@ -17,6 +18,7 @@ mod path;
 mod policies;
 mod problem;
 mod stream;
+mod trials;
 
 use std::sync::Arc;
 
@@ -78,6 +80,8 @@ impl Context {
         (name = "models", description = "What a body can do in its world"),
         (name = "policies", description = "Demonstration in, policy out"),
         (name = "streams", description = "Policy steps while the demonstration is still running"),
+        (name = "learners", description = "Which attributes matter, learned from rewards"),
+        (name = "trials", description = "Weights drawn from a learner, the policy that they gave, and the reward that it earned"),
         (name = "operation", description = "Health and measurements"),
     ),
     components(schemas(Problem)),
@@ -96,6 +100,15 @@ fn routes() -> OpenApiRouter<Context> {
         .routes(routes!(stream::websocket, stream::ndjson))
         .routes(routes!(stream::list_sessions))
         .routes(routes!(stream::get_session))
+        .routes(routes!(learners::put_learner, learners::get_learner, learners::delete_learner))
+        .routes(routes!(learners::list_learners))
+        .routes(routes!(learners::get_weights))
+        .routes(routes!(learners::list_weights))
+        .routes(routes!(learners::learn))
+        .routes(routes!(trials::make_trial, trials::list_trials))
+        .routes(routes!(trials::get_trial))
+        .routes(routes!(trials::put_reward))
+        .routes(routes!(trials::fail_trial))
         .routes(routes!(operation::livez))
         .routes(routes!(operation::readyz))
         .routes(routes!(operation::metrics))

@@ -29,6 +29,18 @@ impl<S: Send + Sync> FromRequestParts<S> for Paging {
     type Rejection = Problem;
 
     async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Problem> {
+        Self::read(parts, "limit, after", |_, _| None)
+    }
+}
+
+impl Paging {
+    /// Reads a query that also has parameters that `other` knows; those that it does not know, it answers with `None`, faulty
+    /// ones with what is wrong. `known` lists all names.
+    pub(super) fn read(
+        parts: &Parts,
+        known: &str,
+        mut other: impl FnMut(&str, &str) -> Option<Result<(), String>>,
+    ) -> Result<Self, Problem> {
         let mut faults = Faults::default();
         let mut note = |name: &str, detail: String| faults.note_at(&Path::Member(&Path::Root, name), detail);
         let mut paging = Self { limit: Self::DEFAULT_LIMIT, after: None };
@@ -43,10 +55,20 @@ impl<S: Send + Sync> FromRequestParts<S> for Paging {
                     }
                 },
                 "after" => paging.after = Some(value),
-                _ => note(&name, "unknown query parameter; known here: limit, after".to_owned()),
+                _ => match other(&name, &value) {
+                    Some(Ok(())) => {}
+                    Some(Err(detail)) => note(&name, detail),
+                    None => note(&name, format!("unknown query parameter; known here: {known}")),
+                },
             }
         }
         if faults.is_empty() { Ok(paging) } else { Err(faults.into()) }
+    }
+
+    /// The `after` of a list that is paged by numbers.
+    pub(super) fn after_number(&self) -> Result<Option<u64>, Problem> {
+        let parse = |after: &String| after.parse().map_err(|_| Faults::one("/after", "expected the `next` of a page"));
+        Ok(self.after.as_ref().map(parse).transpose()?)
     }
 }
 
@@ -70,5 +92,9 @@ pub(super) struct List<T> {
 impl<T> List<T> {
     pub(super) fn of<U>(page: Page<U>, item: impl Fn(U) -> T) -> Self {
         Self { items: page.items.into_iter().map(item).collect(), next: page.next }
+    }
+
+    pub(super) fn try_of<U, E>(page: Page<U>, item: impl Fn(U) -> Result<T, E>) -> Result<Self, E> {
+        Ok(Self { items: page.items.into_iter().map(item).collect::<Result<_, _>>()?, next: page.next })
     }
 }

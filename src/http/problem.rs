@@ -22,9 +22,13 @@ pub(super) enum ProblemKind {
     UnknownPolicy,
     UnknownLearner,
     UnknownSession,
+    UnknownTrial,
+    UnknownVersion,
     MethodNotAllowed,
     SlowBody,
     Conflict,
+    AlreadyRewarded,
+    TrialFailed,
     TooLarge,
     UnsupportedMediaType,
     Invalid,
@@ -45,11 +49,15 @@ impl ProblemKind {
             Self::UnknownPolicy => ("unknown-policy", "There is no such policy", StatusCode::NOT_FOUND),
             Self::UnknownLearner => ("unknown-learner", "There is no such learner", StatusCode::NOT_FOUND),
             Self::UnknownSession => ("unknown-session", "There is no such session", StatusCode::NOT_FOUND),
+            Self::UnknownTrial => ("unknown-trial", "There is no such trial", StatusCode::NOT_FOUND),
+            Self::UnknownVersion => ("unknown-version", "There is no such version", StatusCode::NOT_FOUND),
             Self::MethodNotAllowed => {
                 ("method-not-allowed", "The method is not supported here", StatusCode::METHOD_NOT_ALLOWED)
             }
             Self::SlowBody => ("slow-body", "The body took too long", StatusCode::REQUEST_TIMEOUT),
             Self::Conflict => ("conflict", "The name is taken", StatusCode::CONFLICT),
+            Self::AlreadyRewarded => ("already-rewarded", "The trial has a reward", StatusCode::CONFLICT),
+            Self::TrialFailed => ("trial-failed", "The trial has failed", StatusCode::CONFLICT),
             Self::TooLarge => ("too-large", "The body is too large", StatusCode::PAYLOAD_TOO_LARGE),
             Self::UnsupportedMediaType => {
                 ("unsupported-media-type", "The body must be JSON", StatusCode::UNSUPPORTED_MEDIA_TYPE)
@@ -154,12 +162,16 @@ impl From<ServiceError> for Problem {
                     "policy" => ProblemKind::UnknownPolicy,
                     "learner" => ProblemKind::UnknownLearner,
                     "session" => ProblemKind::UnknownSession,
+                    "trial" => ProblemKind::UnknownTrial,
                     _ => ProblemKind::UnknownModel,
                 };
                 let fault = pointer.map(|pointer| Fault { pointer: pointer.to_owned(), detail: detail.clone() });
                 Self { errors: fault.into_iter().collect(), ..Self::new(problem, detail) }
             }
             ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),
+            ServiceError::UnknownVersion { .. } => Self::new(ProblemKind::UnknownVersion, detail),
+            ServiceError::AlreadyRewarded { .. } => Self::new(ProblemKind::AlreadyRewarded, detail),
+            ServiceError::TrialFailed { .. } => Self::new(ProblemKind::TrialFailed, detail),
             ServiceError::Pool(PoolError::Busy) => Self::new(ProblemKind::Busy, detail),
             ServiceError::Store(StoreError::Locked) => Self::new(ProblemKind::NotReady, detail),
             ServiceError::Store(StoreError::Closed) | ServiceError::Pool(PoolError::Stopped) => {

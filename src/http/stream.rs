@@ -252,6 +252,12 @@ struct SessionBody {
     weights: Vec<f64>,
     /// How many observations past the current one a decision may wait for; `null`: all.
     lookahead: Option<u32>,
+    /// The learner whose weights are used, if any.
+    learner: Option<String>,
+    /// The version of the learner's weights.
+    weights_version: Option<u64>,
+    /// The trial that it explores, if any.
+    trial_id: Option<String>,
     /// `open`, `done` or `expired`.
     status: &'static str,
     /// How many observations are durable.
@@ -274,6 +280,9 @@ impl From<SessionRow> for SessionBody {
             model_hash: row.model_hash,
             weights: row.weights,
             lookahead: row.lookahead,
+            learner: row.learner,
+            weights_version: row.weights_version,
+            trial_id: row.trial_id,
             status: row.status.name(),
             observations: row.n_observations,
             policy_id: row.policy_id,

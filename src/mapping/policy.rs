@@ -23,6 +23,10 @@ pub struct Stamp {
     pub lookahead: Option<u32>,
     /// The policy that this one refines, if any.
     pub refines: Option<String>,
+    /// The learner whose weights were used, if any.
+    pub learner: Option<String>,
+    /// The version of the learner's weights.
+    pub weights_version: Option<u64>,
     /// Wall-clock time of the search, in microseconds.
     pub elapsed_us: u64,
 }
@@ -190,8 +194,8 @@ impl Policy {
             id: stamp.id,
             model: stamp.model,
             model_hash: stamp.model_hash,
-            learner: None,
-            weights_version: None,
+            learner: stamp.learner,
+            weights_version: stamp.weights_version,
             weights: problem.model.schema().by_attribute(problem.weights.as_slice().iter().copied()),
             lookahead: stamp.lookahead,
             status: mapping.status,

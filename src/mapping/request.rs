@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::{Budget, Demonstration, HeuristicName, Mapper, Mapping, OnlineMapping, Problem, Settings};
-use crate::attribute::Scalar;
+use crate::attribute::{Scalar, Weights};
 use crate::document::{Faults, Object, Place};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::model::{Model, StateIdx};
@@ -46,20 +46,35 @@ impl<'m> Request<'m> {
 
     /// Reads a request against the model that it names. The names themselves (`model`, `learner`) are the caller's.
     pub fn read(model: &'m Model, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
+        Self::read_over(model, object, |_| Some(model.schema().weights()), faults)
+    }
+
+    /// Reads a request like [`Self::read`], with weights from `base` where it names none. `base` is called last, so that it
+    /// knows whether faults were noted.
+    pub fn read_over(
+        model: &'m Model,
+        object: &Object<'_, '_>,
+        base: impl FnOnce(&mut Faults) -> Option<Weights>,
+        faults: &mut Faults,
+    ) -> Option<Self> {
         let schema = model.schema();
         let demonstration = object.required("demonstration", faults);
         let demonstration = demonstration.and_then(|place| Demonstration::read(schema, &place, faults));
-        let weights = match object.optional("weights") {
-            Some(place) => schema.read_weights(&place, faults),
-            None => Some(schema.weights()),
+        let named = match object.optional("weights") {
+            Some(place) => schema.read_named_weights(&place, faults),
+            None => Some(Vec::new()),
         };
         let start = match object.optional("start") {
             Some(place) => model.read_start(&place, faults).map(Some),
             None => Some(None),
         };
         let options = Self::read_options(object, faults);
+        let mut weights = base(faults)?;
+        for (position, weight) in named? {
+            weights.set(position, weight);
+        }
         let Options { settings, lookahead, deadline } = options?;
-        let problem = Problem::new(model, demonstration?, weights?, start?);
+        let problem = Problem::new(model, demonstration?, weights, start?);
         Some(Self { problem, settings, lookahead, deadline })
     }
 
@@ -147,7 +162,7 @@ pub struct RequestDocument {
     /// Weights by attribute name, each at least 0; attributes not named keep the model's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub weights: Option<BTreeMap<String, f64>>,
-    /// Name of a learner whose mean weights are used.
+    /// Name of a learner whose mean weights are used, for attributes that `weights` does not name.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub learner: Option<String>,
     /// How many observations past the current one a decision may wait for; `null`: all. With a number, the policy is what a

@@ -9,16 +9,20 @@
 //! Everything that is spawned is tracked, and ends with [`Etude::close`].
 
 mod cache;
+mod learner_task;
+mod learners;
 mod models;
 mod name;
 mod policies;
 mod pool;
 mod refiner;
 mod sessions;
+mod trials;
 
 use std::path::PathBuf;
 use std::time::Duration;
 
+pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, Registered};
 pub use name::{InvalidName, Name};
 pub use policies::MadePolicy;
@@ -26,6 +30,7 @@ pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
 pub use sessions::{Ended, Observation, Resumed, Session, SessionError};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
+pub use trials::TrialAnswer;
 
 use crate::document::{Faults, ParseError};
 use crate::model::Limits;
@@ -33,6 +38,7 @@ use crate::store::{Store, StoreError};
 use cache::MapperCache;
 use refiner::Refiner;
 use sessions::Owners;
+use trials::TrialNumbers;
 
 /// How the service is set up.
 #[derive(Clone, Debug)]
@@ -69,12 +75,36 @@ pub enum ServiceError {
         pointer: Option<&'static str>,
     },
     /// The name is taken by something else.
-    #[error("model {name:?} exists with other content (hash {existing_hash}); delete it first or use another name")]
+    #[error("{kind} {name:?} exists with other content (hash {existing_hash}); delete it first or use another name")]
     Conflict {
+        /// What it is the name of.
+        kind: &'static str,
         /// The name.
         name: String,
         /// The hash of what is there.
         existing_hash: String,
+    },
+    /// The learner never had this version of its weights.
+    #[error("the weights of learner {name:?} have no version {version}")]
+    UnknownVersion {
+        /// The learner.
+        name: String,
+        /// What was asked for.
+        version: u64,
+    },
+    /// The trial has a reward, and that is not changed.
+    #[error("trial {trial} has earned {existing} already")]
+    AlreadyRewarded {
+        /// The trial.
+        trial: String,
+        /// What it has earned.
+        existing: f64,
+    },
+    /// The trial has failed, and takes neither a reward nor another reason.
+    #[error("trial {trial} has failed")]
+    TrialFailed {
+        /// The trial.
+        trial: String,
     },
     /// The searches cannot keep up, or the service is shutting down.
     #[error(transparent)]
@@ -97,6 +127,9 @@ pub struct Etude {
     owners: Owners,
     session_idle_timeout: Duration,
     limits: Limits,
+    trial_numbers: TrialNumbers,
+    /// Held while rewards are folded.
+    learning: tokio::sync::Mutex<()>,
 }
 
 impl Etude {
@@ -115,6 +148,8 @@ impl Etude {
             owners: Owners::default(),
             session_idle_timeout: settings.session_idle_timeout,
             limits: settings.limits,
+            trial_numbers: TrialNumbers::default(),
+            learning: tokio::sync::Mutex::new(()),
         })
     }
 

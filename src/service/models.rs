@@ -66,7 +66,7 @@ impl Etude {
             PutModel::Created(summary) => (Registered::New, summary),
             PutModel::Unchanged(summary) => (Registered::Already, summary),
             PutModel::Conflict { existing_hash } => {
-                return Err(ServiceError::Conflict { name: name.to_string(), existing_hash });
+                return Err(ServiceError::Conflict { kind: "model", name: name.to_string(), existing_hash });
             }
         };
         self.mappers.insert(hash, Arc::new(mapper));

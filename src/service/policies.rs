@@ -10,7 +10,9 @@ use serde_json::Value;
 use serde_json::value::RawValue;
 use uuid::Uuid;
 
-use super::{Etude, ServiceError};
+use super::learners::Ready;
+use super::{Admission, Etude, ServiceError};
+use crate::attribute::Weights;
 use crate::document::{self, Faults, Place};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Status};
@@ -43,28 +45,43 @@ impl Etude {
         now: Timestamp,
     ) -> Result<MadePolicy, ServiceError> {
         let place = self.pool.admit()?;
-        let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
-            document::parse(body.as_ref())
-        } else {
-            place.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
-        };
-        let document = document?;
+        let document = parse(body, &place).await?;
         let (envelope, faults) = Envelope::read(&document);
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
-        let found = match &envelope.learner {
-            Some(learner) => Err(unknown_learner(learner)),
-            None => self.mapper(&envelope.model, "/model", Some(&place)).await,
+        let found = async {
+            let learner = match &envelope.learner {
+                Some(learner) => Some(self.ready(learner, Some("/learner")).await?),
+                None => None,
+            };
+            Ok((learner, self.mapper(&envelope.model, "/model", Some(&place)).await?))
         };
-        let (model_hash, mapper) = match found {
+        let (learner, (model_hash, mapper)) = match found.await {
             Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
             found => found?,
         };
 
         let id = Uuid::now_v7().to_string();
-        let stamp = Stamp { id: Some(id.clone()), model: envelope.model, model_hash, ..Stamp::default() };
+        let stamp = Stamp {
+            id: Some(id.clone()),
+            model: envelope.model,
+            model_hash,
+            learner: learner.as_ref().map(|ready| ready.name.clone()),
+            weights_version: learner.as_ref().map(|ready| ready.weights.version),
+            ..Stamp::default()
+        };
         let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
-        let job = move |interrupt: &mut dyn Interrupt| search(&mapper, &document, stamp, interrupt);
+        let job = move |interrupt: &mut dyn Interrupt| {
+            let schema = mapper.model().schema();
+            let base = |faults: &mut Faults| match &learner {
+                None => Some(schema.weights()),
+                Some(Ready { learner, weights, .. }) => {
+                    let learned = learner.weights_for(schema, &weights.distribution.mean);
+                    learned.map_err(|missing| faults.append(Faults::one("/learner", missing.to_string()))).ok()
+                }
+            };
+            search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)
+        };
         let Searched { policy, row, refinement } = place.run(deadline, job).await??;
         // The disk is no concern of those who wait for a thread.
         drop(place);
@@ -105,6 +122,16 @@ impl Etude {
     }
 }
 
+/// Parses a body, by its `place` in the pool if it is large.
+pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admission) -> Result<Value, ServiceError> {
+    let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
+        document::parse(body.as_ref())
+    } else {
+        place.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
+    };
+    Ok(document?)
+}
+
 /// What must be known of a request before its model is at hand.
 struct Envelope {
     model: String,
@@ -133,17 +160,13 @@ impl Envelope {
     }
 }
 
-fn unknown_learner(name: &str) -> ServiceError {
-    ServiceError::Unknown { kind: "learner", name: name.to_owned(), pointer: Some("/learner") }
-}
-
 /// What a search gave.
-struct Searched {
+pub(super) struct Searched {
     /// The policy: JSON.
-    policy: String,
-    row: PolicyText,
+    pub(super) policy: String,
+    pub(super) row: PolicyText,
     /// What is to be done about the policy, if it is local.
-    refinement: Option<NewRefinement>,
+    pub(super) refinement: Option<NewRefinement>,
 }
 
 /// A policy as it will be stored.
@@ -166,14 +189,16 @@ impl PolicyText {
     }
 }
 
-/// Reads the request against its model, searches, and writes the policy.
-fn search(
+/// Reads the request against its model, with weights from `base` where it names none, searches, and writes the policy.
+pub(super) fn search(
     mapper: &Arc<Mapper>,
     document: &Value,
+    fields: &[&str],
+    base: impl FnOnce(&mut Faults) -> Option<Weights>,
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
-    let request = match read_request(mapper.model(), document) {
+    let request = match read_request(mapper.model(), document, fields, base) {
         Ok(request) => request,
         Err(faults) => return Ok(Err(faults.into())),
     };
@@ -189,19 +214,33 @@ fn searched(policy: &Policy, document: &Value) -> Result<Searched, ServiceError>
     let row = PolicyText::of(policy)?;
     let refinement = (policy.status == Status::Local).then(|| {
         let mut request = document.clone();
-        request["lookahead"] = Value::Null;
+        // The weights that were used, wherever they came from.
+        request["weights"] = serde_json::json!(policy.weights);
+        for name in ["learner", "lookahead"] {
+            request[name] = Value::Null;
+        }
         NewRefinement { policy_id: row.id.clone(), model_hash: policy.model_hash.clone(), request: request.to_string() }
     });
     Ok(Searched { policy: row.policy.clone(), row, refinement })
 }
 
-/// Reads a request against its model.
-pub(super) fn read_request<'m>(model: &'m Model, document: &Value) -> Result<Request<'m>, Faults> {
+/// Reads a request that may have these `fields` against its model, with weights from `base` where it names none.
+fn read_request<'m>(
+    model: &'m Model,
+    document: &Value,
+    fields: &[&str],
+    base: impl FnOnce(&mut Faults) -> Option<Weights>,
+) -> Result<Request<'m>, Faults> {
     let mut faults = Faults::default();
     let root = Place::root(document);
-    let object = root.object(&Request::FIELDS, &mut faults);
-    let request = object.and_then(|object| Request::read(model, &object, &mut faults));
+    let object = root.object(fields, &mut faults);
+    let request = object.and_then(|object| Request::read_over(model, &object, base, &mut faults));
     faults.check(request)
+}
+
+/// Reads a request that names all weights.
+pub(super) fn read_weighted_request<'m>(model: &'m Model, document: &Value) -> Result<Request<'m>, Faults> {
+    read_request(model, document, &Request::FIELDS, |_| Some(model.schema().weights()))
 }
 
 /// Logs what a search gave.
@@ -223,6 +262,6 @@ pub(super) fn as_micros(since: Instant) -> u64 {
     u64::try_from(since.elapsed().as_micros()).unwrap_or(u64::MAX)
 }
 
-fn write(document: &impl Serialize) -> Result<String, ServiceError> {
+pub(super) fn write(document: &impl Serialize) -> Result<String, ServiceError> {
     serde_json::to_string(document).map_err(ServiceError::Write)
 }

@@ -10,7 +10,7 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::policies::{PolicyText, as_micros, read_request, report};
+use super::policies::{PolicyText, as_micros, read_weighted_request, report};
 use super::{Etude, ServiceError};
 use crate::document;
 use crate::interrupt::{Cancelled, Interrupt};
@@ -101,7 +101,7 @@ fn refine(
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Option<PolicyText>, ServiceError>, Cancelled> {
-    let request = match read_request(mapper.model(), document) {
+    let request = match read_weighted_request(mapper.model(), document) {
         Ok(request) => request,
         Err(faults) => return Ok(Err(faults.into())),
     };

@@ -14,6 +14,7 @@ use tokio::sync::OwnedMutexGuard;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
+use super::learners::Ready;
 use super::policies::{PolicyText, as_micros, report};
 use super::{Etude, PoolError, ServiceError};
 use crate::attribute::{ByAttribute, Weights};
@@ -41,6 +42,9 @@ pub enum SessionError {
     /// There is no demonstration to end.
     #[error("nothing was observed yet")]
     Empty,
+    /// The demonstration has ended already.
+    #[error("the demonstration has ended")]
+    Ended,
     /// Something is wrong with the frame.
     #[error("{0}")]
     Faults(#[from] Faults),
@@ -81,11 +85,20 @@ pub struct Session {
     weights: Weights,
     lookahead: Option<NonZeroU32>,
     start: Option<u32>,
+    source: Source,
     n_received: u32,
     n_steps: usize,
     /// `None` once the session has ended.
     online: Option<OnlineMapping>,
     ownership: Ownership,
+}
+
+/// Where a session's weights come from.
+#[derive(Clone, Debug)]
+struct Source {
+    learner: Option<String>,
+    weights_version: Option<u64>,
+    trial_id: Option<String>,
 }
 
 /// A session that was resumed.
@@ -119,17 +132,30 @@ impl Etude {
         let root = Place::root(request);
         let object = root.object(&Session::OPEN_FIELDS, &mut faults);
         let names = object.as_ref().and_then(|object| read_names(object, &mut faults));
-        let (model, learner) = faults.clone().check(names)?;
-        if let Some(name) = learner {
-            return Err(ServiceError::Unknown { kind: "learner", name, pointer: Some("/learner") }.into());
-        }
+        let Names { model, learner, explores } = faults.clone().check(names)?;
+        let learner = match learner {
+            Some(learner) => Some(self.ready(&learner, Some("/learner")).await?),
+            None => None,
+        };
         let (model_hash, mapper) = self.mapper(&model, "/model", None).await?;
-        let opening = object.as_ref().and_then(|object| Opening::read(&mapper, object, &mut faults));
-        let Opening { weights, lookahead, start } = faults.check(opening)?;
+        let opening = object.as_ref().and_then(|object| Opening::read(&mapper, learner.as_ref(), object, &mut faults));
+        let Opening { mut weights, lookahead, start } = faults.check(opening)?;
 
+        let mut trial = None;
+        if let (true, Some(ready)) = (explores, &learner) {
+            let draw = self.draw(ready, mapper.model().schema(), now).await?;
+            weights = draw.weights;
+            trial = Some(draw.trial);
+        }
         let id = Uuid::now_v7().to_string();
         let ownership = self.owners.take(&id).await;
-        self.store
+        let source = Source {
+            learner: learner.as_ref().map(|ready| ready.name.clone()),
+            weights_version: learner.as_ref().map(|ready| ready.weights.version),
+            trial_id: trial.as_ref().map(|trial| trial.id.clone()),
+        };
+        let opened = self
+            .store
             .open_session(NewSession {
                 id: id.clone(),
                 model: model.clone(),
@@ -137,9 +163,17 @@ impl Etude {
                 weights: weights.as_slice().to_vec(),
                 lookahead: lookahead.map(NonZeroU32::get),
                 start,
+                learner: source.learner.clone(),
+                weights_version: source.weights_version,
+                trial,
                 created_at: now,
             })
             .await?;
+        if !opened {
+            // Deleted in between.
+            let name = source.learner.unwrap_or_default();
+            return Err(ServiceError::Unknown { kind: "learner", name, pointer: Some("/learner") }.into());
+        }
         let online = OnlineMapping::new(Arc::clone(&mapper), weights.clone(), start, lookahead);
         let online = Some(online);
         Ok(Session {
@@ -150,6 +184,7 @@ impl Etude {
             weights,
             lookahead,
             start,
+            source,
             n_received: 0,
             n_steps: 0,
             online,
@@ -184,6 +219,7 @@ impl Etude {
             weights: weights.clone(),
             lookahead,
             start: row.start,
+            source: Source { learner: row.learner, weights_version: row.weights_version, trial_id: row.trial_id },
             n_received: row.n_observations,
             n_steps: 0,
             online: Some(OnlineMapping::new(Arc::clone(&mapper), weights, row.start, lookahead)),
@@ -261,6 +297,18 @@ impl Session {
         &self.id
     }
 
+    /// The trial that it explores, if any.
+    #[must_use]
+    pub fn trial_id(&self) -> Option<&str> {
+        self.source.trial_id.as_deref()
+    }
+
+    /// Whether its demonstration has ended.
+    #[must_use]
+    pub fn has_ended(&self) -> bool {
+        self.online.is_none()
+    }
+
     /// The weights of the distance.
     #[must_use]
     pub fn weights(&self) -> ByAttribute<f64> {
@@ -297,6 +345,9 @@ impl Session {
         states: &Place<'_, '_>,
         now: Timestamp,
     ) -> Result<Vec<Observation>, SessionError> {
+        if self.has_ended() {
+            return Err(SessionError::Ended);
+        }
         if seq > self.n_received {
             return Err(SessionError::Gap { expected: self.n_received });
         }
@@ -372,6 +423,9 @@ impl Session {
     ///
     /// If observations are missing, or the service ends.
     pub async fn end(&mut self, etude: &Etude, seq: u32, now: Timestamp) -> Result<Ended, SessionError> {
+        if self.has_ended() {
+            return Err(SessionError::Ended);
+        }
         if seq != self.n_received {
             return Err(SessionError::Gap { expected: self.n_received });
         }
@@ -381,10 +435,16 @@ impl Session {
         let texts = etude.store.observations(&self.id).await?;
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let (mapper, weights, start) = (Arc::clone(&self.mapper), self.weights.clone(), self.start);
+        let policy_id = match &self.source.trial_id {
+            Some(trial) => etude.store.trial(trial).await?.map(|trial| trial.policy_id),
+            None => None,
+        };
         let stamp = Stamp {
-            id: Some(Uuid::now_v7().to_string()),
+            id: Some(policy_id.unwrap_or_else(|| Uuid::now_v7().to_string())),
             model: self.model.clone(),
             model_hash: self.model_hash.clone(),
+            learner: self.source.learner.clone(),
+            weights_version: self.source.weights_version,
             lookahead: self.lookahead.map(NonZeroU32::get),
             ..Stamp::default()
         };
@@ -464,16 +524,33 @@ fn read_stored(mapper: &Mapper, texts: &[String]) -> Result<Vec<Observation>, Se
     Ok(observations)
 }
 
-/// Reads the names in a request to open a session.
-fn read_names(object: &Object<'_, '_>, faults: &mut Faults) -> Option<(String, Option<String>)> {
+/// The names in a request to open a session.
+struct Names {
+    model: String,
+    learner: Option<String>,
+    explores: bool,
+}
+
+fn read_names(object: &Object<'_, '_>, faults: &mut Faults) -> Option<Names> {
     let model = object.required("model", faults).and_then(|place| place.string(faults));
     let learner = object.optional("learner").map(|place| place.string(faults));
-    let explore = object.optional("explore").map(|place| (place, place.boolean(faults)));
-    if let (None, Some((place, Some(true)))) = (&learner, explore) {
-        faults.note(&place, "exploring needs a learner");
+    let explores = match object.optional("explore") {
+        Some(place) => {
+            let explores = place.boolean(faults);
+            if explores == Some(true) && learner.is_none() {
+                faults.note(&place, "exploring needs a learner");
+            }
+            explores
+        }
+        None => Some(false),
+    };
+    if let (Some(true), Some(place)) = (explores, object.optional("weights"))
+        && place.value.as_object().is_some_and(|weights| !weights.is_empty())
+    {
+        faults.note(&place, "an exploring session draws its weights");
     }
     let learner = learner.map_or(Some(None), |learner| learner.map(Some));
-    Some((model?.to_owned(), learner?.map(str::to_owned)))
+    Some(Names { model: model?.to_owned(), learner: learner?.map(str::to_owned), explores: explores? })
 }
 
 /// What a session is opened with.
@@ -484,12 +561,25 @@ struct Opening {
 }
 
 impl Opening {
-    fn read(mapper: &Mapper, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
+    fn read(mapper: &Mapper, learner: Option<&Ready>, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
         let model = mapper.model();
-        let weights = match object.optional("weights") {
-            Some(place) => model.schema().read_weights(&place, faults),
+        let base = match learner {
             None => Some(model.schema().weights()),
+            Some(Ready { learner, weights, .. }) => {
+                let learned = learner.weights_for(model.schema(), &weights.distribution.mean);
+                learned.map_err(|missing| faults.append(Faults::one("/learner", missing.to_string()))).ok()
+            }
         };
+        let named = match object.optional("weights") {
+            Some(place) => model.schema().read_named_weights(&place, faults),
+            None => Some(Vec::new()),
+        };
+        let weights = base.zip(named).map(|(mut weights, named)| {
+            for (position, weight) in named {
+                weights.set(position, weight);
+            }
+            weights
+        });
         let lookahead = match (object.optional("lookahead"), object.members.contains_key("lookahead")) {
             (Some(place), _) => read_lookahead(&place, faults).map(Some),
             (None, true) => Some(None),

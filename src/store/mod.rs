@@ -9,15 +9,18 @@
 //! A write that was answered is on disk. Rows become domain types here and nowhere else; times are milliseconds since 1970,
 //! documents are JSON text.
 
+mod learners;
 mod models;
 mod policies;
 mod refinements;
 mod sessions;
+mod trials;
 mod writer;
 
 use std::path::Path;
 use std::time::Duration;
 
+pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
 pub use models::{ModelRow, ModelSummary, NewModel, PutModel};
 pub use policies::{NewPolicy, PolicySummaryRow};
 pub use refinements::{NewRefinement, RefinementEnd};
@@ -26,6 +29,7 @@ use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection};
 use tokio_util::task::TaskTracker;
+pub use trials::{AcceptedReward, FailTrial, Failure, NewReward, NewTrial, PutReward, TrialRow, TrialStatus};
 use writer::Writer;
 
 /// Earlier ones can corrupt a database in WAL mode.
@@ -143,6 +147,7 @@ fn migrator() -> Migrator {
         migrations: vec![
             migration(1, "models and policies", include_str!("../../migrations/0001_models_and_policies.sql")),
             migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
+            migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
         ]
         .into(),
         ..Migrator::DEFAULT
@@ -185,6 +190,12 @@ fn corrupt<E: Into<Box<dyn std::error::Error + Send + Sync>>>(
     column: &'static str,
 ) -> impl FnOnce(E) -> StoreError {
     move |source| StoreError::Corrupt { table, column, source: source.into() }
+}
+
+/// A column that is never negative.
+fn count(row: &sqlx::sqlite::SqliteRow, table: &'static str, column: &'static str) -> Result<u64, StoreError> {
+    use sqlx::Row;
+    u64::try_from(row.try_get::<i64, _>(column)?).map_err(corrupt(table, column))
 }
 
 fn timestamp(table: &'static str, column: &'static str, ms: i64) -> Result<jiff::Timestamp, StoreError> {

@@ -6,6 +6,7 @@ use sqlx::{Row, SqliteConnection};
 
 use super::policies::NewPolicy;
 use super::refinements::NewRefinement;
+use super::trials::{self, NewTrial};
 use super::writer::{Write, Written};
 use super::{Page, Store, StoreError, corrupt, policies, refinements, timestamp};
 
@@ -53,6 +54,12 @@ pub struct SessionRow {
     pub lookahead: Option<u32>,
     /// Index of the start state, if the request named one.
     pub start: Option<u32>,
+    /// The learner whose weights are used, if any.
+    pub learner: Option<String>,
+    /// The version of the learner's weights.
+    pub weights_version: Option<u64>,
+    /// The trial that is explored, if any.
+    pub trial_id: Option<String>,
     /// How far it has come.
     pub status: SessionStatus,
     /// How many observations are stored.
@@ -80,6 +87,12 @@ pub struct NewSession {
     pub lookahead: Option<u32>,
     /// Index of the start state, if the request named one.
     pub start: Option<u32>,
+    /// The learner whose weights are used, if any.
+    pub learner: Option<String>,
+    /// The version of the learner's weights.
+    pub weights_version: Option<u64>,
+    /// The trial that is explored, if any.
+    pub trial: Option<NewTrial>,
     /// When it is opened.
     pub created_at: Timestamp,
 }
@@ -111,13 +124,13 @@ pub struct SessionEnd {
 }
 
 impl Store {
-    /// Opens a session.
+    /// Opens a session, and its trial if it explores. Says whether the trial's learner was there.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn open_session(&self, session: NewSession) -> Result<(), StoreError> {
-        self.writer.write(Write::OpenSession(session)).await.map(drop)
+    pub async fn open_session(&self, session: NewSession) -> Result<bool, StoreError> {
+        self.done(Write::OpenSession(Box::new(session))).await
     }
 
     /// Adds observations to an open session. Says whether it was open and they came next.
@@ -203,6 +216,9 @@ fn read_session(row: &SqliteRow) -> Result<SessionRow, StoreError> {
         weights: serde_json::from_str(row.try_get("weights")?).map_err(corrupt(TABLE, "weights"))?,
         lookahead: count("lookahead")?,
         start: count("start")?,
+        learner: row.try_get("learner")?,
+        weights_version: count("weights_version")?.map(u64::from),
+        trial_id: row.try_get("trial_id")?,
         status: SessionStatus::named(status).ok_or_else(|| corrupt(TABLE, "status")(status.to_owned()))?,
         n_observations: count("n_observations")?.unwrap_or(0),
         policy_id: row.try_get("policy_id")?,
@@ -211,12 +227,18 @@ fn read_session(row: &SqliteRow) -> Result<SessionRow, StoreError> {
     })
 }
 
-pub(super) async fn open(connection: &mut SqliteConnection, session: &NewSession) -> Result<(), StoreError> {
+pub(super) async fn open(connection: &mut SqliteConnection, session: &NewSession) -> Result<bool, StoreError> {
+    if let Some(trial) = &session.trial
+        && !trials::add(connection, trial).await?
+    {
+        return Ok(false);
+    }
     let created_at_ms = session.created_at.as_millisecond();
     sqlx::query(
         "INSERT INTO sessions
-             (id, model, model_hash, weights, lookahead, start, status, n_observations, created_at_ms, active_at_ms)
-         VALUES ($1, $2, $3, $4, $5, $6, 'open', 0, $7, $7)",
+             (id, model, model_hash, weights, lookahead, start, learner, weights_version, trial_id,
+              status, n_observations, created_at_ms, active_at_ms)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', 0, $10, $10)",
     )
     .bind(&session.id)
     .bind(&session.model)
@@ -224,10 +246,13 @@ pub(super) async fn open(connection: &mut SqliteConnection, session: &NewSession
     .bind(serde_json::to_string(&session.weights).map_err(corrupt("sessions", "weights"))?)
     .bind(session.lookahead)
     .bind(session.start)
+    .bind(&session.learner)
+    .bind(session.weights_version.and_then(|version| i64::try_from(version).ok()))
+    .bind(session.trial.as_ref().map(|trial| &trial.id))
     .bind(created_at_ms)
     .execute(connection)
     .await?;
-    Ok(())
+    Ok(true)
 }
 
 pub(super) async fn add(connection: &mut SqliteConnection, new: &NewObservations) -> Result<bool, StoreError> {

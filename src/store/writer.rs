@@ -11,8 +11,9 @@ use tokio_util::task::TaskTracker;
 use jiff::Timestamp;
 
 use super::{
-    NewModel, NewObservations, NewPolicy, NewRefinement, NewSession, PutModel, RefinementEnd, SessionEnd, StoreError,
-    models, policies, refinements, sessions,
+    FailTrial, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement, NewReward, NewSession, NewTrial,
+    PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, WeightsRow, learners, models, policies,
+    refinements, sessions, trials,
 };
 
 /// Most writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
@@ -28,11 +29,23 @@ pub(super) enum Write {
     DeleteModel(String),
     AddPolicy(NewPolicy, Option<NewRefinement>),
     EndRefinement(Box<RefinementEnd>),
-    OpenSession(NewSession),
+    OpenSession(Box<NewSession>),
     AddObservations(NewObservations),
     EndSession(Box<SessionEnd>),
     /// Those last active before this time.
     ExpireSessions(Timestamp),
+    PutLearner(NewLearner),
+    DeleteLearner(String),
+    AddWeights {
+        learner: i64,
+        weights: WeightsRow,
+    },
+    AddTrial(Box<NewTrial>),
+    FailTrial {
+        id: String,
+        reason: Option<String>,
+    },
+    PutReward(NewReward),
 }
 
 /// What became of a [`Write`].
@@ -43,6 +56,15 @@ pub(super) enum Written {
     DeleteModel(bool),
     /// Whether things were as expected, so that it was done.
     Done(bool),
+    PutLearner(PutLearner),
+    /// The sequence number of the deleted one, if there was one.
+    DeleteLearner(Option<i64>),
+    /// Whether it was the next version.
+    AddWeights(bool),
+    /// Whether its learner was there.
+    AddTrial(bool),
+    FailTrial(Box<FailTrial>),
+    PutReward(Box<PutReward>),
 }
 
 #[derive(Debug)]
@@ -128,37 +150,67 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
     }
 }
 
-/// Applies `group` in one transaction.
+/// Applies `group` in one transaction: rewards last, all together. Nobody was answered yet, so that any order is one in which
+/// they may have come.
 async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<Written>, StoreError> {
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     let mut written = Vec::with_capacity(group.len());
+    let mut rewards = Vec::new();
     for job in group {
         written.push(match &job.write {
-            Write::PutModel(model) => Written::PutModel(models::put(&mut transaction, model).await?),
-            Write::DeleteModel(name) => Written::DeleteModel(models::delete(&mut transaction, name).await?),
-            Write::AddPolicy(policy, refinement) => {
-                policies::add(&mut transaction, policy).await?;
-                if let Some(refinement) = refinement {
-                    refinements::add(&mut transaction, refinement).await?;
-                }
-                Written::Done(true)
+            Write::PutReward(reward) => {
+                rewards.push(reward);
+                None
             }
-            Write::EndRefinement(end) => {
-                refinements::end(&mut transaction, end).await?;
-                Written::Done(true)
-            }
-            Write::OpenSession(session) => {
-                sessions::open(&mut transaction, session).await?;
-                Written::Done(true)
-            }
-            Write::AddObservations(observations) => Written::Done(sessions::add(&mut transaction, observations).await?),
-            Write::EndSession(end) => Written::Done(sessions::end(&mut transaction, end).await?),
-            Write::ExpireSessions(before) => {
-                sessions::expire(&mut transaction, *before).await?;
-                Written::Done(true)
-            }
+            write => Some(apply(&mut transaction, write).await?),
         });
     }
+    if !rewards.is_empty() {
+        let put = trials::reward_all(&mut transaction, &rewards).await?;
+        let waiting = written.iter_mut().filter(|written| written.is_none());
+        for (written, put) in waiting.zip(put) {
+            *written = Some(Written::PutReward(Box::new(put)));
+        }
+    }
     transaction.commit().await?;
-    Ok(written)
+    Ok(written.into_iter().flatten().collect())
+}
+
+/// Applies a single write.
+async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Written, StoreError> {
+    Ok(match write {
+        Write::PutModel(model) => Written::PutModel(models::put(connection, model).await?),
+        Write::DeleteModel(name) => Written::DeleteModel(models::delete(connection, name).await?),
+        Write::AddPolicy(policy, refinement) => {
+            policies::add(connection, policy).await?;
+            if let Some(refinement) = refinement {
+                refinements::add(connection, refinement).await?;
+            }
+            Written::Done(true)
+        }
+        Write::EndRefinement(end) => {
+            refinements::end(connection, end).await?;
+            Written::Done(true)
+        }
+        Write::OpenSession(session) => Written::Done(sessions::open(connection, session).await?),
+        Write::AddObservations(observations) => Written::Done(sessions::add(connection, observations).await?),
+        Write::EndSession(end) => Written::Done(sessions::end(connection, end).await?),
+        Write::ExpireSessions(before) => {
+            sessions::expire(connection, *before).await?;
+            Written::Done(true)
+        }
+        Write::PutLearner(learner) => Written::PutLearner(learners::put(connection, learner).await?),
+        Write::DeleteLearner(name) => Written::DeleteLearner(learners::delete(connection, name).await?),
+        Write::AddWeights { learner, weights } => {
+            Written::AddWeights(learners::add_weights(connection, *learner, weights).await?)
+        }
+        Write::AddTrial(trial) => Written::AddTrial(trials::add(connection, trial).await?),
+        Write::FailTrial { id, reason } => {
+            Written::FailTrial(Box::new(trials::fail(connection, id, reason.as_deref()).await?))
+        }
+        Write::PutReward(reward) => {
+            let mut put = trials::reward_all(connection, &[reward]).await?;
+            Written::PutReward(Box::new(put.pop().ok_or(StoreError::Closed)?))
+        }
+    })
 }

@@ -194,10 +194,21 @@ impl Connection<'_> {
                 self.send_steps(steps.get(step as usize..).unwrap_or_default()).await?;
                 let Some(policy) = policy else { return Ok(None) };
                 self.send(&ServerFrame::from(&policy)).await?;
-                Ok(Some(Closed::Done))
+                Ok(self.done())
             }
             (ClientFrame::Observe { .. } | ClientFrame::End { .. }, None) => {
                 Err(not_allowed("open or resume a session first"))
+            }
+            (ClientFrame::Reward { reward }, Some(session)) if let Some(trial) = session.trial_id() => {
+                let has_ended = session.has_ended();
+                match self.etude.accept_reward(trial, reward, now).await {
+                    Ok(trial) => {
+                        let order = trial.row.reward.as_ref().map(|reward| reward.reward_order);
+                        self.send(&ServerFrame::Rewarded { trial: &trial.row.id, reward, reward_order: order }).await?;
+                        Ok(has_ended.then_some(Closed::Done))
+                    }
+                    Err(error) => self.go_on_or_end(&error.into()).await,
+                }
             }
             (ClientFrame::Reward { .. }, _) => Err(not_allowed("only an exploring session takes a reward")),
             (ClientFrame::Observe { seq, frame }, Some(session)) => {
@@ -219,11 +230,17 @@ impl Connection<'_> {
                 Ok(Ended { steps, policy }) => {
                     self.send_steps(&steps).await?;
                     self.send(&ServerFrame::from(&policy)).await?;
-                    Ok(Some(Closed::Done))
+                    Ok(self.done())
                 }
                 Err(error) => self.go_on_or_end(&error).await,
             },
         }
+    }
+
+    /// How the connection ends when the policy is done: an exploring session waits for its reward.
+    fn done(&self) -> Option<Closed> {
+        let explores = self.session.as_ref().is_some_and(|session| session.trial_id().is_some());
+        (!explores).then_some(Closed::Done)
     }
 
     async fn opened(&mut self, session: Session) -> Result<(), Over> {
@@ -231,7 +248,7 @@ impl Connection<'_> {
         let session = self.session.insert(session);
         let frame = ServerFrame::Opened {
             session: session.id(),
-            trial: None,
+            trial: session.trial_id(),
             weights: session.weights(),
             received: session.n_received(),
             steps: session.n_steps(),
@@ -252,6 +269,13 @@ impl Connection<'_> {
             SessionError::Gap { .. } => StreamProblem::new("gap", error.to_string()),
             SessionError::TooMany => StreamProblem::new("too-many-observations", error.to_string()),
             SessionError::Empty => StreamProblem::new("empty", error.to_string()),
+            SessionError::Ended => StreamProblem::new("ended", error.to_string()),
+            SessionError::Service(ServiceError::AlreadyRewarded { .. }) => {
+                StreamProblem::new("already-rewarded", error.to_string())
+            }
+            SessionError::Service(ServiceError::TrialFailed { .. }) => {
+                StreamProblem::new("trial-failed", error.to_string())
+            }
             SessionError::Faults(faults) => {
                 let mut problem = StreamProblem::of("invalid", faults);
                 // Places are within the frame.
@@ -320,7 +344,9 @@ fn ends(error: &SessionError) -> Over {
     match error {
         SessionError::Faults(faults) => Over::because(Closed::BadFrame, StreamProblem::of("invalid", faults)),
         SessionError::NotOpen => Over::because(Closed::Unknown, StreamProblem::new("expired", detail)),
-        SessionError::Gap { .. } | SessionError::TooMany | SessionError::Empty => not_allowed(&detail),
+        SessionError::Gap { .. } | SessionError::TooMany | SessionError::Empty | SessionError::Ended => {
+            not_allowed(&detail)
+        }
         SessionError::Service(ServiceError::Unknown { kind, .. }) => {
             Over::because(Closed::Unknown, StreamProblem::new(&format!("unknown-{kind}"), detail))
         }

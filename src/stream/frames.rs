@@ -139,6 +139,15 @@ pub enum ServerFrame<'f> {
         /// Its actions, in order.
         actions: &'f [std::sync::Arc<str>],
     },
+    /// The reward of the explored trial is durable.
+    Rewarded {
+        /// The trial.
+        trial: &'f str,
+        /// Its reward.
+        reward: f64,
+        /// The order in which its learner accepted it.
+        reward_order: Option<u64>,
+    },
     /// Something is wrong.
     Error {
         /// What.

@@ -23,6 +23,7 @@
 //! | `seq` beyond what was received | `gap` | goes on; nothing was taken |
 //! | states with faults | `invalid`, with pointers | goes on; none of the frame's states was taken |
 //! | more observations than a session may have; an end without any | `too-many-observations`, `empty` | goes on |
+//! | `observe` or `end` after the end of an exploring session; a second, other reward | `ended`, `already-rewarded` | goes on |
 //! | the session is resumed on another connection | `taken-over` | close 1008 |
 //! | nothing came for too long | `idle` | close 1008 |
 //! | too many sessions; the client does not read | `overloaded` | close 1013, to be resumed |
@@ -30,7 +31,7 @@
 //! | the server failed | `internal` | close 1011, to be resumed |
 //!
 //! Observations that were received before are ignored, so a client may send again whatever it is not sure of. After `done`
-//! the server closes with 1000, and what still comes is ignored.
+//! the server closes with 1000, and what still comes is ignored; a session that explores waits for its reward before.
 
 mod engine;
 pub mod frames;

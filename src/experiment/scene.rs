@@ -1,0 +1,94 @@
+//! The worlds of the paper's figures.
+
+use serde_json::Value;
+
+use crate::model::{Act, Cave, Cell, Definition, Limits};
+use crate::world::{Outcome, Rewards, WumpusWorld};
+
+/// A world, the body that the imitator has in it, and what it was shown.
+#[derive(Clone, Debug)]
+pub struct Scene {
+    name: &'static str,
+    model: Value,
+    demonstration: Value,
+    world: WumpusWorld,
+}
+
+const FIGURE_4: &str = include_str!("../../examples/figure-4/model.json");
+const FIGURE_4_SEEN: &str = include_str!("../../examples/figure-4/demonstration.json");
+const FIGURE_6: &str = include_str!("../../examples/figure-6/model.json");
+const FIGURE_6_SEEN: &str = include_str!("../../examples/figure-6/demonstration.json");
+const FIGURE_8: [(&str, &str); 4] = [
+    ("figure-8-l1", include_str!("../../examples/figure-8/model-l1.json")),
+    ("figure-8-l2", include_str!("../../examples/figure-8/model-l2.json")),
+    ("figure-8-l3", include_str!("../../examples/figure-8/model-l3.json")),
+    ("figure-8-l4", include_str!("../../examples/figure-8/model-l4.json")),
+];
+const FIGURE_8_SEEN: &str = include_str!("../../examples/figure-8/demonstration.json");
+
+impl Scene {
+    /// The world of figure 4: the imitator cannot shoot the wumpus that the demonstrator shot.
+    #[must_use]
+    pub fn figure_4() -> Self {
+        Self::new("figure-4", FIGURE_4, FIGURE_4_SEEN)
+    }
+
+    /// The world of figures 6 and 7: the gold that the demonstrator fetched is gone; there is another piece.
+    #[must_use]
+    pub fn figure_6() -> Self {
+        Self::new("figure-6", FIGURE_6, FIGURE_6_SEEN)
+    }
+
+    /// The worlds of figure 8: the gold lies at one of four other locations, L1 to L4.
+    #[must_use]
+    pub fn figure_8() -> [Self; 4] {
+        FIGURE_8.map(|(name, model)| Self::new(name, model, FIGURE_8_SEEN))
+    }
+
+    fn new(name: &'static str, model: &str, demonstration: &str) -> Self {
+        let parse = |text| serde_json::from_str::<Value>(text).expect("examples are JSON");
+        let model = parse(model);
+        let Ok(Definition::Wumpus(cave)) = Definition::read(&model, Limits::DEFAULT) else {
+            unreachable!("the examples of figures are caves");
+        };
+        Self { name, model, demonstration: parse(demonstration), world: WumpusWorld::new(cave, Rewards::PAPER) }
+    }
+
+    /// The name of its model.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        self.name
+    }
+
+    /// The imitator's model: JSON.
+    #[must_use]
+    pub fn model(&self) -> &Value {
+        &self.model
+    }
+
+    /// What it was shown: JSON.
+    #[must_use]
+    pub fn demonstration(&self) -> &Value {
+        &self.demonstration
+    }
+
+    /// The rules and things of its world.
+    #[must_use]
+    pub fn cave(&self) -> &Cave {
+        self.world.cave()
+    }
+
+    /// Where the demonstrator was seen, observation by observation.
+    #[must_use]
+    pub fn observed_cells(&self) -> Vec<Cell> {
+        let coordinate = |seen: &Value, name: &str| u16::try_from(seen[name].as_u64()?).ok();
+        let seen = self.demonstration.as_array().map(Vec::as_slice).unwrap_or_default();
+        seen.iter().filter_map(|seen| coordinate(seen, "x").zip(coordinate(seen, "y"))).collect()
+    }
+
+    /// What becomes of an imitator that executes these actions. Those that are none have no place in this world.
+    #[must_use]
+    pub fn execute(&self, actions: &[String]) -> Outcome {
+        self.world.execute(actions.iter().filter_map(|name| Act::named(name)))
+    }
+}

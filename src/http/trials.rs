@@ -1,0 +1,271 @@
+//! `/v1/learners/{learner}/trials` and `/v1/trials`.
+
+use axum::extract::{FromRequestParts, Request, State};
+use axum::http::header::LOCATION;
+use axum::http::request::Parts;
+use axum::http::{HeaderValue, StatusCode};
+use axum::response::Response;
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use serde_json::value::RawValue;
+use utoipa::{IntoParams, ToSchema};
+
+use super::Context;
+use super::body::{json, read_json};
+use super::paging::{List, Paging};
+use super::path::{PathId, PathName};
+use super::problem::Problem;
+use crate::mapping::{ObservationDocument, Policy, StartReference};
+use crate::service::{ServiceError, TrialAnswer};
+use crate::store::{StoreError, TrialStatus};
+
+/// Largest body of a reward or of a reason.
+const MAX_SMALL_BODY_BYTES: usize = 16 * 1024;
+
+/// A request for a trial.
+#[derive(Debug, Serialize, Deserialize, ToSchema)]
+#[schema(as = TrialRequest)]
+pub(super) struct TrialRequestBody {
+    /// Name of the imitator's model. It must have the attributes of the learner.
+    #[schema(example = "figure-6")]
+    model: String,
+    /// The observed states, in order: 1 to 100,000. Attributes may be missing or null: not observed.
+    demonstration: Vec<ObservationDocument>,
+    /// Where the imitator starts; the model's start if left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    start: Option<StartReference>,
+    /// How many observations past the current one a decision may wait for; `null`: all.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 1)]
+    lookahead: Option<u32>,
+}
+
+/// A trial: weights drawn from a learner, the policy that they gave, and the reward that it earned.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Trial)]
+pub(super) struct TrialBody {
+    /// Under which it is stored.
+    id: String,
+    /// The learner.
+    #[schema(example = "gold")]
+    learner: String,
+    /// Counted from 1 per learner. With the learner's seed, what the draw is keyed by.
+    #[schema(example = 41)]
+    number: u64,
+    /// What has become of it: `active` until it has a reward, `rewarded` then, `learned` once that is folded into the
+    /// weights; `failed`; `expired` when its lease is over (a late reward is still accepted).
+    #[schema(value_type = String, example = "active")]
+    status: &'static str,
+    /// The weights as drawn, by attribute of the learner.
+    #[schema(value_type = BTreeMap<String, f64>)]
+    weights: Box<RawValue>,
+    /// The version of the learner's weights that they were drawn from.
+    #[schema(example = 12)]
+    weights_version: u64,
+    /// What it earned.
+    reward: Option<f64>,
+    /// Counted from 1 per learner, in the order in which rewards were accepted.
+    reward_order: Option<u64>,
+    /// The version of the learner's weights that folded the reward in.
+    learned_version: Option<u64>,
+    /// Why it failed, in the client's words.
+    reason: Option<String>,
+    /// When it expires.
+    #[schema(value_type = String, format = DateTime)]
+    lease_expires_at: Timestamp,
+    /// The policy to be executed.
+    policy_id: String,
+    /// The policy in full; not in lists, nor when a reward is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(value_type = Option<Policy>, required = false)]
+    policy: Option<Box<RawValue>>,
+}
+
+impl TrialBody {
+    fn of(answer: TrialAnswer) -> Result<Self, ServiceError> {
+        let TrialAnswer { row, status, policy } = answer;
+        let corrupt =
+            |error: serde_json::Error| StoreError::Corrupt { table: "trials", column: "weights", source: error.into() };
+        Ok(Self {
+            id: row.id,
+            learner: row.learner,
+            number: row.number,
+            status: status.name(),
+            weights: RawValue::from_string(row.weights).map_err(corrupt)?,
+            weights_version: row.weights_version,
+            reward: row.reward.map(|accepted| accepted.reward),
+            reward_order: row.reward.map(|accepted| accepted.reward_order),
+            learned_version: row.learned_version,
+            reason: row.failed.and_then(|failure| failure.reason),
+            lease_expires_at: row.lease_expires_at,
+            policy_id: row.policy_id,
+            policy,
+        })
+    }
+}
+
+/// What a trial earned.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Reward)]
+pub(super) struct RewardBody {
+    /// Finite.
+    #[schema(example = 974)]
+    reward: f64,
+}
+
+/// Why a trial failed.
+#[derive(Debug, Serialize, ToSchema)]
+#[schema(as = Failure)]
+pub(super) struct FailureBody {
+    /// In the client's words; up to 1000 characters.
+    #[schema(example = "the battery is empty")]
+    reason: Option<String>,
+}
+
+/// Draw weights from a learner, and map a demonstration with them.
+#[utoipa::path(
+    post, path = "/v1/learners/{learner}/trials", tag = "trials",
+    params(("learner" = String, Path, description = "The learner's name")),
+    request_body = TrialRequestBody,
+    responses(
+        (status = 201, description = "The trial, with its policy", body = TrialBody,
+            headers(("location" = String, description = "Where it can be read again"))),
+        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "`unknown-learner`, `unknown-model`", body = Problem, content_type = "application/problem+json"),
+        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`; also if the model lacks an attribute of the learner", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn make_trial(
+    State(context): State<Context>,
+    PathName(name): PathName,
+    request: Request,
+) -> Result<Response, Problem> {
+    let body = read_json(request, context.max_body_bytes).await?;
+    let made = TrialBody::of(context.etude.make_trial(&name, body, Timestamp::now()).await?)?;
+    let location = HeaderValue::from_str(&format!("/v1/trials/{}", made.id));
+    let mut response = json(StatusCode::CREATED, &made);
+    if let Ok(location) = location {
+        response.headers_mut().insert(LOCATION, location);
+    }
+    Ok(response)
+}
+
+/// Which trials are wanted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, IntoParams)]
+#[into_params(parameter_in = Query)]
+pub(super) struct WhichTrials {
+    /// Only those with this status: `active`, `rewarded`, `learned`, `failed` or `expired`.
+    #[param(value_type = Option<String>)]
+    status: Option<TrialStatus>,
+}
+
+/// [`WhichTrials`] and [`Paging`] of the same query.
+pub(super) struct TrialsQuery(WhichTrials, Paging);
+
+impl<S: Send + Sync> FromRequestParts<S> for TrialsQuery {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Problem> {
+        let mut which = WhichTrials { status: None };
+        let paging = Paging::read(parts, "limit, after, status", |name, value| match name {
+            "status" => {
+                which.status = TrialStatus::ALL.into_iter().find(|status| status.name() == value);
+                let names = TrialStatus::ALL.map(TrialStatus::name).join(", ");
+                let fault = which.status.is_none().then(|| format!("expected one of {names}, found {value:?}"));
+                Some(fault.map_or(Ok(()), Err))
+            }
+            _ => None,
+        })?;
+        Ok(Self(which, paging))
+    }
+}
+
+/// Trials of a learner without their policies, in the order of their numbers.
+#[utoipa::path(
+    get, path = "/v1/learners/{learner}/trials", tag = "trials",
+    params(("learner" = String, Path, description = "The learner's name"), WhichTrials, Paging),
+    responses(
+        (status = 200, description = "A page of trials", body = List<TrialBody>),
+        (status = 404, description = "`unknown-learner`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn list_trials(
+    State(context): State<Context>,
+    PathName(name): PathName,
+    TrialsQuery(which, paging): TrialsQuery,
+) -> Result<Response, Problem> {
+    let after = paging.after_number()?.unwrap_or(0);
+    let page = context.etude.trials(&name, which.status, Timestamp::now(), after, paging.limit).await?;
+    Ok(json(StatusCode::OK, &List::try_of(page, TrialBody::of)?))
+}
+
+/// A trial, with its policy.
+#[utoipa::path(
+    get, path = "/v1/trials/{trial}", tag = "trials",
+    params(("trial" = String, Path, description = "Its id")),
+    responses(
+        (status = 200, description = "The trial", body = TrialBody),
+        (status = 404, description = "`unknown-trial`", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn get_trial(State(context): State<Context>, PathId(id): PathId) -> Result<Response, Problem> {
+    let trial = context.etude.trial(&id, Timestamp::now()).await?;
+    Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
+}
+
+/// Give a trial its reward; durable before it is answered. Counts once, however often it is sent.
+#[utoipa::path(
+    put, path = "/v1/trials/{trial}/reward", tag = "trials",
+    params(("trial" = String, Path, description = "Its id")),
+    request_body = RewardBody,
+    responses(
+        (status = 200, description = "The reward is the trial's, now or already", body = TrialBody),
+        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "`unknown-trial`: also if its learner was deleted", body = Problem, content_type = "application/problem+json"),
+        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "`already-rewarded`: it has another reward; `trial-failed`", body = Problem, content_type = "application/problem+json"),
+        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`: among others, not finite", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn put_reward(
+    State(context): State<Context>,
+    PathId(id): PathId,
+    request: Request,
+) -> Result<Response, Problem> {
+    let body = read_json(request, context.max_body_bytes.min(MAX_SMALL_BODY_BYTES)).await?;
+    let trial = context.etude.reward_trial(&id, &body, Timestamp::now()).await?;
+    Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
+}
+
+/// End a trial without a reward.
+#[utoipa::path(
+    post, path = "/v1/trials/{trial}/fail", tag = "trials",
+    params(("trial" = String, Path, description = "Its id")),
+    request_body = FailureBody,
+    responses(
+        (status = 200, description = "The trial has failed, now or already for this reason", body = TrialBody),
+        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "`unknown-trial`: also if its learner was deleted", body = Problem, content_type = "application/problem+json"),
+        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "`already-rewarded`; `trial-failed`: for another reason", body = Problem, content_type = "application/problem+json"),
+        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn fail_trial(
+    State(context): State<Context>,
+    PathId(id): PathId,
+    request: Request,
+) -> Result<Response, Problem> {
+    let body = read_json(request, context.max_body_bytes.min(MAX_SMALL_BODY_BYTES)).await?;
+    let trial = context.etude.fail_trial(&id, &body, Timestamp::now()).await?;
+    Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
+}

@@ -1,0 +1,308 @@
+//! Trials: drawn, mapped, rewarded.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use jiff::Timestamp;
+use rustc_hash::FxHashMap;
+use serde_json::value::RawValue;
+use uuid::Uuid;
+
+use super::learners::{Ready, unknown};
+use super::policies::{self, Searched};
+use super::{Etude, Name, ServiceError};
+use crate::attribute::{Schema, Weights};
+use crate::document::{Faults, Place, Range};
+use crate::interrupt::Interrupt;
+use crate::mapping::Stamp;
+use crate::store::{FailTrial, NewReward, NewTrial, Page, PutReward, Store, StoreError, TrialRow, TrialStatus};
+
+/// Longest reason for a failure, in characters.
+const MAX_REASON_CHARS: usize = 1000;
+
+/// A trial, and what has become of it.
+#[derive(Debug)]
+pub struct TrialAnswer {
+    /// The trial.
+    pub row: TrialRow,
+    /// What has become of it.
+    pub status: TrialStatus,
+    /// Its policy: JSON. Not in lists.
+    pub policy: Option<Box<RawValue>>,
+}
+
+impl Etude {
+    /// Draws a trial from the learner called `name`, for the demonstration and model in `body` (JSON), and stores it with
+    /// the policy that it gives.
+    ///
+    /// # Errors
+    ///
+    /// If the body is no request for a trial, something that is named is not there, the model lacks an attribute of the
+    /// learner, or the service cannot do it now.
+    pub async fn make_trial(
+        &self,
+        name: &Name,
+        body: impl AsRef<[u8]> + Send + 'static,
+        now: Timestamp,
+    ) -> Result<TrialAnswer, ServiceError> {
+        let Ready { sequence, name, learner, weights } = self.ready(name.as_str(), None).await?;
+        let place = self.pool.admit()?;
+        let document = policies::parse(body, &place).await?;
+        let mut faults = Faults::default();
+        let root = Place::root(&document);
+        let model = root.object(&TRIAL_FIELDS, &mut faults).and_then(|object| {
+            object.required("demonstration", &mut faults);
+            object.required("model", &mut faults)?.string(&mut faults).map(str::to_owned)
+        });
+        let Some(model) = model else { return Err(faults.into()) };
+        let (model_hash, mapper) = match self.mapper(&model, "/model", Some(&place)).await {
+            Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
+            found => found?,
+        };
+
+        let numbers = self.trial_numbers.of(sequence, &self.store).await?;
+        let id = Uuid::now_v7().to_string();
+        let (policy_id, weights_version) = (Uuid::now_v7().to_string(), weights.version);
+        let stamp = Stamp {
+            id: Some(policy_id.clone()),
+            model,
+            model_hash,
+            learner: Some(name.clone()),
+            weights_version: Some(weights_version),
+            ..Stamp::default()
+        };
+        let lease_s = learner.lease_s();
+        let job = move |interrupt: &mut dyn Interrupt| {
+            let mut drawn = None;
+            let base = |faults: &mut Faults| {
+                let schema = mapper.model().schema();
+                if let Err(missing) = learner.weights_for(schema, &learner.initial().mean) {
+                    faults.append(Faults::one("/model", missing.to_string()));
+                }
+                // A request with faults takes no number: the next trial is the same as if it had not been made.
+                if !faults.is_empty() {
+                    return None;
+                }
+                let number = numbers.fetch_add(1, Ordering::Relaxed) + 1;
+                let weights = learner.draw(&weights.distribution, number);
+                let all = learner.weights_for(schema, &weights).ok();
+                drawn = Some((number, policies::write(&learner.by_attribute(weights))));
+                all
+            };
+            let searched = policies::search(&mapper, &document, &TRIAL_FIELDS, base, stamp, interrupt)?;
+            Ok(searched.map(|searched| (searched, drawn)))
+        };
+        let (Searched { policy, row, refinement }, drawn) = place.run(None, job).await??;
+        drop(place);
+        let (number, weights) = drawn.ok_or(StoreError::Closed)?;
+        let weights = weights?;
+
+        let now = as_stored(now);
+        let lease_expires_at = now.checked_add(Duration::from_secs(lease_s)).unwrap_or(Timestamp::MAX);
+        let new = NewTrial {
+            id: id.clone(),
+            learner: sequence,
+            number,
+            weights: weights.clone(),
+            weights_version,
+            policy_id: policy_id.clone(),
+            policy: Some(row.at(now)),
+            refinement,
+            created_at: now,
+            lease_expires_at,
+        };
+        let is_refined = new.refinement.is_some();
+        if !self.store.add_trial(new).await? {
+            return Err(unknown(&name, None));
+        }
+        if is_refined {
+            self.refiner.wake();
+        }
+        metrics::counter!("etude_trials_total").increment(1);
+        let row = TrialRow {
+            sequence: 0,
+            id,
+            learner: name,
+            number,
+            weights,
+            weights_version,
+            policy_id,
+            lease_expires_at,
+            failed: None,
+            reward: None,
+            learned_version: None,
+        };
+        Ok(TrialAnswer { row, status: TrialStatus::Active, policy: Some(read_policy(policy)?) })
+    }
+
+    /// Draws a trial for a policy that is still in the making. The caller stores it.
+    pub(super) async fn draw(&self, ready: &Ready, schema: &Schema, now: Timestamp) -> Result<Draw, ServiceError> {
+        let Ready { sequence, learner, weights, .. } = ready;
+        let numbers = self.trial_numbers.of(*sequence, &self.store).await?;
+        let number = numbers.fetch_add(1, Ordering::Relaxed) + 1;
+        let drawn = learner.draw(&weights.distribution, number);
+        let missing = |missing: crate::learning::MissingAttributes| Faults::one("/learner", missing.to_string());
+        let all = learner.weights_for(schema, &drawn).map_err(missing)?;
+        let now = as_stored(now);
+        let trial = NewTrial {
+            id: Uuid::now_v7().to_string(),
+            learner: *sequence,
+            number,
+            weights: policies::write(&learner.by_attribute(drawn))?,
+            weights_version: weights.version,
+            policy_id: Uuid::now_v7().to_string(),
+            policy: None,
+            refinement: None,
+            created_at: now,
+            lease_expires_at: now.checked_add(Duration::from_secs(learner.lease_s())).unwrap_or(Timestamp::MAX),
+        };
+        metrics::counter!("etude_trials_total").increment(1);
+        Ok(Draw { trial, weights: all })
+    }
+
+    /// The trial with this id, with its policy.
+    ///
+    /// # Errors
+    ///
+    /// If there is none.
+    pub async fn trial(&self, id: &str, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
+        let row = self.store.trial(id).await?.ok_or_else(|| unknown_trial(id))?;
+        let policy = self.store.policy(&row.policy_id).await?.map(read_policy).transpose()?;
+        Ok(TrialAnswer { status: row.status(now), row, policy })
+    }
+
+    /// At most `limit` trials of a learner in the order of their numbers, from the first after the number `after`; only those
+    /// with the given status, if one is.
+    ///
+    /// # Errors
+    ///
+    /// If there is no such learner.
+    pub async fn trials(
+        &self,
+        name: &Name,
+        status: Option<TrialStatus>,
+        now: Timestamp,
+        after: u64,
+        limit: u32,
+    ) -> Result<Page<TrialAnswer>, ServiceError> {
+        let learner = self.learner_row(name).await?.sequence;
+        let Page { items, next } = self.store.trials(learner, status, now, after, limit).await?;
+        let answer = |row: TrialRow| TrialAnswer { status: row.status(now), row, policy: None };
+        Ok(Page { items: items.into_iter().map(answer).collect(), next })
+    }
+
+    /// Accepts the reward in `body` (JSON) for a trial; durable when this returns. The same reward again changes nothing.
+    ///
+    /// # Errors
+    ///
+    /// If the body is no reward, there is no such trial, or it has another reward or has failed.
+    pub async fn reward_trial(&self, id: &str, body: &[u8], now: Timestamp) -> Result<TrialAnswer, ServiceError> {
+        let document = crate::document::parse(body)?;
+        let mut faults = Faults::default();
+        let object = Place::root(&document).object(&["reward"], &mut faults);
+        let reward =
+            object.and_then(|object| object.required("reward", &mut faults)?.number(Range::Finite, &mut faults));
+        self.accept_reward(id, faults.check(reward)?, now).await
+    }
+
+    /// Accepts a reward, which must be finite, for a trial; durable when this returns. The same reward again changes nothing.
+    ///
+    /// # Errors
+    ///
+    /// If there is no such trial, or it has another reward or has failed.
+    pub async fn accept_reward(&self, id: &str, reward: f64, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
+        let new = NewReward { trial: id.to_owned(), reward, accepted_at: now };
+        let row = match self.store.put_reward(new).await? {
+            PutReward::Accepted(row) => {
+                metrics::counter!("etude_rewards_total").increment(1);
+                row
+            }
+            PutReward::Unchanged(row) => row,
+            PutReward::Conflict { existing } => {
+                return Err(ServiceError::AlreadyRewarded { trial: id.to_owned(), existing });
+            }
+            PutReward::Failed => return Err(ServiceError::TrialFailed { trial: id.to_owned() }),
+            PutReward::Unknown => return Err(unknown_trial(id)),
+        };
+        Ok(TrialAnswer { status: row.status(now), row, policy: None })
+    }
+
+    /// Ends a trial without a reward, for the reason in `body` (JSON).
+    ///
+    /// # Errors
+    ///
+    /// If the body gives no reason, there is no such trial, or it has a reward or has failed for another reason.
+    pub async fn fail_trial(&self, id: &str, body: &[u8], now: Timestamp) -> Result<TrialAnswer, ServiceError> {
+        let document = crate::document::parse(body)?;
+        let mut faults = Faults::default();
+        let object = Place::root(&document).object(&["reason"], &mut faults);
+        let reason = object.and_then(|object| match object.optional("reason") {
+            None => Some(None),
+            Some(place) => {
+                let reason = place.string(&mut faults)?;
+                if reason.chars().count() > MAX_REASON_CHARS {
+                    return place.mismatch(&format!("at most {MAX_REASON_CHARS} characters"), &mut faults);
+                }
+                Some(Some(reason.to_owned()))
+            }
+        });
+        let reason = faults.check(reason)?;
+        match self.store.fail_trial(id, reason).await? {
+            FailTrial::Failed(row) => Ok(TrialAnswer { status: row.status(now), row, policy: None }),
+            FailTrial::Conflict { .. } => Err(ServiceError::TrialFailed { trial: id.to_owned() }),
+            FailTrial::Rewarded { existing } => Err(ServiceError::AlreadyRewarded { trial: id.to_owned(), existing }),
+            FailTrial::Unknown => Err(unknown_trial(id)),
+        }
+    }
+}
+
+/// A trial that was drawn, and the weights of the distance that it gives.
+pub(super) struct Draw {
+    pub(super) trial: NewTrial,
+    pub(super) weights: Weights,
+}
+
+/// Every field of a request for a trial.
+const TRIAL_FIELDS: [&str; 4] = ["model", "demonstration", "start", "lookahead"];
+
+/// Numbers of trials, by learner. Kept in memory: a number that was given out but whose trial did not become durable was
+/// never seen outside, and may be given again after a restart.
+#[derive(Debug, Default)]
+pub(super) struct TrialNumbers {
+    last: Mutex<FxHashMap<i64, Arc<AtomicU64>>>,
+}
+
+impl TrialNumbers {
+    /// The last number given out by the learner with this sequence number.
+    pub(super) async fn of(&self, learner: i64, store: &Store) -> Result<Arc<AtomicU64>, StoreError> {
+        let known = self.last.lock().unwrap_or_else(PoisonError::into_inner).get(&learner).cloned();
+        if let Some(last) = known {
+            return Ok(last);
+        }
+        let stored = store.last_trial_number(learner).await?;
+        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        // Another request may have been faster, and have given out a number already.
+        Ok(Arc::clone(last.entry(learner).or_insert_with(|| Arc::new(AtomicU64::new(stored)))))
+    }
+
+    /// Forgets a learner that was deleted.
+    pub(super) fn forget(&self, learner: i64) {
+        self.last.lock().unwrap_or_else(PoisonError::into_inner).remove(&learner);
+    }
+}
+
+fn unknown_trial(id: &str) -> ServiceError {
+    ServiceError::Unknown { kind: "trial", name: id.to_owned(), pointer: None }
+}
+
+fn read_policy(policy: String) -> Result<Box<RawValue>, ServiceError> {
+    let corrupt =
+        |error: serde_json::Error| StoreError::Corrupt { table: "policies", column: "policy", source: error.into() };
+    Ok(RawValue::from_string(policy).map_err(corrupt)?)
+}
+
+/// A time as exact as it is stored.
+pub(super) fn as_stored(time: Timestamp) -> Timestamp {
+    time.round(jiff::Unit::Millisecond).unwrap_or(time)
+}

@@ -1,0 +1,331 @@
+//! The tables of learners and their weights, and the log of rewards as learners read it.
+
+use futures_util::TryStreamExt;
+use jiff::Timestamp;
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
+
+use super::writer::{Write, Written};
+use super::{Page, Store, StoreError, corrupt, count, timestamp};
+use crate::attribute::ByAttribute;
+use crate::learning::Distribution;
+
+/// A learner to be registered.
+#[derive(Clone, Debug)]
+pub struct NewLearner {
+    /// The name to register it under.
+    pub name: String,
+    /// SHA-256 of its canonical text.
+    pub hash: String,
+    /// Its canonical text.
+    pub definition: String,
+    /// What it starts from.
+    pub initial: Distribution,
+    /// When it is registered.
+    pub created_at: Timestamp,
+}
+
+/// A learner as it is stored.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LearnerRow {
+    /// Unlike its name, never used again.
+    pub sequence: i64,
+    /// The name it is registered under.
+    pub name: String,
+    /// SHA-256 of its canonical text.
+    pub hash: String,
+    /// Its canonical text.
+    pub definition: String,
+    /// When it was registered.
+    pub created_at: Timestamp,
+}
+
+/// What became of a registration.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum PutLearner {
+    /// It is new.
+    Created(LearnerRow),
+    /// The same content was there already, under the same name.
+    Unchanged(LearnerRow),
+    /// Other content is there under this name; it was left alone.
+    Conflict {
+        /// The hash of what is there.
+        existing_hash: String,
+    },
+}
+
+/// A version of a learner's distribution.
+#[derive(Clone, Debug, PartialEq)]
+pub struct WeightsRow {
+    /// Counted from 0: what the learner started from.
+    pub version: u64,
+    /// The order of the last reward that is folded in; 0 if there is none.
+    pub reward_order: u64,
+    /// The distribution.
+    pub distribution: Distribution,
+    /// When it was made.
+    pub updated_at: Timestamp,
+}
+
+/// What a learner learns from: an accepted reward, and the weights that earned it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RewardRow {
+    /// Counted from 1 per learner, in the order of acceptance.
+    pub reward_order: u64,
+    /// As drawn.
+    pub weights: ByAttribute<f64>,
+    /// The reward.
+    pub reward: f64,
+}
+
+impl Store {
+    /// Registers a learner, unless its name is taken.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn put_learner(&self, learner: NewLearner) -> Result<PutLearner, StoreError> {
+        match self.writer.write(Write::PutLearner(learner)).await? {
+            Written::PutLearner(put) => Ok(put),
+            _ => Err(StoreError::Closed),
+        }
+    }
+
+    /// Deletes a learner with its weights, trials and rewards. Gives the sequence number of the deleted one, if there was
+    /// one.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn delete_learner(&self, name: &str) -> Result<Option<i64>, StoreError> {
+        match self.writer.write(Write::DeleteLearner(name.to_owned())).await? {
+            Written::DeleteLearner(deleted) => Ok(deleted),
+            _ => Err(StoreError::Closed),
+        }
+    }
+
+    /// Adds the version that follows the learner's last one. Says whether it did: not if that version is there already, or
+    /// the learner is gone.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn add_weights(&self, learner: i64, weights: WeightsRow) -> Result<bool, StoreError> {
+        match self.writer.write(Write::AddWeights { learner, weights }).await? {
+            Written::AddWeights(added) => Ok(added),
+            _ => Err(StoreError::Closed),
+        }
+    }
+
+    /// The learner called `name`.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn learner(&self, name: &str) -> Result<Option<LearnerRow>, StoreError> {
+        let query = sqlx::query("SELECT * FROM learners WHERE name = $1").bind(name);
+        query.fetch_optional(&self.readers).await?.map(|row| read_learner(&row)).transpose()
+    }
+
+    /// The learner called `name`, and the last version of its weights.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn learner_and_weights(&self, name: &str) -> Result<Option<(LearnerRow, WeightsRow)>, StoreError> {
+        let query = sqlx::query(
+            "SELECT l.*, w.version, w.reward_order, w.expected_reward, w.mean, w.sd, w.updated_at_ms
+             FROM learners l JOIN weights w ON w.learner = l.sequence
+             WHERE l.name = $1 ORDER BY w.version DESC LIMIT 1",
+        );
+        let row = query.bind(name).fetch_optional(&self.readers).await?;
+        row.map(|row| Ok((read_learner(&row)?, read_weights(&row)?))).transpose()
+    }
+
+    /// At most `limit` learners in the order of their names, from the first after `after`.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn learners(&self, after: Option<&str>, limit: u32) -> Result<Page<LearnerRow>, StoreError> {
+        let query = sqlx::query("SELECT * FROM learners WHERE name > $1 ORDER BY name LIMIT $2");
+        let query = query.bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
+        let rows = query.fetch_all(&self.readers).await?;
+        let learners = rows.iter().map(read_learner).collect::<Result<Vec<_>, _>>()?;
+        Ok(Page::of(learners, limit, |learner| learner.name.clone()))
+    }
+
+    /// Names of learners with rewards that no version has folded in.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn learners_behind(&self) -> Result<Vec<String>, StoreError> {
+        let query = sqlx::query_scalar(
+            "SELECT l.name FROM learners l
+             WHERE (SELECT MAX(reward_order) FROM rewards r WHERE r.learner = l.sequence)
+                 > (SELECT MAX(reward_order) FROM weights w WHERE w.learner = l.sequence)",
+        );
+        Ok(query.fetch_all(&self.readers).await?)
+    }
+
+    /// A version of the weights of a learner.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn weights(&self, learner: i64, version: u64) -> Result<Option<WeightsRow>, StoreError> {
+        let query = sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version = $2");
+        let query = query.bind(learner).bind(as_integer(version));
+        query.fetch_optional(&self.readers).await?.map(|row| read_weights(&row)).transpose()
+    }
+
+    /// At most `limit` versions of the weights of a learner, from the first after `after` on; `None`: from version 0.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn weights_history(
+        &self,
+        learner: i64,
+        after: Option<u64>,
+        limit: u32,
+    ) -> Result<Page<WeightsRow>, StoreError> {
+        let query = sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version > $2 ORDER BY version LIMIT $3");
+        let query = query.bind(learner).bind(after.map_or(-1, as_integer)).bind(i64::from(limit) + 1);
+        let rows = query.fetch_all(&self.readers).await?;
+        let weights = rows.iter().map(read_weights).collect::<Result<Vec<_>, _>>()?;
+        Ok(Page::of(weights, limit, |weights| weights.version.to_string()))
+    }
+
+    /// Gives each accepted reward of a learner after the one with order `after` to `each`, in order.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn each_reward(
+        &self,
+        learner: i64,
+        after: u64,
+        mut each: impl FnMut(RewardRow),
+    ) -> Result<(), StoreError> {
+        let query = sqlx::query(
+            "SELECT r.reward_order, r.reward, t.weights FROM rewards r JOIN trials t ON t.sequence = r.trial
+             WHERE r.learner = $1 AND r.reward_order > $2 ORDER BY r.reward_order",
+        );
+        let mut rows = query.bind(learner).bind(as_integer(after)).fetch(&self.readers);
+        while let Some(row) = rows.try_next().await? {
+            each(RewardRow {
+                reward_order: count(&row, "rewards", "reward_order")?,
+                weights: serde_json::from_str(row.try_get("weights")?).map_err(corrupt("trials", "weights"))?,
+                reward: row.try_get("reward")?,
+            });
+        }
+        Ok(())
+    }
+}
+
+fn read_learner(row: &SqliteRow) -> Result<LearnerRow, StoreError> {
+    Ok(LearnerRow {
+        sequence: row.try_get("sequence")?,
+        name: row.try_get("name")?,
+        hash: row.try_get("hash")?,
+        definition: row.try_get("definition")?,
+        created_at: timestamp("learners", "created_at_ms", row.try_get("created_at_ms")?)?,
+    })
+}
+
+fn read_weights(row: &SqliteRow) -> Result<WeightsRow, StoreError> {
+    const TABLE: &str = "weights";
+    let numbers = |column: &'static str| -> Result<Vec<f64>, StoreError> {
+        serde_json::from_str(row.try_get(column)?).map_err(corrupt(TABLE, column))
+    };
+    Ok(WeightsRow {
+        version: count(row, TABLE, "version")?,
+        reward_order: count(row, TABLE, "reward_order")?,
+        distribution: Distribution {
+            mean: numbers("mean")?,
+            sd: numbers("sd")?,
+            expected_reward: row.try_get("expected_reward")?,
+        },
+        updated_at: timestamp(TABLE, "updated_at_ms", row.try_get("updated_at_ms")?)?,
+    })
+}
+
+/// As SQLite holds it; the counts and times of this program stay far below its limit.
+pub(super) fn as_integer(count: u64) -> i64 {
+    i64::try_from(count).unwrap_or(i64::MAX)
+}
+
+pub(super) async fn put(connection: &mut SqliteConnection, learner: &NewLearner) -> Result<PutLearner, StoreError> {
+    let inserted = sqlx::query(
+        "INSERT INTO learners (name, hash, definition, created_at_ms) VALUES ($1, $2, $3, $4)
+         ON CONFLICT (name) DO NOTHING",
+    )
+    .bind(&learner.name)
+    .bind(&learner.hash)
+    .bind(&learner.definition)
+    .bind(learner.created_at.as_millisecond())
+    .execute(&mut *connection)
+    .await?;
+    let query = sqlx::query("SELECT * FROM learners WHERE name = $1").bind(&learner.name);
+    let row = read_learner(&query.fetch_one(&mut *connection).await?)?;
+    if inserted.rows_affected() == 1 {
+        let first = WeightsRow {
+            version: 0,
+            reward_order: 0,
+            distribution: learner.initial.clone(),
+            updated_at: learner.created_at,
+        };
+        insert_weights(connection, row.sequence, &first).await?;
+        return Ok(PutLearner::Created(row));
+    }
+    Ok(if row.hash == learner.hash {
+        PutLearner::Unchanged(row)
+    } else {
+        PutLearner::Conflict { existing_hash: row.hash }
+    })
+}
+
+pub(super) async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<Option<i64>, StoreError> {
+    let query = sqlx::query_scalar("DELETE FROM learners WHERE name = $1 RETURNING sequence").bind(name);
+    Ok(query.fetch_optional(connection).await?)
+}
+
+pub(super) async fn add_weights(
+    connection: &mut SqliteConnection,
+    learner: i64,
+    weights: &WeightsRow,
+) -> Result<bool, StoreError> {
+    let query = sqlx::query_scalar("SELECT MAX(version) FROM weights WHERE learner = $1").bind(learner);
+    let last: Option<i64> = query.fetch_one(&mut *connection).await?;
+    // Without a version, the learner is gone.
+    if last.map(|last| last + 1) != Some(as_integer(weights.version)) {
+        return Ok(false);
+    }
+    insert_weights(connection, learner, weights).await?;
+    Ok(true)
+}
+
+async fn insert_weights(
+    connection: &mut SqliteConnection,
+    learner: i64,
+    weights: &WeightsRow,
+) -> Result<(), StoreError> {
+    let json = |numbers: &[f64], column| serde_json::to_string(numbers).map_err(corrupt("weights", column));
+    let Distribution { mean, sd, expected_reward } = &weights.distribution;
+    sqlx::query(
+        "INSERT INTO weights (learner, version, reward_order, expected_reward, mean, sd, updated_at_ms)
+         VALUES ($1, $2, $3, $4, $5, $6, $7)",
+    )
+    .bind(learner)
+    .bind(as_integer(weights.version))
+    .bind(as_integer(weights.reward_order))
+    .bind(expected_reward)
+    .bind(json(mean, "mean")?)
+    .bind(json(sd, "sd")?)
+    .bind(weights.updated_at.as_millisecond())
+    .execute(connection)
+    .await?;
+    Ok(())
+}

@@ -1,0 +1,137 @@
+//! The simulator of the wumpus world.
+
+use crate::model::{Act, Cave, CaveState};
+
+/// What the world pays. Sums of these are rewards.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rewards {
+    /// For an action, whether it has an effect or not.
+    pub action: f64,
+    /// For `shoot`, instead.
+    pub shot: f64,
+    /// For dying, on top of the action that did it.
+    pub death: f64,
+    /// For each piece of gold that is carried out, on top of the `climb` that did it.
+    pub gold: f64,
+}
+
+impl Rewards {
+    /// Those of the paper's experiments.
+    pub const PAPER: Self = Self { action: -1.0, shot: -10.0, death: -1000.0, gold: 1000.0 };
+}
+
+impl Default for Rewards {
+    fn default() -> Self {
+        Self::PAPER
+    }
+}
+
+/// What became of an agent.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Outcome {
+    /// What it earned.
+    pub reward: f64,
+    /// How many actions it executed.
+    pub n_executed: usize,
+    /// How many pieces of gold it carried out.
+    pub n_gold: u32,
+    /// Whether it died.
+    pub is_dead: bool,
+    /// How everything was in the end.
+    pub state: CaveState,
+}
+
+/// A wumpus world that gives rewards.
+#[derive(Clone, Debug)]
+pub struct WumpusWorld {
+    cave: Cave,
+    rewards: Rewards,
+}
+
+impl WumpusWorld {
+    /// A world with the rules and things of `cave`; what body that has does not matter here.
+    #[must_use]
+    pub fn new(cave: Cave, rewards: Rewards) -> Self {
+        Self { cave, rewards }
+    }
+
+    /// The rules and things.
+    #[must_use]
+    pub fn cave(&self) -> &Cave {
+        &self.cave
+    }
+
+    /// Executes `acts` from the start, until the agent is dead or outside.
+    #[must_use]
+    pub fn execute(&self, acts: impl IntoIterator<Item = Act>) -> Outcome {
+        let Self { cave, rewards } = self;
+        let mut outcome = Outcome { reward: 0.0, n_executed: 0, n_gold: 0, is_dead: false, state: cave.first_state() };
+        for act in acts {
+            outcome.state = cave.after(outcome.state, act);
+            outcome.n_executed += 1;
+            outcome.reward += if act == Act::Shoot { rewards.shot } else { rewards.action };
+            if cave.is_deadly(&outcome.state) {
+                outcome.is_dead = true;
+                outcome.reward += rewards.death;
+                break;
+            }
+            if outcome.state.outside {
+                outcome.n_gold = cave.first_state().lying.count_ones() - outcome.state.lying.count_ones();
+                outcome.reward += rewards.gold * f64::from(outcome.n_gold);
+                break;
+            }
+        }
+        outcome
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::model::{Definition, Limits};
+
+    fn world(wumpi: &[[u16; 2]], gold: &[[u16; 2]]) -> WumpusWorld {
+        let model = json!({"dynamics": {"kind": "wumpus", "width": 4, "height": 2, "wumpi": wumpi, "gold": gold}});
+        let Ok(Definition::Wumpus(cave)) = Definition::read(&model, Limits::DEFAULT) else { panic!("a cave") };
+        WumpusWorld::new(cave, Rewards::PAPER)
+    }
+
+    fn acts(letters: &str) -> impl Iterator<Item = Act> + '_ {
+        letters.chars().map(|letter| match letter {
+            'F' => Act::Forward,
+            'L' => Act::TurnLeft,
+            'R' => Act::TurnRight,
+            'S' => Act::Shoot,
+            'G' => Act::Grab,
+            _ => Act::Climb,
+        })
+    }
+
+    #[test]
+    fn gold_pays_once_it_is_carried_out() {
+        let world = world(&[], &[[1, 0], [1, 0]]);
+        let outcome = world.execute(acts("FGGGLLFC"));
+        assert_eq!((outcome.reward, outcome.n_gold, outcome.is_dead), (1992.0, 2, false));
+        assert_eq!(world.execute(acts("FGLLF")).reward, -5.0, "not while it is still inside");
+        assert_eq!(world.execute(acts("FGC")).reward, -3.0, "not from elsewhere than the start");
+        let outcome = world.execute(acts("CFG"));
+        assert_eq!((outcome.reward, outcome.n_executed), (-1.0, 1), "outside, it is over");
+    }
+
+    #[test]
+    fn a_live_wumpus_kills_and_a_dead_one_does_not() {
+        let world = world(&[[2, 0]], &[]);
+        let outcome = world.execute(acts("FFLF"));
+        assert_eq!((outcome.reward, outcome.n_executed, outcome.is_dead), (-1002.0, 2, true));
+        let outcome = world.execute(acts("SFFLF"));
+        assert_eq!((outcome.reward, outcome.is_dead, outcome.state.cell), (-14.0, false, (2, 1)));
+    }
+
+    #[test]
+    fn an_action_without_effect_costs_its_step() {
+        let world = world(&[], &[]);
+        assert_eq!(world.execute(acts("GRFSS")).reward, -23.0, "no gold, a wall, an arrow, and no arrow");
+    }
+}
