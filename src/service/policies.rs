@@ -11,7 +11,7 @@ use serde_json::value::RawValue;
 use uuid::Uuid;
 
 use super::{Etude, ServiceError};
-use crate::document::{self, Faults, Place};
+use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Status};
 use crate::model::Model;
@@ -48,7 +48,7 @@ impl Etude {
             self.pool.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
         };
         let document = document?;
-        let (envelope, faults) = Envelope::read(&document);
+        let (envelope, mut faults) = Envelope::read(&document);
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
         let found = match &envelope.learner {
@@ -56,7 +56,12 @@ impl Etude {
             None => self.mapper(&envelope.model, "/model").await,
         };
         let (model_hash, mapper) = match found {
-            Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
+            // What is unknown is then one fault among others.
+            Err(ref error @ ServiceError::Unknown { pointer: Some(pointer), .. }) if !faults.is_empty() => {
+                let name = pointer.trim_start_matches('/');
+                faults.note_at(&Path::Member(&Path::Root, name), error.to_string());
+                return Err(faults.into());
+            }
             found => found?,
         };
 
