@@ -29,10 +29,10 @@ fn main() {
 }
 
 fn measure(world: &World) {
-    let definition = Definition::read(&world.model, Limits::DEFAULT).expect("worlds are models");
+    let definition = Definition::read(&world.model, Limits::DEFAULT, &mut Uninterrupted).expect("worlds are models");
     let started = Instant::now();
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).expect("worlds are small enough");
-    let mapper = &Mapper::new(model);
+    let mapper = &Mapper::new(model, &mut Uninterrupted).expect("nothing interrupts");
     let compiled = started.elapsed();
     let peer = Peer::new(mapper, world);
     let graph = mapper.model().graph();

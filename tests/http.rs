@@ -281,7 +281,10 @@ async fn all_faults_of_a_request_are_told_at_once() {
         (status, &problem["type"], pointers(&problem)),
         (404, &json!("/problems/unknown-model"), vec!["/model"])
     );
-    assert_eq!(post(json!({"model": "nothing", "demonstration": [{}], "hurry": 1})).await.0, 422);
+    let (status, problem) = post(json!({"model": "nothing", "demonstration": [{}], "hurry": 1})).await;
+    assert_eq!((status, pointers(&problem)), (422, vec!["/hurry", "/model"]));
+    let (_, problem) = post(json!({"model": "x".repeat(100_000), "demonstration": [{}]})).await;
+    assert!(problem.to_string().len() < 1000, "{problem}");
     let (status, problem) = post(json!({"model": "corridor", "learner": "nobody", "demonstration": [{}]})).await;
     assert_eq!((status, &problem["type"]), (404, &json!("/problems/unknown-learner")));
     assert_eq!(service.get("/v1/policies").await.1["items"], json!([]), "nothing was stored");

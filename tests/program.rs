@@ -97,6 +97,10 @@ fn faults_of_files_are_told_with_their_places() {
     assert!(faults.contains("/demonstration/0/speed: unknown attribute \"speed\""), "{faults}");
     assert!(faults.contains("/demonstration/1/x: expected a number, found \"a\""), "{faults}");
     assert!(told(good, &file("broken.json", "[{]")).contains("not JSON at line 1, column 3"));
+    let request = file("request.json", r#"{"demonstration": [{}], "weights": 3}"#);
+    let weighted = run(&["map", "--model", good, "--demonstration", &request, "--weight", "x=2"]);
+    assert_eq!(weighted.status.code(), Some(1));
+    assert!(text(&weighted.stderr).contains("--weight: the `weights` of"), "{}", text(&weighted.stderr));
     assert!(told("nowhere.json", &demonstration).contains("cannot read nowhere.json: No such file"));
 }
 

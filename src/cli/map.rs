@@ -56,15 +56,14 @@ enum HeuristicArg {
 
 impl Map {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
-        let model_faults = |faults| CliError::Faults { what: self.model.display().to_string(), faults };
-        let limits = Limits { max_states: usize::MAX };
-        let definition = Definition::read(&read_json(&self.model)?, limits).map_err(model_faults)?;
-        let model = match Model::compile(&definition, limits, &mut Uninterrupted) {
-            Ok(model) => model,
-            Err(CompileError::Faults(faults)) => return Err(model_faults(faults)),
-            Err(CompileError::Cancelled(cancelled)) => return Err(cancelled.into()),
+        let model_error = |error| match error {
+            CompileError::Faults(faults) => CliError::Faults { what: self.model.display().to_string(), faults },
+            CompileError::Cancelled(cancelled) => cancelled.into(),
         };
-        let mapper = Arc::new(Mapper::new(model));
+        let limits = Limits { max_states: usize::MAX };
+        let definition = Definition::read(&read_json(&self.model)?, limits, &mut Uninterrupted).map_err(model_error)?;
+        let model = Model::compile(&definition, limits, &mut Uninterrupted).map_err(model_error)?;
+        let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
 
         let request = self.request()?;
         let mut faults = Faults::default();
@@ -107,10 +106,15 @@ impl Map {
         let stem = || self.model.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
         request.entry("model").or_insert_with(|| stem().into());
         if !self.weights.is_empty() {
-            let weights = request.entry("weights").or_insert_with(|| json!({}));
-            for (attribute, weight) in &self.weights {
-                weights[attribute] = json!(weight);
+            let weights = request.entry("weights").or_insert(Value::Null);
+            if weights.is_null() {
+                *weights = json!({});
             }
+            let Value::Object(weights) = weights else {
+                let path = self.demonstration.display();
+                return Err(CliError::Option(format!("--weight: the `weights` of {path} are no object")));
+            };
+            weights.extend(self.weights.iter().map(|(attribute, weight)| (attribute.clone(), json!(weight))));
         }
         let heuristic = self.heuristic.and_then(|heuristic| heuristic.to_possible_value());
         let options = [

@@ -95,10 +95,13 @@ pub struct Mapper {
 
 impl Mapper {
     /// Prepares `model`. Takes time and memory proportional to its states and transitions times attributes.
-    #[must_use]
-    pub fn new(model: Model) -> Self {
-        let projections = Projections::new(&model);
-        Self { model, projections }
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
+    pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
+        let projections = Projections::new(&model, interrupt)?;
+        Ok(Self { model, projections })
     }
 
     /// The model.

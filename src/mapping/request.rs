@@ -159,7 +159,8 @@ pub struct RequestDocument {
     pub model: String,
     /// The observed states, in order: 1 to 100,000. Attributes may be missing or null: not observed.
     pub demonstration: Vec<ObservationDocument>,
-    /// Weights by attribute name, each at least 0; attributes not named keep the model's.
+    /// Weights by attribute name, each at least 0; attributes not named keep the model's. No attribute adds more than 1e150 to
+    /// a distance, however large its weight.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub weights: Option<BTreeMap<String, f64>>,
     /// Name of a learner whose mean weights are used, for attributes that `weights` does not name.

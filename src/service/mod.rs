@@ -32,7 +32,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 pub use trials::TrialAnswer;
 
-use crate::document::{Faults, ParseError};
+use crate::document::{Faults, ParseError, Quoted};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
 use cache::MapperCache;
@@ -65,7 +65,7 @@ pub enum ServiceError {
     #[error("{0}")]
     Faults(#[from] Faults),
     /// There is nothing of this kind with this name or id.
-    #[error("there is no {kind} {name:?}")]
+    #[error("there is no {kind} {}", Quoted(name))]
     Unknown {
         /// What was looked for.
         kind: &'static str,

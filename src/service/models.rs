@@ -155,12 +155,13 @@ fn prepare(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Prepared, ServiceError>, Cancelled> {
     let definition = match document::parse(text) {
-        Ok(document) => Definition::read(&document, limits),
+        Ok(document) => Definition::read(&document, limits, interrupt),
         Err(error) => return Ok(Err(error.into())),
     };
     let definition = match definition {
         Ok(definition) => definition,
-        Err(faults) => return Ok(Err(faults.into())),
+        Err(CompileError::Faults(faults)) => return Ok(Err(faults.into())),
+        Err(CompileError::Cancelled(cancelled)) => return Err(cancelled),
     };
     let model = match Model::compile(&definition, limits, interrupt) {
         Ok(model) => model,
@@ -169,7 +170,8 @@ fn prepare(
     };
     let attributes = model.schema().attributes().iter().map(AttributeDocument::from).collect();
     let actions = model.actions().iter().map(ActionDocument::from).collect();
+    let mapper = Mapper::new(model, interrupt)?;
     let definition = definition.document().text();
     let hash = hash_of(&definition);
-    Ok(Ok(Prepared { definition, hash, mapper: Mapper::new(model), attributes, actions }))
+    Ok(Ok(Prepared { definition, hash, mapper, attributes, actions }))
 }

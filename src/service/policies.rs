@@ -13,7 +13,7 @@ use uuid::Uuid;
 use super::learners::Ready;
 use super::{Admission, Etude, ServiceError};
 use crate::attribute::Weights;
-use crate::document::{self, Faults, Place};
+use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Status};
 use crate::model::Model;
@@ -46,7 +46,7 @@ impl Etude {
     ) -> Result<MadePolicy, ServiceError> {
         let place = self.pool.admit()?;
         let document = parse(body, &place).await?;
-        let (envelope, faults) = Envelope::read(&document);
+        let (envelope, mut faults) = Envelope::read(&document);
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
         let found = async {
@@ -57,7 +57,12 @@ impl Etude {
             Ok((learner, self.mapper(&envelope.model, "/model", Some(&place)).await?))
         };
         let (learner, (model_hash, mapper)) = match found.await {
-            Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
+            // What is unknown is then one fault among others.
+            Err(ref error @ ServiceError::Unknown { pointer: Some(pointer), .. }) if !faults.is_empty() => {
+                let name = pointer.trim_start_matches('/');
+                faults.note_at(&Path::Member(&Path::Root, name), error.to_string());
+                return Err(faults.into());
+            }
             found => found?,
         };
 
@@ -77,7 +82,9 @@ impl Etude {
                 None => Some(schema.weights()),
                 Some(Ready { learner, weights, .. }) => {
                     let learned = learner.weights_for(schema, &weights.distribution.mean);
-                    learned.map_err(|missing| faults.append(Faults::one("/learner", missing.to_string()))).ok()
+                    learned
+                        .map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string()))
+                        .ok()
                 }
             };
             search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)

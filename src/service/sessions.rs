@@ -18,7 +18,7 @@ use super::learners::Ready;
 use super::policies::{PolicyText, as_micros, report};
 use super::{Etude, PoolError, ServiceError};
 use crate::attribute::{ByAttribute, Weights};
-use crate::document::{self, Faults, Object, Place};
+use crate::document::{self, Faults, Object, Path, Place};
 use crate::interrupt::{Interrupt, Uninterrupted};
 use crate::mapping::{
     CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, read_lookahead,
@@ -567,7 +567,9 @@ impl Opening {
             None => Some(model.schema().weights()),
             Some(Ready { learner, weights, .. }) => {
                 let learned = learner.weights_for(model.schema(), &weights.distribution.mean);
-                learned.map_err(|missing| faults.append(Faults::one("/learner", missing.to_string()))).ok()
+                learned
+                    .map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string()))
+                    .ok()
             }
         };
         let named = match object.optional("weights") {

@@ -13,7 +13,7 @@ use super::learners::{Ready, unknown};
 use super::policies::{self, Searched};
 use super::{Etude, Name, ServiceError};
 use crate::attribute::{Schema, Weights};
-use crate::document::{Faults, Place, Range};
+use crate::document::{Faults, Path, Place, Range};
 use crate::interrupt::Interrupt;
 use crate::mapping::Stamp;
 use crate::store::{FailTrial, NewReward, NewTrial, Page, PutReward, Store, StoreError, TrialRow, TrialStatus};
@@ -78,7 +78,7 @@ impl Etude {
             let base = |faults: &mut Faults| {
                 let schema = mapper.model().schema();
                 if let Err(missing) = learner.weights_for(schema, &learner.initial().mean) {
-                    faults.append(Faults::one("/model", missing.to_string()));
+                    faults.note_at(&Path::Member(&Path::Root, "model"), missing.to_string());
                 }
                 // A request with faults takes no number: the next trial is the same as if it had not been made.
                 if !faults.is_empty() {

@@ -14,8 +14,9 @@ pub(crate) fn example(path: &str) -> Value {
 }
 
 pub(crate) fn mapper(model: &Value) -> Mapper {
-    let definition = Definition::read(model, Limits::DEFAULT).unwrap();
-    Mapper::new(Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap())
+    let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    Mapper::new(model, &mut Uninterrupted).unwrap()
 }
 
 pub(crate) fn close(a: f64, b: f64) -> bool {
