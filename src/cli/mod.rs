@@ -1,11 +1,14 @@
 //! The command line.
 
+mod client;
 mod demo;
 mod healthcheck;
 mod map;
 mod openapi;
 mod render;
 mod serve;
+mod side_by_side;
+mod stream;
 
 use std::error::Error;
 use std::io;
@@ -35,6 +38,9 @@ enum Command {
     Serve(serve::Serve),
     /// Map a demonstration from files, without a service.
     Map(map::Map),
+    /// Map a demonstration while it is still running: observations from standard input, one JSON line each; steps to
+    /// standard output.
+    Stream(stream::Stream),
     /// Start a service, send it the demonstration of figure 4, and show what comes back.
     Demo,
     /// Print the OpenAPI description of the service.
@@ -78,6 +84,12 @@ enum CliError {
     /// A service answered something else than expected.
     #[error("{url} answered {status}: {body}")]
     Answer { url: String, status: u16, body: String },
+    /// A line of the input is not an observation.
+    #[error("line {line} of the input: {problem}")]
+    Line { line: u64, problem: String },
+    /// A stream ended without a policy.
+    #[error("the stream ended without a policy: {0}")]
+    Stream(String),
     /// Input or output failed.
     #[error(transparent)]
     Io(#[from] io::Error),
@@ -95,6 +107,7 @@ pub fn run() -> ExitCode {
     let done = start_logging(&log, default_filter).map_err(CliError::from).and_then(|()| match command {
         Command::Serve(serve) => serve.run(),
         Command::Map(map) => map.run(&mut io::stdout().lock()),
+        Command::Stream(stream) => stream.run(&mut io::stdout()),
         Command::Demo => demo::run(&mut io::stdout()),
         Command::Openapi => openapi::run(&mut io::stdout().lock()),
         Command::Healthcheck(healthcheck) => healthcheck.run(),
