@@ -3,6 +3,8 @@
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies
 //! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves.
 
+use std::collections::{HashMap, HashSet};
+
 use sqlx::{Connection, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
@@ -126,7 +128,8 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
 async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<Written>, StoreError> {
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     let mut written = Vec::with_capacity(group.len());
-    for job in group {
+    let mut added = add_observations(&mut transaction, group).await?;
+    for (n, job) in group.iter().enumerate() {
         written.push(match &job.write {
             Write::PutModel(model) => Written::PutModel(models::put(&mut transaction, model).await?),
             Write::DeleteModel(name) => Written::DeleteModel(models::delete(&mut transaction, name).await?),
@@ -145,7 +148,10 @@ async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<
                 sessions::open(&mut transaction, session).await?;
                 Written::Done(true)
             }
-            Write::AddObservations(observations) => Written::Done(sessions::add(&mut transaction, observations).await?),
+            Write::AddObservations(observations) => Written::Done(match added.remove(&n) {
+                Some(was_next) => was_next,
+                None => sessions::add(&mut transaction, &[observations]).await? == [true],
+            }),
             Write::EndSession(end) => Written::Done(sessions::end(&mut transaction, end).await?),
             Write::ExpireSessions(before) => {
                 sessions::expire(&mut transaction, *before).await?;
@@ -155,4 +161,26 @@ async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<
     }
     transaction.commit().await?;
     Ok(written)
+}
+
+/// Adds the observations of a group at once, but for those to a session that the group has already added to: a session was
+/// resumed meanwhile. Gives by index in the group whether they came next. What else a group does to these
+/// sessions was not waited for by their owner, so any order will do.
+async fn add_observations(
+    connection: &mut SqliteConnection,
+    group: &[Job],
+) -> Result<HashMap<usize, bool>, StoreError> {
+    let mut sessions_added = HashSet::new();
+    let (indices, news): (Vec<usize>, Vec<&NewObservations>) = group
+        .iter()
+        .enumerate()
+        .filter_map(|(n, job)| match &job.write {
+            Write::AddObservations(new) => sessions_added.insert(&new.session_id).then_some((n, new)),
+            _ => None,
+        })
+        .unzip();
+    if news.is_empty() {
+        return Ok(HashMap::new());
+    }
+    Ok(indices.into_iter().zip(sessions::add(connection, &news).await?).collect())
 }
