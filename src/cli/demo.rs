@@ -5,12 +5,11 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::path::Path;
 
 use clap::{Args, FromArgMatches};
-use reqwest::Client;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
-use super::client::answer;
-use super::{CliError, render, runtime};
+use super::client::{answer, client};
+use super::{CliError, render, runtime, side_by_side};
 use crate::config::ServeConfig;
 use crate::mapping::Policy;
 use crate::server::Server;
@@ -47,8 +46,7 @@ fn config(database: &Path) -> Result<ServeConfig, CliError> {
 }
 
 async fn show(address: SocketAddr, out: &mut impl Write) -> Result<(), CliError> {
-    let client =
-        Client::builder().no_proxy().build().map_err(|source| CliError::Http { url: String::new(), source })?;
+    let client = client()?;
     let model = document(MODEL)?;
     let demonstration = document(DEMONSTRATION)?;
 
@@ -72,7 +70,13 @@ async fn show(address: SocketAddr, out: &mut impl Write) -> Result<(), CliError>
     writeln!(out, "    o demonstrator   x imitator   S start   W wumpus   G gold\n")?;
     writeln!(out, "{}", render::steps(&policy))?;
     write!(out, "{}", render::totals(&policy))?;
-    Ok(())
+
+    writeln!(
+        out,
+        "\nPOST /v1/stream: the same while the demonstration is still running. Of what is observed, what has changed;\nof what \
+         is committed, step, move, observation, action, and whether it is proven or the lookahead was used up.\n"
+    )?;
+    side_by_side::stream(&client, &format!("http://{address}"), "figure-4", &demonstration, out).await
 }
 
 fn document(text: &str) -> Result<Value, CliError> {

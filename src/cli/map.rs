@@ -56,13 +56,7 @@ enum HeuristicArg {
 
 impl Map {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
-        let model_error = |error| match error {
-            CompileError::Faults(faults) => CliError::Faults { what: self.model.display().to_string(), faults },
-            CompileError::Cancelled(cancelled) => cancelled.into(),
-        };
-        let limits = Limits { max_states: usize::MAX };
-        let definition = Definition::read(&read_json(&self.model)?, limits, &mut Uninterrupted).map_err(model_error)?;
-        let model = Model::compile(&definition, limits, &mut Uninterrupted).map_err(model_error)?;
+        let (definition, model) = read_model(&self.model)?;
         let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
 
         let request = self.request()?;
@@ -133,7 +127,19 @@ fn as_micros(duration: Duration) -> u64 {
     u64::try_from(duration.as_micros()).unwrap_or(u64::MAX)
 }
 
-fn read_json(path: &Path) -> Result<Value, CliError> {
+/// Reads and compiles a model. There is no limit but memory: nobody else is served.
+pub(super) fn read_model(path: &Path) -> Result<(Definition, Model), CliError> {
+    let model_error = |error| match error {
+        CompileError::Faults(faults) => CliError::Faults { what: path.display().to_string(), faults },
+        CompileError::Cancelled(cancelled) => cancelled.into(),
+    };
+    let limits = Limits { max_states: usize::MAX };
+    let definition = Definition::read(&read_json(path)?, limits, &mut Uninterrupted).map_err(model_error)?;
+    let model = Model::compile(&definition, limits, &mut Uninterrupted).map_err(model_error)?;
+    Ok((definition, model))
+}
+
+pub(super) fn read_json(path: &Path) -> Result<Value, CliError> {
     let read = if path == Path::new("-") {
         let mut text = Vec::new();
         io::stdin().lock().read_to_end(&mut text).map(|_| text)
@@ -144,12 +150,12 @@ fn read_json(path: &Path) -> Result<Value, CliError> {
     document::parse(&text).map_err(|source| CliError::Parse { path: path.to_owned(), source })
 }
 
-fn parse_weight(text: &str) -> Result<(String, f64), String> {
+pub(super) fn parse_weight(text: &str) -> Result<(String, f64), String> {
     let (attribute, weight) = text.rsplit_once('=').ok_or("expected ATTRIBUTE=WEIGHT")?;
     let weight: f64 = weight.parse().map_err(|_| format!("expected a number, found {weight:?}"))?;
     if weight.is_finite() { Ok((attribute.to_owned(), weight)) } else { Err("expected a finite number".to_owned()) }
 }
 
-fn parse_json(text: &str) -> Result<Value, String> {
+pub(super) fn parse_json(text: &str) -> Result<Value, String> {
     document::parse(text.as_bytes()).map_err(|error| error.to_string())
 }

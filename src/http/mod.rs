@@ -92,6 +92,8 @@ fn routes() -> OpenApiRouter<Context> {
     let mut description = Description::openapi();
     // Taken from Cargo.toml, which names none.
     description.info.license = None;
+    let protocol = include_str!("../stream/protocol.md");
+    description.info.description = description.info.description.map(|text| format!("{text}\n\n{protocol}"));
     OpenApiRouter::with_openapi(description)
         .routes(routes!(models::put_model, models::get_model, models::delete_model))
         .routes(routes!(models::list_models))

@@ -1,6 +1,9 @@
 //! The tables of sessions and their observations.
 
+use std::collections::HashSet;
+
 use jiff::Timestamp;
+use serde_json::Value;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
@@ -255,29 +258,46 @@ pub(super) async fn open(connection: &mut SqliteConnection, session: &NewSession
     Ok(true)
 }
 
-pub(super) async fn add(connection: &mut SqliteConnection, new: &NewObservations) -> Result<bool, StoreError> {
+/// Adds to several sessions, each of them once. Gives for each whether it was open and this was what came next. Two
+/// statements, however many there are: each one costs the driver a change of threads.
+pub(super) async fn add(
+    connection: &mut SqliteConnection,
+    group: &[&NewObservations],
+) -> Result<Vec<bool>, StoreError> {
+    let rows = group
+        .iter()
+        .map(|new| serde_json::json!([new.session_id, new.seq, new.n_states, new.states, new.at.as_millisecond()]));
+    let rows = Value::Array(rows.collect()).to_string();
     // Only what comes next, and only once, whatever is retried or raced.
-    let updated = sqlx::query(
-        "UPDATE sessions SET n_observations = n_observations + $3, active_at_ms = $4
-         WHERE id = $1 AND status = 'open' AND n_observations = $2",
+    let updated = sqlx::query_scalar::<_, String>(
+        "UPDATE sessions SET n_observations = n_observations + (new.value ->> 2), active_at_ms = new.value ->> 4
+         FROM json_each($1) AS new
+         WHERE sessions.id = new.value ->> 0 AND status = 'open' AND n_observations = new.value ->> 1
+         RETURNING sessions.id",
     )
-    .bind(&new.session_id)
-    .bind(new.seq)
-    .bind(new.n_states)
-    .bind(new.at.as_millisecond())
-    .execute(&mut *connection)
+    .bind(&rows)
+    .fetch_all(&mut *connection)
     .await?;
-    if updated.rows_affected() == 0 {
-        return Ok(false);
+    let updated: HashSet<String> = updated.into_iter().collect();
+    let is_updated: Vec<bool> = group.iter().map(|new| updated.contains(&new.session_id)).collect();
+    if updated.is_empty() {
+        return Ok(is_updated);
     }
-    sqlx::query("INSERT INTO observations (session_id, seq, n_states, states) VALUES ($1, $2, $3, $4)")
-        .bind(&new.session_id)
-        .bind(new.seq)
-        .bind(new.n_states)
-        .bind(&new.states)
-        .execute(connection)
-        .await?;
-    Ok(true)
+    let rows = if updated.len() == group.len() {
+        rows
+    } else {
+        let rows = group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated);
+        let rows = rows.map(|(new, _)| serde_json::json!([new.session_id, new.seq, new.n_states, new.states]));
+        Value::Array(rows.collect()).to_string()
+    };
+    sqlx::query(
+        "INSERT INTO observations (session_id, seq, n_states, states)
+         SELECT value ->> 0, value ->> 1, value ->> 2, value ->> 3 FROM json_each($1)",
+    )
+    .bind(rows)
+    .execute(connection)
+    .await?;
+    Ok(is_updated)
 }
 
 pub(super) async fn end(connection: &mut SqliteConnection, end: &SessionEnd) -> Result<bool, StoreError> {

@@ -3,6 +3,8 @@
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies
 //! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves.
 
+use std::collections::{HashMap, HashSet};
+
 use sqlx::{Connection, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
@@ -156,12 +158,14 @@ async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     let mut written = Vec::with_capacity(group.len());
     let mut rewards = Vec::new();
-    for job in group {
+    let mut added = add_observations(&mut transaction, group).await?;
+    for (n, job) in group.iter().enumerate() {
         written.push(match &job.write {
             Write::PutReward(reward) => {
                 rewards.push(reward);
                 None
             }
+            Write::AddObservations(_) if let Some(was_next) = added.remove(&n) => Some(Written::Done(was_next)),
             write => Some(apply(&mut transaction, write).await?),
         });
     }
@@ -193,7 +197,9 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
             Written::Done(true)
         }
         Write::OpenSession(session) => Written::Done(sessions::open(connection, session).await?),
-        Write::AddObservations(observations) => Written::Done(sessions::add(connection, observations).await?),
+        Write::AddObservations(observations) => {
+            Written::Done(sessions::add(connection, &[observations]).await? == [true])
+        }
         Write::EndSession(end) => Written::Done(sessions::end(connection, end).await?),
         Write::ExpireSessions(before) => {
             sessions::expire(connection, *before).await?;
@@ -213,4 +219,26 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
             Written::PutReward(Box::new(put.pop().ok_or(StoreError::Closed)?))
         }
     })
+}
+
+/// Adds the observations of a group at once, but for those to a session that the group has already added to: a session was
+/// resumed meanwhile. Gives by index in the group whether they came next. What else a group does to these
+/// sessions was not waited for by their owner, so any order will do.
+async fn add_observations(
+    connection: &mut SqliteConnection,
+    group: &[Job],
+) -> Result<HashMap<usize, bool>, StoreError> {
+    let mut sessions_added = HashSet::new();
+    let (indices, news): (Vec<usize>, Vec<&NewObservations>) = group
+        .iter()
+        .enumerate()
+        .filter_map(|(n, job)| match &job.write {
+            Write::AddObservations(new) => sessions_added.insert(&new.session_id).then_some((n, new)),
+            _ => None,
+        })
+        .unzip();
+    if news.is_empty() {
+        return Ok(HashMap::new());
+    }
+    Ok(indices.into_iter().zip(sessions::add(connection, &news).await?).collect())
 }
