@@ -123,7 +123,7 @@ fn as_micros(duration: Duration) -> u64 {
     u64::try_from(duration.as_micros()).unwrap_or(u64::MAX)
 }
 
-fn read_json(path: &Path) -> Result<Value, CliError> {
+pub(super) fn read_json(path: &Path) -> Result<Value, CliError> {
     let read = if path == Path::new("-") {
         let mut text = Vec::new();
         io::stdin().lock().read_to_end(&mut text).map(|_| text)
