@@ -26,7 +26,7 @@
 //! | [`world`] | simulators that execute a policy and give its reward |
 //! | [`experiment`] | the paper's figures |
 //! | [`store`] | all SQL: one writer that groups commits, a pool of readers |
-//! | [`service`] | the application: models, policies, the bounded pool that searches run on |
+//! | [`service`] | the application: models, policies, learners, trials, the bounded pool that searches run on |
 //! | [`http`] | routes, bodies, problem documents, the OpenAPI description |
 //! | [`server`] | the assembled program, from listening to clean shutdown |
 //! | [`cli`] | the subcommands |

@@ -5,12 +5,14 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::path::Path;
 
 use clap::{Args, FromArgMatches};
+use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
 use super::client::{answer, client};
 use super::{CliError, render, runtime, side_by_side};
 use crate::config::ServeConfig;
+use crate::experiment::{CurvePlan, Scene};
 use crate::mapping::Policy;
 use crate::server::Server;
 
@@ -76,7 +78,60 @@ async fn show(address: SocketAddr, out: &mut impl Write) -> Result<(), CliError>
         "\nPOST /v1/stream: the same while the demonstration is still running. Of what is observed, what has changed;\nof what \
          is committed, step, move, observation, action, and whether it is proven or the lookahead was used up.\n"
     )?;
-    side_by_side::stream(&client, &format!("http://{address}"), "figure-4", &demonstration, out).await
+    side_by_side::stream(&client, &format!("http://{address}"), "figure-4", &demonstration, out).await?;
+    writeln!(out)?;
+    learn(address, out).await
+}
+
+/// Trials in the world of figure 6, until the gold is found time after time.
+async fn learn(address: SocketAddr, out: &mut impl Write) -> Result<(), CliError> {
+    /// So many trials in a row must fetch the gold.
+    const ENOUGH: usize = 10;
+    /// A line of rewards.
+    const SHOWN: usize = 20;
+    let client = super::client::Client::new(&format!("http://{address}"))?;
+    let scene = Scene::figure_6();
+    let plan = CurvePlan::documented();
+    writeln!(
+        out,
+        "The gold that another demonstrator fetched is gone; there is some more two cells away. With default weights"
+    )?;
+    let _: Value = client.put("/v1/models/figure-6", scene.model()).await?;
+    let request = json!({"model": "figure-6", "demonstration": scene.demonstration()});
+    let reward_of = |policy: &Value| -> Result<f64, CliError> {
+        let actions: Vec<String> = Vec::deserialize(&policy["actions"]).map_err(std::io::Error::from)?;
+        Ok(scene.execute(&actions).reward)
+    };
+    let policy: Value = client.post("/v1/policies", &request).await?;
+    writeln!(
+        out,
+        "the imitator comes home without any: reward {}. So it learns from trials which weights matter.\n",
+        reward_of(&policy)?
+    )?;
+
+    writeln!(out, "POST /v1/learners/gold/trials, PUT /v1/trials/../reward, until {ENOUGH} in a row fetch the gold:")?;
+    let _: Value = client.put("/v1/learners/gold", &plan.learner).await?;
+    let (mut n_trials, mut n_found) = (0, 0);
+    while n_trials < plan.n_trials && n_found < ENOUGH {
+        let trial: Value = client.post("/v1/learners/gold/trials", &request).await?;
+        let reward = reward_of(&trial["policy"])?;
+        let path = format!("/v1/trials/{}/reward", trial["id"].as_str().unwrap_or_default());
+        let _: Value = client.put(&path, &json!({"reward": reward})).await?;
+        let _: Value = client.post("/v1/learners/gold/learn", &Value::Null).await?;
+        n_found = if reward > 0.0 { n_found + 1 } else { 0 };
+        n_trials += 1;
+        write!(out, "{}{reward:>5}", if n_trials % SHOWN == 1 { "\n " } else { "" })?;
+    }
+    let weights: Value = client.get("/v1/learners/gold/weights").await?;
+    let learned = json!({"learner": "gold", "model": "figure-6", "demonstration": scene.demonstration()});
+    let policy: Value = client.post("/v1/policies", &learned).await?;
+    writeln!(
+        out,
+        "\n\nWeights after {n_trials} trials, all 1 at first; their means give a policy with reward {}:\n",
+        reward_of(&policy)?
+    )?;
+    write!(out, "{}", render::weights(&weights))?;
+    Ok(())
 }
 
 fn document(text: &str) -> Result<Value, CliError> {

@@ -4,6 +4,7 @@ mod client;
 mod demo;
 mod experiment;
 mod healthcheck;
+mod learner;
 mod map;
 mod openapi;
 mod render;
@@ -45,6 +46,8 @@ enum Command {
     Stream(stream::Stream),
     /// Start a service, send it the demonstration of figure 4, and show what comes back.
     Demo,
+    /// Check, export and import learners.
+    Learner(learner::LearnerCommand),
     /// Reproduce the paper's experiments: pictures and tables of its figures 4, 7 and 8.
     Experiment(experiment::Experiment),
     /// Print the OpenAPI description of the service.
@@ -88,6 +91,12 @@ enum CliError {
     /// A service answered something else than expected.
     #[error("{url} answered {status}: {body}")]
     Answer { url: String, status: u16, body: String },
+    /// A database did not do as asked.
+    #[error(transparent)]
+    Service(#[from] crate::service::ServiceError),
+    /// The log of a learner's rewards gives other weights than are stored.
+    #[error("{name}: version {version} of the weights is {stored}, but the log gives {replayed}")]
+    Replay { name: String, version: u64, stored: String, replayed: String },
     /// An experiment failed.
     #[error(transparent)]
     Experiment(crate::experiment::LocalError),
@@ -120,6 +129,7 @@ pub fn run() -> ExitCode {
         Command::Stream(stream) => stream.run(&mut io::stdout()),
         Command::Demo => demo::run(&mut io::stdout()),
         Command::Experiment(experiment) => experiment.run(&mut io::stdout().lock()),
+        Command::Learner(learner) => learner.run(&mut io::stdout().lock()),
         Command::Openapi => openapi::run(&mut io::stdout().lock()),
         Command::Healthcheck(healthcheck) => healthcheck.run(),
     });

@@ -84,6 +84,26 @@ pub(super) fn decimal(cost: f64) -> String {
     if text.ends_with('.') { format!("{text}0") } else { text.to_owned() }
 }
 
+/// The mean weights of a learner (JSON) as bars.
+pub(super) fn weights(weights: &Value) -> String {
+    /// Characters per unit of weight.
+    const SCALE: f64 = 8.0;
+    const MAX_CHARS: usize = 80;
+    let mut text = String::new();
+    for weight in weights["weights"].as_array().map(Vec::as_slice).unwrap_or_default() {
+        let mean = weight["mean"].as_f64().unwrap_or_default();
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "saturates, which is what is wanted"
+        )]
+        let n_chars = ((mean * SCALE).round() as usize).min(MAX_CHARS);
+        let name = weight["attribute"].as_str().unwrap_or_default();
+        let _ = writeln!(text, "  {name:<8} {mean:>5.2}  {}", "█".repeat(n_chars));
+    }
+    text
+}
+
 /// The cave of `model` (JSON, `wumpus` dynamics) with the cells that the demonstrator (`o`) and the imitator (`x`) pass.
 pub(super) fn cave(model: &Value, demonstration: &Value, policy: &Policy) -> String {
     let dynamics = &model["dynamics"];

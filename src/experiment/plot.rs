@@ -76,7 +76,8 @@ pub fn figure_4(paths: &Paths) -> Drawn {
             };
             let inside = [(left + 1, top + 1), (left + CELL - 1, top + CELL - 1)];
             area.draw(&Rectangle::new(inside, fill.filled())).map_err(failed)?;
-            area.draw(&Text::new(name, (left + CELL / 2, top + 14), text(15))).map_err(failed)?;
+            let corner = text(14).pos(Pos::new(HPos::Left, VPos::Center));
+            area.draw(&Text::new(name, (left + 6, top + 12), corner)).map_err(failed)?;
         }
         let ways = [
             (&paths.demonstrator, BLUE_LINE, 24, "demonstrator, who shoots the wumpus at (3, 0)"),
@@ -102,14 +103,27 @@ pub fn figure_4(paths: &Paths) -> Drawn {
 
 /// The line through `cells`, each part `lane` to the right of where it goes, so that the way back lies beside the way there.
 fn lanes(cells: &[Cell], lane: i32, middle: impl Fn(Cell) -> (i32, i32)) -> Vec<(i32, i32)> {
-    let mut line = Vec::new();
-    for pair in cells.windows(2).filter(|pair| pair[0] != pair[1]) {
+    let parts = cells.windows(2).filter(|pair| pair[0] != pair[1]).map(|pair| {
         let ((x0, y0), (x1, y1)) = (middle(pair[0]), middle(pair[1]));
-        let (dx, dy) = ((x1 - x0).signum(), (y1 - y0).signum());
-        // On paper y grows downwards: right of (dx, dy) is (-dy, dx).
-        let aside = |(x, y): (i32, i32)| (x - dy * lane, y + dx * lane);
-        line.extend([aside((x0, y0)), aside((x1, y1))]);
+        ((x0, y0), (x1, y1), ((x1 - x0).signum(), (y1 - y0).signum()))
+    });
+    // On paper y grows downwards: right of (dx, dy) is (-dy, dx).
+    let aside = |(x, y): (i32, i32), (dx, dy): (i32, i32)| (x - dy * lane, y + dx * lane);
+    let mut line = Vec::new();
+    let mut last = None;
+    for (from, to, heading) in parts {
+        match last {
+            None => line.push(aside(from, heading)),
+            Some((_, before)) if before == heading => {}
+            Some((_, before)) if before == (-heading.0, -heading.1) => {
+                line.extend([aside(from, before), aside(from, heading)]);
+            }
+            // Where lanes meet at a corner.
+            Some((_, before)) => line.push(aside(aside(from, before), heading)),
+        }
+        last = Some((to, heading));
     }
+    line.extend(last.map(|(end, heading)| aside(end, heading)));
     line
 }
 
@@ -189,7 +203,7 @@ pub fn figure_8(locations: &Locations) -> Drawn {
             .margin_top(46)
             .x_label_area_size(30)
             .y_label_area_size(60)
-            .build_cartesian_2d(0.0..n_rows, -100.0..1100.0)
+            .build_cartesian_2d(0.0..n_rows, -170.0..1100.0)
             .map_err(failed)?;
         chart
             .configure_mesh()
@@ -220,7 +234,7 @@ pub fn figure_8(locations: &Locations) -> Drawn {
                 chart.draw_series([bar]).map_err(failed)?;
                 chart.draw_series([label]).map_err(failed)?;
             }
-            let name = Text::new(format!("gold at {}", row.location), (left + 0.5, -85.0), text(15));
+            let name = Text::new(format!("gold at {}", row.location), (left + 0.5, -140.0), text(15));
             chart.draw_series([name]).map_err(failed)?;
         }
         chart.draw_series([PathElement::new([(0.0, 0.0), (n_rows, 0.0)], INK)]).map_err(failed)?;
