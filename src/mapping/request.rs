@@ -64,6 +64,7 @@ impl<'m> Request<'m> {
     }
 
     /// The mapping that is asked for, of `mapper`'s model: with a lookahead, the one that a stream of the demonstration gives.
+    /// That one is not cut short: a lookahead bounds its work, so `interrupt` is asked once per layer and can only cancel it.
     ///
     /// # Errors
     ///
@@ -165,7 +166,7 @@ pub struct RequestDocument {
     /// Most nodes to expand; then the best mapping found so far is answered, with `status` `bounded`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_expansions: Option<u64>,
-    /// Most milliseconds to search, waiting included; then as above. At most a day.
+    /// Most milliseconds to search, waiting included; then as above. At most a day. Without effect if there is a lookahead.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(maximum = 86_400_000)]
     pub deadline_ms: Option<u64>,
