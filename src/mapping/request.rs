@@ -8,7 +8,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Budget, Demonstration, HeuristicName, Mapper, Mapping, OnlineMapping, Problem, Settings};
+use super::{Budget, Demonstration, HeuristicName, Mapper, Mapping, OnlineMapping, Policy, Problem, Settings};
 use crate::attribute::Scalar;
 use crate::document::{Faults, Object, Place};
 use crate::interrupt::{Cancelled, Interrupt};
@@ -48,7 +48,13 @@ impl<'m> Request<'m> {
     pub fn read(model: &'m Model, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
         let schema = model.schema();
         let demonstration = object.required("demonstration", faults);
-        let demonstration = demonstration.and_then(|place| Demonstration::read(schema, &place, faults));
+        let demonstration = demonstration.and_then(|place| {
+            // Before it is read: small observations make as large steps as others.
+            let n_observations = place.value.as_array().map_or(0, Vec::len);
+            let is_answerable = n_observations > Demonstration::MAX_OBSERVATIONS
+                || Policy::check_size(model, n_observations, &place, faults);
+            is_answerable.then(|| Demonstration::read(schema, &place, faults)).flatten()
+        });
         let weights = match object.optional("weights") {
             Some(place) => schema.read_weights(&place, faults),
             None => Some(schema.weights()),
@@ -143,7 +149,8 @@ pub struct RequestDocument {
     /// Name of the imitator's model.
     #[schema(example = "figure-4")]
     pub model: String,
-    /// The observed states, in order: 1 to 100,000. Attributes may be missing or null: not observed.
+    /// The observed states, in order: 1 to 100,000, or fewer if the policy's states would take more than 64 MB. Attributes
+    /// may be missing or null: not observed.
     pub demonstration: Vec<ObservationDocument>,
     /// Weights by attribute name, each at least 0; attributes not named keep the model's. No attribute adds more than 1e150 to
     /// a distance, however large its weight.
