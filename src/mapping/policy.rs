@@ -182,7 +182,8 @@ pub struct SearchReport {
 const MAX_STATES_BYTES: usize = 64 << 20;
 
 impl Policy {
-    /// Notes that the policy of `demonstration`, of which every observation has a step at least, would be too large.
+    /// Notes at `place` that a policy of `n_observations`, each of which has a step at least, would be too large; says
+    /// whether it would not.
     /// What is estimated is what a step says of the imitator's state.
     pub(super) fn check_size(model: &Model, n_observations: usize, place: &Place<'_, '_>, faults: &mut Faults) -> bool {
         let step_bytes = serde_json::to_string(&model.describe(0)).map_or(0, |text| text.len());
