@@ -535,3 +535,18 @@ async fn a_database_that_another_process_holds_is_no_internal_error() {
     assert_eq!(put("a").await.status(), 201);
     assert_eq!(service.get("/readyz").await.0, 200);
 }
+
+#[tokio::test]
+async fn a_small_request_for_an_enormous_policy_is_refused() {
+    let service = Service::start(&[]).await;
+    let attribute = |n: usize| json!({"name": format!("{n:0>64}"), "kind": "number"});
+    let model = json!({
+        "attributes": (0..256).map(attribute).collect::<Vec<_>>(), "actions": [],
+        "dynamics": {"kind": "table", "states": [vec![0; 256]], "transitions": []},
+    });
+    assert_eq!(service.put("/v1/models/wide", &model).await.0, 201);
+    let request = json!({"model": "wide", "demonstration": vec![json!({}); 10_800]});
+    let (status, problem) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, pointers(&problem)), (422, vec!["/demonstration"]), "{problem}");
+    assert!(problem["detail"].as_str().unwrap().contains("64 MB is the most"), "{problem}");
+}

@@ -14,8 +14,8 @@ use std::collections::HashMap;
 
 use etude::attribute::Scalar;
 use etude::document::{Faults, Place};
-use etude::interrupt::Uninterrupted;
-use etude::mapping::{Mapper, MoveKind, Policy, Request, Stamp, Status};
+use etude::interrupt::{Cancelled, Signal, Uninterrupted};
+use etude::mapping::{Mapper, Mapping, MoveKind, Policy, Request, Stamp, Status};
 use etude::model::Act;
 use problems::{close, example, mapper, problem};
 use proptest::prelude::*;
@@ -288,4 +288,60 @@ fn the_papers_heuristic_misses_the_optimum_of_figure_8_at_l3() {
     let paper = solve(&mapper, &request("paper"));
     assert_eq!((paper.cost.total, paper.status), (14.5, Status::Bounded));
     assert!(paper.lower_bound.unwrap() <= optimal.cost.total);
+}
+
+/// A demonstration that goes through figure 4 again and again, to be followed as `options` say.
+fn long_request(n_observations: usize, options: &Value) -> Value {
+    let demonstration = example("figure-4/demonstration.json");
+    let demonstration: Vec<Value> =
+        demonstration.as_array().unwrap().iter().cycle().take(n_observations).cloned().collect();
+    let mut request = json!({"model": "m", "demonstration": demonstration});
+    request.as_object_mut().unwrap().extend(options.as_object().unwrap().clone());
+    request
+}
+
+/// Maps, giving the `n`-th poll and all later ones `signal`. Gives the number of polls, and the mapping.
+fn map_until(request: &Value, n: u32, signal: Signal) -> (u32, Result<Mapping, Cancelled>) {
+    let mapper = mapper(&example("figure-4/model.json"));
+    let mut faults = Faults::default();
+    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
+    let mut n_polls = 0;
+    let mut interrupt = || {
+        n_polls += 1;
+        if n_polls >= n { signal } else { Signal::Continue }
+    };
+    let mapping = mapper.map(&request.problem, request.settings, &mut interrupt);
+    (n_polls, mapping)
+}
+
+#[test]
+fn a_search_with_the_papers_heuristic_asks_while_it_estimates() {
+    // Each estimate looks at most of 50,000 distances.
+    let request = long_request(50_000, &json!({"heuristic": "paper", "max_expansions": 4}));
+    let (n_polls, mapping) = map_until(&request, 3, Signal::Cancel);
+    assert_eq!((n_polls, mapping.err()), (3, Some(Cancelled)), "within the first expansion");
+    let (_, mapping) = map_until(&request, 3, Signal::Finish);
+    let mapping = mapping.unwrap();
+    assert_eq!((mapping.n_expanded, mapping.status), (1, Status::Bounded));
+    assert_eq!(mapping.moves.last().unwrap().observation, 49_999);
+}
+
+#[test]
+fn the_completion_of_a_search_asks_too() {
+    for heuristic in ["none", "default"] {
+        let request = long_request(100_000, &json!({"heuristic": heuristic, "max_expansions": 0}));
+        let (n_polls, mapping) = map_until(&request, u32::MAX, Signal::Continue);
+        let moves = mapping.unwrap().moves;
+        let n_looks = 6 * moves.len();
+        assert!(n_polls as usize > n_looks / 2048, "{n_polls} polls");
+        let (n_cancelled, mapping) = map_until(&request, n_polls / 2, Signal::Cancel);
+        assert_eq!((n_cancelled, mapping.err()), (n_polls / 2, Some(Cancelled)));
+    }
+    // Told to finish, it skips on to the end before long.
+    let request = long_request(100_000, &json!({"heuristic": "none"}));
+    let (n_polls, mapping) = map_until(&request, 1, Signal::Finish);
+    let moves = mapping.unwrap().moves;
+    assert!(n_polls < 2000, "{n_polls} polls");
+    assert_eq!(moves.last().unwrap().observation, 99_999);
 }

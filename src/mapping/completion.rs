@@ -2,7 +2,8 @@
 
 use super::Problem;
 use super::heuristic::Heuristic;
-use super::search::{Move, MoveKind};
+use super::search::{Move, MoveKind, POLL_EVERY};
+use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::model::StateIdx;
 
 /// Whether a completion may act without advancing.
@@ -15,18 +16,59 @@ pub(super) enum Extras {
 /// Most extra actions under one observation; a body that needs more is not worth following greedily.
 const MAX_EXTRAS: usize = 64;
 
-/// Extends `path` to the last observation, each time by the move of least cost plus estimate. Takes
-/// `O(n_observations * (1 + extras))` looks at a state's successors.
+/// How much work completions may be after an interrupt said to finish, in looks at a distance: tens of milliseconds with a
+/// few attributes. Most demonstrations are followed to their end by then; for the rest of the others it is skipped on.
+pub(super) const GRACE: u64 = 1 << 20;
+
+/// What completions may still spend, all of those of a search together.
+pub(super) struct Allowance<'i> {
+    meter: Meter<'i>,
+    grace_left: u64,
+    is_over: bool,
+}
+
+impl<'i> Allowance<'i> {
+    pub(super) fn new(interrupt: &'i mut dyn Interrupt) -> Self {
+        Self { meter: Meter::new(interrupt, POLL_EVERY), grace_left: GRACE, is_over: false }
+    }
+
+    /// Counts `units` of work that are about to be done. Says whether they may be.
+    fn spend(&mut self, units: u64) -> Result<bool, Cancelled> {
+        match self.meter.spend(units) {
+            Signal::Cancel => return Err(Cancelled),
+            Signal::Finish => self.is_over = true,
+            Signal::Continue => {}
+        }
+        if self.is_over {
+            self.grace_left = self.grace_left.saturating_sub(units);
+        }
+        Ok(self.grace_left > 0)
+    }
+}
+
+/// Extends `path` to the last observation, each time by the move of least cost plus estimate; where `allowance` is used
+/// up, by skipping on. Takes `O(n_observations * (1 + extras))` looks at a state's successors.
+///
+/// # Errors
+///
+/// [`Cancelled`] if the interrupt of `allowance` said so.
 pub(super) fn complete<H: Heuristic>(
     problem: &Problem<'_>,
     heuristic: &H,
     extras: Extras,
     mut path: Vec<Move>,
-) -> Vec<Move> {
-    let Some(end) = path.last().copied() else { return path };
+    allowance: &mut Allowance<'_>,
+) -> Result<Vec<Move>, Cancelled> {
+    let Some(end) = path.last().copied() else { return Ok(path) };
     let (mut i, mut state) = (end.observation as usize, end.state);
     let mut seen = vec![state];
     while i < problem.last() {
+        let n_looks = 1 + 2 * problem.model.graph().successors(state).len() as u64;
+        if !allowance.spend(n_looks * heuristic.work(i))? {
+            i += 1;
+            path.push(skip_to(i, state));
+            continue;
+        }
         let may_linger = extras == Extras::Allowed && seen.len() <= MAX_EXTRAS;
         let (step, next) = best_move(problem, heuristic, i, state, may_linger.then_some(&seen));
         i = next;
@@ -37,7 +79,13 @@ pub(super) fn complete<H: Heuristic>(
         seen.push(state);
         path.push(step);
     }
-    path
+    Ok(path)
+}
+
+fn skip_to(i: usize, state: StateIdx) -> Move {
+    #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
+    let observation = i as u32;
+    Move { kind: MoveKind::Skip, action: None, observation, state }
 }
 
 /// The move out of `(i, state)` of least cost plus estimate, the first found among equals, and the observation it leads
@@ -54,7 +102,7 @@ fn best_move<H: Heuristic>(
     #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
     let step = |kind, action, i: usize, state| Move { kind, action, observation: i as u32, state };
 
-    let mut best = (estimate(i + 1, state, 0.0), step(MoveKind::Skip, None, i + 1, state), i + 1);
+    let mut best = (estimate(i + 1, state, 0.0), skip_to(i + 1, state), i + 1);
     for transition in problem.model.graph().successors(state) {
         let (action, to) = (transition.action, transition.to);
         let cost = problem.model.action(action).cost;

@@ -4,13 +4,13 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::Problem;
-use super::completion::{Extras, complete};
+use super::completion::{Allowance, Extras, complete};
 use super::cost::{Cost, cost_of};
 use super::heuristic::paper::Paper;
 use super::heuristic::projection::{Projected, Projections};
 use super::heuristic::{Blind, Heuristic, HeuristicName};
 use super::search::{Found, Move, search};
-use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
+use crate::interrupt::{Cancelled, Interrupt};
 use crate::model::Model;
 
 /// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
@@ -140,20 +140,20 @@ impl Mapper {
             HeuristicName::Default => match Projected::solve(&self.projections, problem, interrupt)? {
                 Some(projected) => admissible(problem, &projected, budget, most_f, interrupt),
                 // No time for the estimate, so none for a search either.
-                None => admissible(problem, &Blind, Budget { max_expansions: 0, ..budget }, most_f, &mut Uninterrupted),
+                None => admissible(problem, &Blind, Budget { max_expansions: 0, ..budget }, most_f, interrupt),
             },
             HeuristicName::None => admissible(problem, &Blind, budget, most_f, interrupt),
             HeuristicName::Paper => {
                 let found = search(problem, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, problem.start);
-                Ok(match Projected::solve(&self.projections, problem, interrupt)? {
+                match Projected::solve(&self.projections, problem, interrupt)? {
                     Some(projected) => {
                         let lower_bound = first + projected.cost_to_go(0, problem.start);
-                        conclude(problem, &projected, found, lower_bound)
+                        conclude(problem, &projected, found, lower_bound, interrupt)
                     }
-                    None => conclude(problem, &Blind, found, first),
-                })
+                    None => conclude(problem, &Blind, found, first, interrupt),
+                }
             }
         }
     }
@@ -171,26 +171,36 @@ fn admissible<H: Heuristic>(
 ) -> Result<Mapping, Cancelled> {
     let found = search(problem, heuristic, budget, most_f, interrupt)?;
     let lower_bound = if found.is_complete { f64::INFINITY } else { found.least_f };
-    Ok(conclude(problem, heuristic, found, lower_bound))
+    conclude(problem, heuristic, found, lower_bound, interrupt)
 }
 
 /// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than `lower_bound`.
-fn conclude<H: Heuristic>(problem: &Problem<'_>, heuristic: &H, found: Found, lower_bound: f64) -> Mapping {
+fn conclude<H: Heuristic>(
+    problem: &Problem<'_>,
+    heuristic: &H,
+    found: Found,
+    lower_bound: f64,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Mapping, Cancelled> {
     let Found { paths, is_complete, n_expanded, n_generated, .. } = found;
-    let completed = paths.into_iter().flat_map(|path| {
-        let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };
-        ways.iter().map(move |extras| complete(problem, heuristic, *extras, path.clone()))
-    });
-    let costed = completed.map(|moves| (cost_of(problem, &moves), moves));
-    let best = costed.min_by(|(cost, _), (other, _)| cost.total.total_cmp(&other.total));
+    let mut allowance = Allowance::new(interrupt);
+    let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };
+    let mut costed = Vec::new();
+    for path in paths {
+        for extras in ways {
+            let moves = complete(problem, heuristic, *extras, path.clone(), &mut allowance)?;
+            costed.push((cost_of(problem, &moves), moves));
+        }
+    }
+    let best = costed.into_iter().min_by(|(cost, _), (other, _)| cost.total.total_cmp(&other.total));
     let (cost, moves) = best.expect("a search gives at least one path");
     let is_optimal = cost.total * (1.0 - ROUNDING) <= lower_bound;
-    Mapping {
+    Ok(Mapping {
         moves,
         cost,
         status: if is_optimal { Status::Optimal } else { Status::Bounded },
         lower_bound: Some(if is_optimal { cost.total } else { lower_bound }),
         n_expanded,
         n_generated,
-    }
+    })
 }

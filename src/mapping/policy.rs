@@ -8,6 +8,7 @@ use utoipa::ToSchema;
 use super::cost::{Cost, CostSum};
 use super::{Mapping, Move, MoveKind, Problem, Status};
 use crate::attribute::{ByAttribute, Scalar};
+use crate::document::{Faults, Place};
 use crate::model::Model;
 
 /// What produced a policy, as far as its problem and mapping do not tell.
@@ -179,7 +180,30 @@ pub struct SearchReport {
     pub elapsed_us: u64,
 }
 
+/// Most bytes of a policy that its states take: 64 MB, 640 for each of the most observations that there can be. The whole is
+/// in memory many times over while it is answered and stored (190 MB of states were seen to take 3 GB), and the
+/// database takes no value over 1 GB.
+const MAX_STATES_BYTES: usize = 64 << 20;
+
 impl Policy {
+    /// Notes at `place` that a policy of `n_observations`, each of which has a step at least, would be too large; says
+    /// whether it would not.
+    /// What is estimated is what a step says of the imitator's state.
+    pub(crate) fn check_size(model: &Model, n_observations: usize, place: &Place<'_, '_>, faults: &mut Faults) -> bool {
+        let step_bytes = serde_json::to_string(&model.describe(0)).map_or(0, |text| text.len());
+        let n_bytes = n_observations.saturating_mul(step_bytes);
+        if n_bytes > MAX_STATES_BYTES {
+            let detail = format!(
+                "the states of a policy of {n_observations} observations would take about {} MB, and {} MB is the most: \
+                 split the demonstration, or give the model fewer or shorter attributes",
+                n_bytes >> 20,
+                MAX_STATES_BYTES >> 20,
+            );
+            faults.note(place, detail);
+        }
+        n_bytes <= MAX_STATES_BYTES
+    }
+
     /// The policy of `mapping`, which must be of `problem`.
     #[must_use]
     pub fn new(stamp: Stamp, problem: &Problem<'_>, mapping: &Mapping) -> Self {

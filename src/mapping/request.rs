@@ -8,7 +8,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Budget, Demonstration, HeuristicName, Mapper, Mapping, OnlineMapping, Problem, Settings};
+use super::{Budget, Demonstration, HeuristicName, Mapper, Mapping, OnlineMapping, Policy, Problem, Settings};
 use crate::attribute::{Scalar, Weights};
 use crate::document::{Faults, Object, Place};
 use crate::interrupt::{Cancelled, Interrupt};
@@ -59,7 +59,13 @@ impl<'m> Request<'m> {
     ) -> Option<Self> {
         let schema = model.schema();
         let demonstration = object.required("demonstration", faults);
-        let demonstration = demonstration.and_then(|place| Demonstration::read(schema, &place, faults));
+        let demonstration = demonstration.and_then(|place| {
+            // Before it is read: small observations make as large steps as others.
+            let n_observations = place.value.as_array().map_or(0, Vec::len);
+            let is_answerable = n_observations > Demonstration::MAX_OBSERVATIONS
+                || Policy::check_size(model, n_observations, &place, faults);
+            is_answerable.then(|| Demonstration::read(schema, &place, faults)).flatten()
+        });
         let named = match object.optional("weights") {
             Some(place) => schema.read_named_weights(&place, faults),
             None => Some(Vec::new()),
@@ -79,6 +85,7 @@ impl<'m> Request<'m> {
     }
 
     /// The mapping that is asked for, of `mapper`'s model: with a lookahead, the one that a stream of the demonstration gives.
+    /// That one is not cut short: a lookahead bounds its work, so `interrupt` is asked once per layer and can only cancel it.
     ///
     /// # Errors
     ///
@@ -157,7 +164,8 @@ pub struct RequestDocument {
     /// Name of the imitator's model.
     #[schema(example = "figure-4")]
     pub model: String,
-    /// The observed states, in order: 1 to 100,000. Attributes may be missing or null: not observed.
+    /// The observed states, in order: 1 to 100,000, or fewer if the policy's states would take more than 64 MB. Attributes
+    /// may be missing or null: not observed.
     pub demonstration: Vec<ObservationDocument>,
     /// Weights by attribute name, each at least 0; attributes not named keep the model's. No attribute adds more than 1e150 to
     /// a distance, however large its weight.
@@ -180,7 +188,7 @@ pub struct RequestDocument {
     /// Most nodes to expand; then the best mapping found so far is answered, with `status` `bounded`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_expansions: Option<u64>,
-    /// Most milliseconds to search, waiting included; then as above. At most a day.
+    /// Most milliseconds to search, waiting included; then as above. At most a day. Without effect if there is a lookahead.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(maximum = 86_400_000)]
     pub deadline_ms: Option<u64>,

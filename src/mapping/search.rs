@@ -9,7 +9,7 @@ use utoipa::ToSchema;
 
 use super::heuristic::Heuristic;
 use super::{Budget, Problem};
-use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::model::{ActionIdx, StateIdx};
 
 /// How a step advances.
@@ -55,9 +55,8 @@ pub(super) struct Found {
     pub(super) n_generated: u64,
 }
 
-/// How many nodes are expanded between two looks at the interrupt. With the paper's estimate on a long demonstration, each may
-/// take a millisecond.
-const POLL_EVERY: u64 = 16;
+/// How many distances are looked at between two looks at the interrupt: less than a millisecond with a few attributes.
+pub(super) const POLL_EVERY: u64 = 2048;
 
 /// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows, among those of at most `most_f`, of which
 /// there must be one. A node is expanded again if a cheaper
@@ -78,6 +77,7 @@ pub(super) fn search<H: Heuristic>(
     let mut nodes = Nodes::new(problem.demonstration.len(), graph.n_states());
     let mut open = BinaryHeap::new();
     let (mut n_expanded, mut n_generated) = (0, 0);
+    let mut meter = Meter::new(interrupt, POLL_EVERY);
 
     let g = problem.distances.distance(0, problem.start);
     let first = nodes.reach(Way { observation: 0, state: problem.start, g, action: NO_ACTION, parent: 0 });
@@ -91,26 +91,37 @@ pub(super) fn search<H: Heuristic>(
             continue;
         }
         let (i, state) = (node.observation as usize, node.state);
-        let found = |paths, is_complete| Found { paths, is_complete, least_f: entry.f, n_expanded, n_generated };
         if i == last {
-            return Ok(found(vec![nodes.path(entry.id)], true));
+            let paths = vec![nodes.path(entry.id)];
+            return Ok(Found { paths, is_complete: true, least_f: entry.f, n_expanded, n_generated });
         }
+        // Whatever is left of an expansion that is broken off costs at least the `f` of its node.
+        let unfinished = |nodes: &Nodes, farthest: Open, n_expanded, n_generated| {
+            let paths = [entry.id, farthest.id, 0].map(|id| nodes.path(id)).to_vec();
+            Ok(Found { paths, is_complete: false, least_f: entry.f, n_expanded, n_generated })
+        };
         let is_spent = n_expanded >= budget.max_expansions || nodes.len() >= budget.max_nodes;
-        let signal = if n_expanded % POLL_EVERY == 0 { interrupt.poll() } else { Signal::Continue };
-        match signal {
+        match meter.spend(1) {
             Signal::Cancel => return Err(Cancelled),
             Signal::Continue if !is_spent => {}
-            Signal::Continue | Signal::Finish => {
-                let ends = [entry.id, farthest.id, 0];
-                return Ok(found(ends.map(|id| nodes.path(id)).to_vec(), false));
-            }
+            Signal::Continue | Signal::Finish => return unfinished(&nodes, farthest, n_expanded, n_generated),
         }
         n_expanded += 1;
         if (entry.observation, farthest.f) > (farthest.observation, entry.f) {
             farthest = entry;
         }
 
-        let mut reach = |i: usize, state: StateIdx, cost: f64, action: ActionIdx| {
+        let skip = (i + 1, state, 0.0, NO_ACTION);
+        let moves = graph.successors(state).iter().flat_map(|transition| {
+            let cost = actions[usize::from(transition.action)].cost;
+            [i + 1, i].map(|i| (i, transition.to, cost, transition.action))
+        });
+        for (i, state, cost, action) in std::iter::once(skip).chain(moves) {
+            match meter.spend(heuristic.work(i)) {
+                Signal::Continue => {}
+                Signal::Finish => return unfinished(&nodes, farthest, n_expanded, n_generated),
+                Signal::Cancel => return Err(Cancelled),
+            }
             n_generated += 1;
             let g = node.g + cost + problem.distances.distance(i, state);
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
@@ -121,12 +132,6 @@ pub(super) fn search<H: Heuristic>(
                     open.push(Open { f, g, observation, id });
                 }
             }
-        };
-        reach(i + 1, state, 0.0, NO_ACTION);
-        for transition in graph.successors(state) {
-            let cost = actions[usize::from(transition.action)].cost;
-            reach(i + 1, transition.to, cost, transition.action);
-            reach(i, transition.to, cost, transition.action);
         }
     }
     unreachable!("every node before the last observation can be left by a skip")

@@ -361,6 +361,10 @@ impl Session {
         if self.n_received as usize + new.len() > Demonstration::MAX_OBSERVATIONS {
             return Err(SessionError::TooMany);
         }
+        let n_observations = self.n_received as usize + new.len();
+        if !Policy::check_size(self.mapper.model(), n_observations, states, &mut faults) {
+            return Err(faults.into());
+        }
         let schema = self.mapper.model().schema();
         let read = new.iter().enumerate().map(|(n, state)| {
             let place = states.item(n_known + n, state);

@@ -21,6 +21,11 @@ use crate::model::StateIdx;
 pub(super) trait Heuristic {
     /// Estimated cost from `(observation, state)` to the end. Finite, at least 0; 0 at the last observation.
     fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64;
+
+    /// How much work an estimate for a node at `observation` is, in looks at a distance. At least 1.
+    fn work(&self, _observation: usize) -> u64 {
+        1
+    }
 }
 
 /// Estimates nothing.

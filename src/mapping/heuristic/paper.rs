@@ -37,4 +37,8 @@ impl Heuristic for Paper<'_> {
         let n_after = (last - j) as f64;
         estimate + n_after * self.least_action_cost
     }
+
+    fn work(&self, observation: usize) -> u64 {
+        1 + (self.problem.last() - observation) as u64
+    }
 }

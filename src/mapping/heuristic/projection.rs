@@ -418,3 +418,32 @@ impl PartialEq for Open {
 }
 
 impl Eq for Open {}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::interrupt::Uninterrupted;
+    use crate::model::{Definition, Limits};
+
+    #[test]
+    fn projections_whose_edges_do_not_fit_are_left_out_largest_first() {
+        let states: Vec<_> = (0..100).map(|n| json!([n, n % 2])).collect();
+        let transitions: Vec<_> = (0..99).map(|n| json!([n, 0, n + 1])).collect();
+        let model = json!({
+            "attributes": [{"name": "n", "kind": "number"}, {"name": "parity", "kind": "number"}],
+            "actions": [{"name": "on"}],
+            "dynamics": {"kind": "table", "states": states, "transitions": transitions},
+        });
+        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let kept = |max_edges| {
+            let projections = Projections::bounded(&model, max_edges, &mut Uninterrupted).unwrap();
+            projections.groups.iter().map(|group| (group.is_kept, group.edges.len())).collect::<Vec<_>>()
+        };
+        assert_eq!(kept(MAX_EDGES), [(true, 99), (true, 2)]);
+        assert_eq!(kept(50), [(false, 0), (true, 2)]);
+        assert_eq!(kept(1), [(false, 0), (false, 0)]);
+    }
+}
