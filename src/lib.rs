@@ -11,7 +11,7 @@
 //! module uses only those to its left.
 //!
 //! ```text
-//! interrupt, document <- attribute <- model <- mapping   |   store <- service <- http <- server <- cli
+//! interrupt, document <- attribute <- model <- mapping   |   store <- service <- stream <- http <- server <- cli
 //!                                                        |   config, telemetry
 //! ```
 //!
@@ -23,7 +23,8 @@
 //! | [`model`] | what a body can do: `table` and `wumpus` dynamics, compiled to one state graph |
 //! | [`mapping`] | the cheapest way to follow a demonstration: problem, search, heuristics, policy |
 //! | [`store`] | all SQL: one writer that groups commits, a pool of readers |
-//! | [`service`] | the application: models, policies, the bounded pool that searches run on |
+//! | [`service`] | the application: models, policies, sessions, the bounded pool that searches run on |
+//! | [`stream`] | the stream protocol, one connection at a time, whatever its transport |
 //! | [`http`] | routes, bodies, problem documents, the OpenAPI description |
 //! | [`server`] | the assembled program, from listening to clean shutdown |
 //! | [`cli`] | the subcommands |
@@ -31,7 +32,9 @@
 //!
 //! A request for a policy passes `http::policies` (body), `service::policies` (model from `service::cache`, a place in
 //! `service::pool`), [`mapping::Request`] (faults), [`mapping::Mapper`] (search), [`mapping::Policy`] (answer), and
-//! `store::writer` (disk) before it is answered.
+//! `store::writer` (disk) before it is answered. An observation of a stream passes `http::stream` (transport),
+//! [`stream::run`] (frames), `service::sessions` (durable before it is acknowledged) and [`mapping::OnlineMapping`]
+//! (committed steps).
 
 pub mod attribute;
 pub mod cli;
