@@ -11,7 +11,7 @@
 //! module uses only those to its left.
 //!
 //! ```text
-//! interrupt, document <- attribute <- model <- mapping <- learning <- world <- experiment   |   store <- service <- http <- server <- cli
+//! interrupt, document <- attribute <- model <- mapping <- learning <- world <- experiment   |   store <- service <- stream <- http <- server <- cli
 //!                                                                                           |   config, telemetry
 //! ```
 //!
@@ -26,7 +26,8 @@
 //! | [`world`] | simulators that execute a policy and give its reward |
 //! | [`experiment`] | the paper's figures |
 //! | [`store`] | all SQL: one writer that groups commits, a pool of readers |
-//! | [`service`] | the application: models, policies, learners, trials, the bounded pool that searches run on |
+//! | [`service`] | the application: models, policies, sessions, learners, trials, the bounded pool that searches run on |
+//! | [`stream`] | the stream protocol, one connection at a time, whatever its transport |
 //! | [`http`] | routes, bodies, problem documents, the OpenAPI description |
 //! | [`server`] | the assembled program, from listening to clean shutdown |
 //! | [`cli`] | the subcommands |
@@ -34,7 +35,9 @@
 //!
 //! A request for a policy passes `http::policies` (body), `service::policies` (model from `service::cache`, a place in
 //! `service::pool`), [`mapping::Request`] (faults), [`mapping::Mapper`] (search), [`mapping::Policy`] (answer), and
-//! `store::writer` (disk) before it is answered.
+//! `store::writer` (disk) before it is answered. An observation of a stream passes `http::stream` (transport),
+//! [`stream::run`] (frames), `service::sessions` (durable before it is acknowledged) and [`mapping::OnlineMapping`]
+//! (committed steps).
 //!
 //! A trial goes the same way through `service::trials`, with weights that a [`learning::Learner`] draws. Its reward is accepted by
 //! `store::writer`, which numbers rewards in one log per learner; `service::learner_task` folds what is new in the log into

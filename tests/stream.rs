@@ -6,6 +6,8 @@ mod service;
 
 use std::time::Duration;
 
+use etude::service::Etude;
+use etude::stream::{Closed, Incoming, Outgoing};
 use futures_util::{SinkExt, StreamExt};
 use reqwest::Body;
 use serde_json::{Value, json};
@@ -15,6 +17,8 @@ use tokio::sync::mpsc;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 
 /// Longer than anything here takes; a test that waits for this fails.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -520,4 +524,46 @@ async fn a_stream_follows_a_learners_weights_or_explores_and_is_rewarded() {
     client.send(json!({"type": "open", "model": "figure-4", "learner": "nobody"})).await;
     assert_eq!(client.receive().await["problem"]["type"], "/problems/unknown-learner");
     assert_eq!(client.closed().await, 4404);
+}
+
+/// A client that reads nothing: the session's own search waits for it, and is given up.
+#[tokio::test]
+async fn who_stays_slow_is_closed_as_overloaded() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let directory = service.stop().await;
+    let database = directory.path().join("etude.db");
+    let flags = service::flags(&["--database", database.to_str().unwrap(), "--slow-reader-timeout", "100ms"]);
+    let (tasks, abort) = (TaskTracker::new(), CancellationToken::new());
+    let etude = Etude::open(&flags.settings(), &tasks, abort.clone()).await.unwrap();
+    let (came, mut incoming) = mpsc::channel(1);
+    // Room for `hello` alone.
+    let (outgoing, mut goes) = mpsc::channel(1);
+    let open = json!({"type": "open", "model": "figure-4"}).to_string();
+    came.send(Incoming::Frame(open.into_bytes())).await.unwrap();
+    let closed = etude::stream::run(&etude, flags.stream_limits(), &mut incoming, &outgoing, &abort).await;
+    assert_eq!((closed, closed.code().0), (Closed::Overloaded, 1013));
+    assert!(matches!(goes.try_recv(), Ok(Outgoing::Frame(hello)) if hello.contains("hello")));
+    etude.close().await;
+}
+
+#[tokio::test]
+async fn pings_are_answered_while_the_service_searches() {
+    let service = Service::start(&[]).await;
+    let cave = json!({
+        "actions": [{"name": "forward"}, {"name": "turn_left"}, {"name": "grab"}],
+        "dynamics": {"kind": "wumpus", "width": 20, "height": 20, "gold": [[5, 5], [9, 2], [3, 12]]},
+    });
+    assert_eq!(service.put("/v1/models/cave", &cave).await.0, 201);
+    let mut client = Client::connect(&service).await;
+    client.open(json!({"type": "open", "model": "cave"})).await;
+    let states: Vec<Value> = (0..1000).map(|n| json!({"x": n % 20, "y": n / 20 % 20})).collect();
+    client.send(json!({"type": "observe", "seq": 0, "states": states})).await;
+    assert_eq!(client.receive().await, json!({"type": "received", "seq": 1000}));
+    // A thousand layers are under way, none of whose steps is sent before all of them are done.
+    client.socket.send(Message::Ping(b"there?".as_slice().into())).await.unwrap();
+    assert_eq!(client.next().await, Message::Pong(b"there?".as_slice().into()));
+    // Who vanishes now ends the search: the service stops at once.
+    drop(client);
+    tokio::time::timeout(PATIENCE, service.stop()).await.unwrap();
 }

@@ -25,7 +25,7 @@ use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{Problem, ProblemKind};
 use crate::store::SessionRow;
-use crate::stream::{self, Incoming, Outgoing, PROTOCOL};
+use crate::stream::{self, Closed, Incoming, Outgoing, PROTOCOL};
 
 /// Frames that wait to be answered, and answers that wait to be read: enough to keep both ends busy.
 const MAX_WAITING: usize = 64;
@@ -73,15 +73,19 @@ async fn serve_websocket(context: Context, socket: WebSocket, place: OwnedSemaph
     // Gone: nobody is there any more. Ended: nothing more will come.
     let (gone, ended) = (CancellationToken::new(), CancellationToken::new());
     let speaking = async {
-        tokio::select! {
-            _ = stream::run(&context.etude, context.stream_limits, &mut incoming, &outgoing, &context.stopping) => {}
+        let closed = tokio::select! {
+            closed = stream::run(&context.etude, context.stream_limits, &mut incoming, &outgoing, &context.stopping) => closed,
             // A search that still runs ends with this.
-            () = gone.cancelled() => {}
-        }
+            () = gone.cancelled() => Closed::ByClient,
+        };
         incoming.close();
-        drop(outgoing);
-        // What is left to be written may take this long.
-        tokio::time::sleep(CLOSE_TIMEOUT).await;
+        // What is left to be written may take this long. Where the queue was full until now, this is the goodbye that a
+        // slow reader gets; if there was one already, nobody takes another.
+        let goodbye = tokio::time::timeout(CLOSE_TIMEOUT, outgoing.send(Outgoing::Close(closed)));
+        if let Ok(Ok(())) = goodbye.await {
+            drop(outgoing);
+            tokio::time::sleep(CLOSE_TIMEOUT).await;
+        }
     };
     let talking = async {
         tokio::select! {

@@ -20,6 +20,11 @@ struct Flags {
     config: ServeConfig,
 }
 
+/// The settings that `flags` give, with defaults for the others.
+pub(crate) fn flags(flags: &[&str]) -> ServeConfig {
+    Flags::parse_from(["etude"].iter().chain(flags)).config
+}
+
 /// A running service.
 pub(crate) struct Service {
     pub(crate) address: SocketAddr,
