@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use etude::attribute::Schema;
 use etude::document::{Faults, Place};
 use etude::interrupt::Uninterrupted;
-use etude::mapping::{Budget, HeuristicName, Mapper, Request, Settings};
+use etude::mapping::{HeuristicName, Mapper, Request, Settings};
 use etude::model::{Definition, Limits, Model};
 use pathfinding::prelude::astar;
 use serde_json::json;
@@ -29,10 +29,10 @@ fn main() {
 }
 
 fn measure(world: &World) {
-    let definition = Definition::read(&world.model, Limits::DEFAULT).expect("worlds are models");
+    let definition = Definition::read(&world.model, Limits::DEFAULT, &mut Uninterrupted).expect("worlds are models");
     let started = Instant::now();
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).expect("worlds are small enough");
-    let mapper = &Mapper::new(model);
+    let mapper = &Mapper::new(model, &mut Uninterrupted).expect("nothing interrupts");
     let compiled = started.elapsed();
     let peer = Peer::new(mapper, world);
     let graph = mapper.model().graph();
@@ -50,7 +50,7 @@ fn measure(world: &World) {
         let mut faults = Faults::default();
         let object = Place::root(&request).object(&Request::FIELDS, &mut faults).expect("a request is an object");
         let request = Request::read(mapper.model(), &object, &mut faults).expect("worlds have their demonstrations");
-        let settings = Settings { heuristic, budget: Budget::DEFAULT };
+        let settings = Settings { heuristic, ..Settings::default() };
         move || {
             let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).expect("nothing interrupts");
             Solved { cost: mapping.cost.total, n_expanded: mapping.n_expanded }

@@ -7,8 +7,9 @@ use std::time::Duration;
 
 use clap::Args;
 
-use crate::model::Limits;
+use crate::model;
 use crate::service::{PoolSettings, Settings};
+use crate::stream::Limits;
 
 /// Settings of the service.
 #[derive(Args, Clone, Debug)]
@@ -29,11 +30,24 @@ pub struct ServeConfig {
     #[arg(long, env = "ETUDE_MAX_BODY_BYTES", default_value_t = 8 * 1024 * 1024, value_name = "BYTES")]
     pub max_body_bytes: usize,
     /// Most states of a model.
-    #[arg(long, env = "ETUDE_MAX_STATES", default_value_t = Limits::DEFAULT.max_states, value_name = "N")]
+    #[arg(long, env = "ETUDE_MAX_STATES", default_value_t = model::Limits::DEFAULT.max_states, value_name = "N")]
     pub max_states: usize,
     /// Memory for models that are kept ready to be searched.
     #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", default_value_t = 1024 * 1024 * 1024, value_name = "BYTES")]
     pub model_cache_bytes: u64,
+    /// Streams that may run at the same time; further ones are answered 503.
+    #[arg(long, env = "ETUDE_MAX_STREAMS", default_value_t = 4096, value_name = "N")]
+    pub max_streams: usize,
+    /// How long a session may be idle before it expires.
+    #[arg(
+        long, env = "ETUDE_SESSION_IDLE_TIMEOUT", default_value = "1h", value_parser = parse_duration, value_name = "TIME"
+    )]
+    pub session_idle_timeout: Duration,
+    /// How long a stream's client may leave unread what waits for it.
+    #[arg(
+        long, env = "ETUDE_SLOW_READER_TIMEOUT", default_value = "10s", value_parser = parse_duration, value_name = "TIME"
+    )]
+    pub slow_reader_timeout: Duration,
     /// How often rewards are folded into the weights of their learners, such as 100ms or 1s; above 0.
     #[arg(long, env = "ETUDE_LEARN_EVERY", default_value = "1s", value_parser = parse_period, value_name = "TIME")]
     pub learn_every: Duration,
@@ -49,8 +63,9 @@ impl ServeConfig {
         let n_cores = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
         Settings {
             database: self.database.clone(),
-            limits: Limits { max_states: self.max_states },
+            limits: model::Limits { max_states: self.max_states },
             model_cache_bytes: self.model_cache_bytes,
+            session_idle_timeout: self.session_idle_timeout,
             pool: PoolSettings {
                 n_threads: self.search_threads.map_or(n_cores, NonZeroUsize::get),
                 max_waiting: self.search_queue,
@@ -58,6 +73,21 @@ impl ServeConfig {
         }
     }
 }
+
+impl ServeConfig {
+    /// What a stream may use.
+    #[must_use]
+    pub fn stream_limits(&self) -> Limits {
+        Limits {
+            frame_bytes: STREAM_FRAME_BYTES,
+            slow_after: self.slow_reader_timeout,
+            idle_after: self.session_idle_timeout,
+        }
+    }
+}
+
+/// Largest frame of a stream: a thousand observations of a dozen attributes.
+const STREAM_FRAME_BYTES: usize = 262_144;
 
 fn parse_duration(text: &str) -> Result<Duration, String> {
     let duration: jiff::SignedDuration = text.parse().map_err(|error: jiff::Error| error.to_string())?;

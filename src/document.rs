@@ -16,7 +16,9 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
-use crate::attribute::MAX_COST;
+/// Largest cost of an action, and largest term of a distance; dimensionless. Keeps every sum along a path finite: even a
+/// hundred million of them stay below the largest float.
+pub const MAX_COST: f64 = 1e150;
 
 /// One thing wrong with a document, and where.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -29,7 +31,8 @@ pub struct Fault {
     pub detail: String,
 }
 
-/// Everything wrong with one document, in document order.
+/// Everything wrong with one document, in the order in which its reader found it: unknown fields of an object before its
+/// known ones, which come in the order in which they are read, not in that of the text.
 #[derive(Clone, Debug, Default, PartialEq, Eq, thiserror::Error)]
 pub struct Faults {
     listed: Vec<Fault>,
@@ -78,18 +81,6 @@ impl Faults {
     #[must_use]
     pub fn listed(&self) -> &[Fault] {
         &self.listed
-    }
-
-    /// Adds the faults of another reading of the same document.
-    pub fn append(&mut self, other: Self) {
-        for fault in other.listed {
-            if self.listed.len() < Self::MAX_LISTED {
-                self.listed.push(fault);
-            } else {
-                self.n_unlisted += 1;
-            }
-        }
-        self.n_unlisted += other.n_unlisted;
     }
 
     /// Ends a reading: the value if nothing was noted, else the faults.
@@ -300,7 +291,10 @@ impl<'v, 'p> Place<'v, 'p> {
                 faults.note(self, format!("there is no {what} {}: there are {len}, counted from 0", self.value));
                 None
             }
-            None => self.mismatch(&format!("the index of a {what}"), faults),
+            None => {
+                let article = if what.starts_with(['a', 'e', 'i', 'o', 'u']) { "an" } else { "a" };
+                self.mismatch(&format!("the index of {article} {what}"), faults)
+            }
         }
     }
 
@@ -388,17 +382,36 @@ struct Excerpt<'v>(&'v Value);
 
 impl fmt::Display for Excerpt<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        const MAX_SHOWN: usize = 60;
         match self.0 {
             Value::Array(items) => write!(f, "an array of {}", items.len()),
             Value::Object(_) => f.write_str("an object"),
-            Value::String(text) if text.chars().count() > MAX_SHOWN => {
-                let shown: String = text.chars().take(MAX_SHOWN).collect();
-                write!(f, "{}..", Value::String(shown))
-            }
+            Value::String(text) => Quoted(text).fmt(f),
             other => write!(f, "{other}"),
         }
     }
+}
+
+/// A text as it is shown in a fault: quoted, and cut if it is long.
+pub(crate) struct Quoted<'t>(pub(crate) &'t str);
+
+impl fmt::Display for Quoted<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        /// Most characters shown: enough to recognize a name by.
+        const MAX_SHOWN: usize = 60;
+        let cut = self.0.char_indices().nth(MAX_SHOWN).map(|(end, _)| &self.0[..end]);
+        let ellipsis = if cut.is_some() { ".." } else { "" };
+        write!(f, "{}{ellipsis}", Value::from(cut.unwrap_or(self.0)))
+    }
+}
+
+/// Names that would have been right, as they are listed in a fault: the first few.
+pub(crate) fn list_known<N: AsRef<str>>(names: impl IntoIterator<Item = N>) -> String {
+    /// Most names listed. There may be tens of thousands, and a fault for every state.
+    const MAX_KNOWN: usize = 10;
+    let mut names = names.into_iter();
+    let mut known: Vec<String> = names.by_ref().take(MAX_KNOWN).map(|name| Quoted(name.as_ref()).to_string()).collect();
+    known.extend(names.next().map(|_| "..".to_owned()));
+    known.join(", ")
 }
 
 #[cfg(test)]
@@ -408,7 +421,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn faults_carry_escaped_pointers_in_document_order() {
+    fn faults_carry_escaped_pointers_in_reading_order() {
         let value = json!({"a/b": [1, "x"], "c~": true});
         let mut faults = Faults::default();
         let root = Place::root(&value);
@@ -443,5 +456,23 @@ mod tests {
         }
         assert_eq!((faults.listed().len(), faults.count()), (Faults::MAX_LISTED, Faults::MAX_LISTED + 5));
         assert!(faults.to_string().ends_with("and 5 more"));
+    }
+
+    #[test]
+    fn what_a_fault_repeats_of_a_document_is_cut() {
+        let long = "\u{e9}".repeat(1_000_000);
+        assert_eq!(Quoted(&long).to_string(), format!("\"{}\"..", "\u{e9}".repeat(60)));
+        assert_eq!(Quoted("a\"b").to_string(), r#""a\"b""#);
+        let names: Vec<String> = (0..60_000).map(|n| format!("{n}{long}")).take(12).collect();
+        let known = list_known(&names);
+        assert!(known.starts_with("\"0") && known.ends_with(", ..") && known.len() < 2000, "{known}");
+        assert_eq!(list_known(["a", "b"]), r#""a", "b""#);
+    }
+
+    #[test]
+    fn an_index_of_an_action_is_asked_for_in_english() {
+        let mut faults = Faults::default();
+        Place::root(&json!("x")).index(3, "action", &mut faults);
+        assert_eq!(faults.listed()[0].detail, "expected the index of an action, found \"x\"");
     }
 }

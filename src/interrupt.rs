@@ -1,7 +1,8 @@
 //! How a long computation is stopped from outside.
 //!
-//! The core has no clock and no cancellation token of its own: it asks its caller, every few hundred steps, whether to
-//! go on. What the answer rests on (a deadline, a vanished client, a shutdown) is the caller's affair.
+//! The core has no clock and no cancellation token of its own: it asks its caller, again and again, whether to go on. How
+//! much work lies between two questions is each computation's to choose, so that it takes milliseconds at most; a
+//! [`Meter`] counts it. What the answer rests on (a deadline, a vanished client, a shutdown) is the caller's affair.
 
 /// What a long computation is told when it asks whether to go on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -38,5 +39,42 @@ pub struct Uninterrupted;
 impl Interrupt for Uninterrupted {
     fn poll(&mut self) -> Signal {
         Signal::Continue
+    }
+}
+
+/// Counts the work of a long computation, and asks its [`Interrupt`] once for every so many units of it.
+pub(crate) struct Meter<'i> {
+    interrupt: &'i mut dyn Interrupt,
+    /// Units of work between two questions.
+    every: u64,
+    /// Units of work until the next question.
+    left: u64,
+}
+
+impl<'i> Meter<'i> {
+    /// A meter that asks at the first unit of work, and then after `every` units.
+    pub(crate) fn new(interrupt: &'i mut dyn Interrupt, every: u64) -> Self {
+        Self { interrupt, every, left: 0 }
+    }
+
+    /// Counts `units` of work that are about to be done, and says whether to go on.
+    #[inline]
+    pub(crate) fn spend(&mut self, units: u64) -> Signal {
+        if let Some(left) = self.left.checked_sub(units) {
+            self.left = left;
+            return Signal::Continue;
+        }
+        self.left = self.every;
+        self.interrupt.poll()
+    }
+
+    /// As [`Self::spend`], for work that is of no use unless it is finished.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if the interrupt said so.
+    #[inline]
+    pub(crate) fn spend_or_cancel(&mut self, units: u64) -> Result<(), Cancelled> {
+        if self.spend(units) == Signal::Cancel { Err(Cancelled) } else { Ok(()) }
     }
 }

@@ -53,5 +53,6 @@ pub mod model;
 pub mod server;
 pub mod service;
 pub mod store;
+pub mod stream;
 pub mod telemetry;
 pub mod world;

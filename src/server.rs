@@ -5,13 +5,13 @@
 //!                                             -> searches aborted, answered 503 -> store closed
 //! ```
 
-use std::future::IntoFuture;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
 use axum::serve::ListenerExt;
 use tokio::net::TcpListener;
+use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -64,6 +64,7 @@ pub struct Server {
     etude: Arc<Etude>,
     router: axum::Router,
     tasks: TaskTracker,
+    streams: TaskTracker,
     stopping: CancellationToken,
     abort: CancellationToken,
     drain_timeout: Duration,
@@ -88,14 +89,30 @@ impl Server {
         let address = listener.local_addr().map_err(listen)?;
         tasks.spawn(upkeep(metrics.clone(), stopping.clone()));
         let etude = Arc::new(etude);
+        tasks.spawn(Arc::clone(&etude).refine_until(stopping.clone()));
+        tasks.spawn(Arc::clone(&etude).expire_until(stopping.clone()));
+        let streams = TaskTracker::new();
         tasks.spawn(Arc::clone(&etude).learn_periodically(config.learn_every, stopping.clone()));
         let router = http::router(Context {
             etude: Arc::clone(&etude),
             stopping: stopping.clone(),
             max_body_bytes: config.max_body_bytes,
             metrics,
+            stream_limits: config.stream_limits(),
+            stream_places: Arc::new(Semaphore::new(config.max_streams)),
+            streams: streams.clone(),
         });
-        Ok(Self { listener, address, etude, router, tasks, stopping, abort, drain_timeout: config.drain_timeout })
+        Ok(Self {
+            listener,
+            address,
+            etude,
+            router,
+            tasks,
+            streams,
+            stopping,
+            abort,
+            drain_timeout: config.drain_timeout,
+        })
     }
 
     /// Where it listens.
@@ -111,7 +128,7 @@ impl Server {
     ///
     /// If connections can no longer be accepted.
     pub async fn run(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), ServerError> {
-        let Self { listener, address, etude, router, tasks, stopping, abort, drain_timeout } = self;
+        let Self { listener, address, etude, router, tasks, streams, stopping, abort, drain_timeout } = self;
         tracing::info!(%address, "listening on http://{address}");
         let listener = listener.tap_io(|stream| {
             // Small answers should not wait for more.
@@ -127,7 +144,13 @@ impl Server {
                 stopping.cancel();
             }
         };
-        let serving = axum::serve(listener, router).with_graceful_shutdown(announce).into_future();
+        let serving = async {
+            axum::serve(listener, router).with_graceful_shutdown(announce).await?;
+            // Websockets are no longer the listener's.
+            streams.close();
+            streams.wait().await;
+            Ok(())
+        };
         let overtime = async {
             stopping.cancelled().await;
             tokio::time::sleep(drain_timeout).await;
@@ -136,7 +159,7 @@ impl Server {
             tokio::time::sleep(ABORT_GRACE).await;
         };
         tokio::select! {
-            served = serving => served.map_err(ServerError::Serve)?,
+            served = serving => { let served: std::io::Result<()> = served; served.map_err(ServerError::Serve)?; }
             () = overtime => tracing::warn!("closing connections that are still open"),
         }
         abort.cancel();

@@ -281,7 +281,10 @@ async fn all_faults_of_a_request_are_told_at_once() {
         (status, &problem["type"], pointers(&problem)),
         (404, &json!("/problems/unknown-model"), vec!["/model"])
     );
-    assert_eq!(post(json!({"model": "nothing", "demonstration": [{}], "hurry": 1})).await.0, 422);
+    let (status, problem) = post(json!({"model": "nothing", "demonstration": [{}], "hurry": 1})).await;
+    assert_eq!((status, pointers(&problem)), (422, vec!["/hurry", "/model"]));
+    let (_, problem) = post(json!({"model": "x".repeat(100_000), "demonstration": [{}]})).await;
+    assert!(problem.to_string().len() < 1000, "{problem}");
     let (status, problem) = post(json!({"model": "corridor", "learner": "nobody", "demonstration": [{}]})).await;
     assert_eq!((status, &problem["type"]), (404, &json!("/problems/unknown-learner")));
     assert_eq!(service.get("/v1/policies").await.1["items"], json!([]), "nothing was stored");
@@ -465,6 +468,39 @@ async fn a_deadline_gives_the_best_mapping_so_far_and_a_bound() {
     assert_eq!(policy["steps"].as_array().unwrap().last().unwrap()["observation"], 19_999);
 }
 
+/// Reads a policy until it is refined.
+async fn refined(service: &Service, id: &str) -> Value {
+    loop {
+        let (_, policy) = service.get(&format!("/v1/policies/{id}")).await;
+        if let Some(refined_by) = policy["refined_by"].as_str() {
+            return service.get(&format!("/v1/policies/{refined_by}")).await.1;
+        }
+        tokio::task::yield_now().await;
+    }
+}
+
+#[tokio::test]
+async fn a_policy_with_a_lookahead_is_local_and_is_refined_in_the_background() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let mut request = example("figure-4/request.json");
+    request["lookahead"] = json!(1);
+    let (status, local) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, &local["status"], &local["lookahead"]), (201, &json!("local"), &json!(1)));
+    assert_eq!((&local["lower_bound"], &local["refined_by"]), (&Value::Null, &Value::Null));
+    assert!(local["cost"]["total"].as_f64().unwrap() > 48.0);
+    let refined = refined(&service, local["id"].as_str().unwrap()).await;
+    assert_eq!((&refined["refines"], &refined["status"]), (&local["id"], &json!("optimal")));
+    assert_eq!((&refined["cost"]["total"], &refined["lookahead"]), (&json!(48.0), &Value::Null));
+    let (_, list) = service.get("/v1/policies").await;
+    assert_eq!(list["items"][0]["refined_by"], refined["id"]);
+
+    // A lookahead that reaches the end decides nothing early.
+    request["lookahead"] = json!(15);
+    let (_, policy) = service.post("/v1/policies", &request).await;
+    assert_eq!((&policy["status"], &policy["cost"]["total"]), (&json!("optimal"), &json!(48.0)));
+}
+
 #[tokio::test]
 async fn a_shutdown_answers_what_still_runs_and_closes_the_database() {
     let service = Service::start(&["--drain-timeout", "0s"]).await;
@@ -479,4 +515,23 @@ async fn a_shutdown_answers_what_still_runs_and_closes_the_database() {
     assert_eq!((status, &problem["type"]), (503, &json!("/problems/stopping")));
     let left: Vec<_> = std::fs::read_dir(directory.path()).unwrap().map(|file| file.unwrap().file_name()).collect();
     assert_eq!(left, ["etude.db"], "the write-ahead log was folded in");
+}
+
+#[tokio::test]
+async fn a_database_that_another_process_holds_is_no_internal_error() {
+    use sqlx::{ConnectOptions, Connection};
+    let service = Service::start(&[]).await;
+    let path = service.directory.path().join("etude.db");
+    let mut other = sqlx::sqlite::SqliteConnectOptions::new().filename(path).connect().await.unwrap();
+    let held = other.begin_with("BEGIN IMMEDIATE").await.unwrap();
+    let put = async |name: &str| service.send(Method::PUT, &format!("/v1/models/{name}"), &corridor()).await;
+    // Both wait for the lock once, not one after the other.
+    let (first, second) = tokio::join!(put("a"), put("b"));
+    for response in [first, second] {
+        assert_eq!(response.headers()[RETRY_AFTER], "1");
+        assert_eq!(answer(response).await.1["type"], "/problems/not-ready");
+    }
+    held.rollback().await.unwrap();
+    assert_eq!(put("a").await.status(), 201);
+    assert_eq!(service.get("/readyz").await.0, 200);
 }

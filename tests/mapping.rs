@@ -8,6 +8,7 @@
 )]
 
 mod oracle;
+mod problems;
 
 use std::collections::HashMap;
 
@@ -15,19 +16,10 @@ use etude::attribute::Scalar;
 use etude::document::{Faults, Place};
 use etude::interrupt::Uninterrupted;
 use etude::mapping::{Mapper, MoveKind, Policy, Request, Stamp, Status};
-use etude::model::{Act, Definition, Limits, Model};
+use etude::model::Act;
+use problems::{close, example, mapper, problem};
 use proptest::prelude::*;
 use serde_json::{Value, json};
-
-fn example(path: &str) -> Value {
-    let path = format!("{}/examples/{path}", env!("CARGO_MANIFEST_DIR"));
-    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
-}
-
-fn mapper(model: &Value) -> Mapper {
-    let definition = Definition::read(model, Limits::DEFAULT).unwrap();
-    Mapper::new(Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap())
-}
 
 fn solve(mapper: &Mapper, request: &Value) -> Policy {
     let mut faults = Faults::default();
@@ -96,107 +88,6 @@ fn check_policy(model: &Value, demonstration: &Value, weights: &Value, policy: &
     assert_eq!(policy.coverage.observed as usize, n_observations);
     let taken: Vec<&str> = steps.iter().filter_map(|step| step.action.as_deref()).collect();
     assert_eq!(policy.actions.iter().map(|action| &**action).collect::<Vec<_>>(), taken);
-}
-
-fn close(a: f64, b: f64) -> bool {
-    (a - b).abs() <= 1e-9 * (1.0 + a.abs().max(b.abs()))
-}
-
-fn attribute() -> impl Strategy<Value = Value> {
-    let weight = prop_oneof![Just(0.0), Just(1.0), 0.0..5.0];
-    let scale = prop_oneof![Just(1.0), 0.5..3.0];
-    (0..4, weight, scale).prop_map(|(kind, weight, scale)| match kind {
-        0 => json!({"kind": "number", "weight": weight, "scale": scale}),
-        1 => json!({"kind": "cyclic", "labels": ["a", "b", "c", "d", "e"], "weight": weight, "scale": scale}),
-        2 => json!({"kind": "cyclic", "period": 4.5, "weight": weight, "scale": scale}),
-        _ => json!({"kind": "category", "weight": weight}),
-    })
-}
-
-/// A value of an attribute, by a number from 0 to 4.
-fn value(attribute: &Value, n: usize) -> Value {
-    match (attribute["kind"].as_str().unwrap(), &attribute["labels"]) {
-        ("number", _) => json!([0.0, 1.0, 2.5, -1.0, 3.0][n]),
-        ("cyclic", Value::Array(labels)) => labels[n].clone(),
-        ("cyclic", _) => json!([0.0, 1.5, 4.0, -2.0, 11.25][n]),
-        _ => [json!("a"), json!(true), json!(1), json!("b"), json!(false)][n].clone(),
-    }
-}
-
-/// A model with `table` dynamics, a demonstration, weights and a start.
-fn problem() -> impl Strategy<Value = (Value, Value, Value, Option<usize>)> {
-    let attributes = prop::collection::vec(attribute(), 1..4);
-    let costs = prop::collection::vec(prop_oneof![Just(0.0), Just(0.3), Just(1.0), 0.0..2.0], 1..4);
-    (attributes, costs, 1usize..9).prop_flat_map(|(mut attributes, costs, n_states)| {
-        for (k, attribute) in attributes.iter_mut().enumerate() {
-            attribute["name"] = json!(format!("k{k}"));
-        }
-        let n_attributes = attributes.len();
-        let states = prop::collection::vec(prop::collection::vec(0usize..5, n_attributes), n_states);
-        let targets = prop::collection::vec(prop::option::weighted(0.6, 0..n_states), n_states * costs.len());
-        let observations =
-            prop::collection::vec(prop::collection::vec(prop::option::weighted(0.8, 0usize..5), n_attributes), 1..8);
-        let unsafe_states = prop::collection::vec(prop::bool::weighted(0.1), n_states);
-        let starts = (0..3, 0..n_states, prop::option::weighted(0.3, 0..n_states));
-        let weights = prop::option::of((0..n_attributes, prop_oneof![Just(0.0), Just(2.0), 0.0..4.0]));
-        (Just((attributes, costs)), states, targets, observations, unsafe_states, starts, weights).prop_map(build)
-    })
-}
-
-#[expect(clippy::type_complexity, reason = "the parts of a generated problem, used once")]
-fn build(
-    ((attributes, costs), states, targets, observations, unsafe_states, starts, weights): (
-        (Vec<Value>, Vec<f64>),
-        Vec<Vec<usize>>,
-        Vec<Option<usize>>,
-        Vec<Vec<Option<usize>>>,
-        Vec<bool>,
-        (i32, usize, Option<usize>),
-        Option<(usize, f64)>,
-    ),
-) -> (Value, Value, Value, Option<usize>) {
-    let n_states = states.len();
-    let (start_kind, model_start, request_start) = starts;
-    // Whatever may be a start is made safe.
-    let is_unsafe = |s: usize| unsafe_states[s] && s != model_start && Some(s) != request_start && s != 0;
-    let start = match start_kind {
-        0 => Value::Null,
-        1 => json!(model_start),
-        _ => json!([0, model_start]),
-    };
-    let actions: Vec<Value> =
-        costs.iter().enumerate().map(|(a, cost)| json!({"name": format!("a{a}"), "cost": cost})).collect();
-    let transitions: Vec<Value> = targets
-        .iter()
-        .enumerate()
-        .filter_map(|(n, to)| to.map(|to| json!([n / costs.len(), format!("a{}", n % costs.len()), to])))
-        .collect();
-    let states: Vec<Value> = states
-        .iter()
-        .map(|state| state.iter().zip(&attributes).map(|(n, attribute)| value(attribute, *n)).collect())
-        .collect();
-    let demonstration: Value = observations
-        .iter()
-        .enumerate()
-        .map(|(i, observation)| {
-            let seen = |k: usize| observation[k].map(|n| value(&attributes[k], n));
-            if i % 2 == 0 {
-                (0..attributes.len()).map(|k| seen(k).unwrap_or(Value::Null)).collect()
-            } else {
-                let named = (0..attributes.len()).filter_map(|k| seen(k).map(|value| (format!("k{k}"), value)));
-                Value::Object(named.collect())
-            }
-        })
-        .collect();
-    let weights = weights.map_or(json!({}), |(k, weight)| json!({format!("k{k}"): weight}));
-    let unsafe_states: Vec<usize> = (0..n_states).filter(|s| is_unsafe(*s)).collect();
-    let model = json!({
-        "attributes": attributes,
-        "actions": actions,
-        "dynamics":
-            {"kind": "table", "states": states, "transitions": transitions, "start": start, "unsafe": unsafe_states},
-    });
-    (model, demonstration, weights, request_start)
 }
 
 proptest! {

@@ -45,6 +45,8 @@ fn the_demo_shows_the_cave_the_steps_and_the_totals() {
         "status    optimal, lower bound 48.0",
         "Weights after 34 trials, all 1 at first; their means give a policy with reward 974:",
         "  gold      5.24  ████",
+        "\n   8 heading=north       1 extra  0 turn_left  lookahead x=0 y=0 heading=north",
+        "\n  10 x=4                 5 match  3 forward    proven    x=2 y=1 heading=east",
     ] {
         assert!(shown.contains(expected), "{expected:?} is not in\n{shown}");
     }
@@ -99,6 +101,10 @@ fn faults_of_files_are_told_with_their_places() {
     assert!(faults.contains("/demonstration/0/speed: unknown attribute \"speed\""), "{faults}");
     assert!(faults.contains("/demonstration/1/x: expected a number, found \"a\""), "{faults}");
     assert!(told(good, &file("broken.json", "[{]")).contains("not JSON at line 1, column 3"));
+    let request = file("request.json", r#"{"demonstration": [{}], "weights": 3}"#);
+    let weighted = run(&["map", "--model", good, "--demonstration", &request, "--weight", "x=2"]);
+    assert_eq!(weighted.status.code(), Some(1));
+    assert!(text(&weighted.stderr).contains("--weight: the `weights` of"), "{}", text(&weighted.stderr));
     assert!(told("nowhere.json", &demonstration).contains("cannot read nowhere.json: No such file"));
 }
 
@@ -132,7 +138,10 @@ impl Process {
 #[test]
 fn sigterm_and_sigint_end_the_service_cleanly() {
     let directory = tempfile::tempdir().unwrap();
-    for (signal, flags) in [("-TERM", ["--log-format", "text"]), ("-INT", ["--log-format", "json"])] {
+    for (signal, flags) in [
+        ("-TERM", ["--log-format", "text", "--log", "etude=debug"]),
+        ("-INT", ["--log-format", "json", "--log", "etude=debug"]),
+    ] {
         let service = Process::start(&directory.path().join("etude.db"), &flags);
         let healthy = run(&["healthcheck", "--listen", &service.address]);
         assert!(healthy.status.success(), "{}", text(&healthy.stderr));
@@ -163,4 +172,136 @@ fn what_cannot_be_started_says_why() {
     let database = directory.path().join("etude.db");
     let failed = run(&["serve", "--listen", &address, "--database", database.to_str().unwrap()]);
     assert!(text(&failed.stderr).contains(&format!("cannot listen on {address}: Address already in use")));
+}
+
+/// `etude stream`, fed line by line.
+struct Streaming {
+    child: Child,
+    input: Option<std::process::ChildStdin>,
+    output: BufReader<std::process::ChildStdout>,
+}
+
+impl Streaming {
+    fn start(flags: &[&str]) -> Self {
+        let mut command = etude(&[&["stream"][..], flags].concat());
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        let output = BufReader::new(child.stdout.take().unwrap());
+        Self { input: child.stdin.take(), child, output }
+    }
+
+    fn write(&mut self, line: &str) {
+        writeln!(self.input.as_ref().unwrap(), "{line}").unwrap();
+    }
+
+    fn read(&mut self) -> String {
+        let mut line = String::new();
+        self.output.read_line(&mut line).unwrap();
+        line
+    }
+
+    /// Ends the input; gives the rest of the output, and the exit code with the errors.
+    fn end(mut self) -> (String, Option<i32>, String) {
+        drop(self.input.take());
+        let mut rest = String::new();
+        std::io::Read::read_to_string(&mut self.output, &mut rest).unwrap();
+        let ended = self.child.wait_with_output().unwrap();
+        (rest, ended.status.code(), text(&ended.stderr).to_owned())
+    }
+}
+
+fn demonstration() -> Vec<String> {
+    let demonstration: Value = serde_json::from_str(include_str!("../examples/figure-4/demonstration.json")).unwrap();
+    demonstration.as_array().unwrap().iter().map(Value::to_string).collect()
+}
+
+/// Writes the demonstration with a line read in between, and gives all that was printed.
+fn stream(flags: &[&str]) -> Vec<String> {
+    let observations = demonstration();
+    let mut streaming = Streaming::start(flags);
+    // The start is committed by the first observation, long before the input has ended.
+    streaming.write(&observations[0]);
+    let mut lines = vec![streaming.read()];
+    streaming.write("");
+    for observation in &observations[1..15] {
+        streaming.write(observation);
+    }
+    lines.extend((0..3).map(|_| streaming.read()));
+    streaming.write(&observations[15]);
+    let (rest, code, errors) = streaming.end();
+    assert_eq!((code, errors.as_str()), (Some(0), ""), "{rest}");
+    lines.iter().map(|line| line.trim_end()).chain(rest.lines()).map(str::to_owned).collect()
+}
+
+#[test]
+fn steps_are_printed_before_the_input_has_ended() {
+    let readable = stream(&["--model", "examples/figure-4/model.json"]);
+    assert!(readable[0].starts_with("step  observation  move   action      state"), "{readable:?}");
+    assert!(
+        readable[1].starts_with("   0            0  start  -           x=0 y=0 heading=east gold=0"),
+        "{readable:?}"
+    );
+    assert_eq!(readable.last().unwrap(), "status    local");
+    assert!(readable[readable.len() - 2].starts_with("cost      48.0 = actions"), "{readable:?}");
+    let proven = stream(&["--model", "examples/figure-4/model.json", "--lookahead", "none", "--weight", "gold=2"]);
+    assert_eq!(proven.last().unwrap(), "status    optimal");
+}
+
+#[test]
+fn a_service_streams_the_same_steps_as_the_program_itself() {
+    let directory = tempfile::tempdir().unwrap();
+    let service = Process::start(&directory.path().join("etude.db"), &[]);
+    let url = format!("http://{}", service.address);
+    let json = |line: &String| serde_json::from_str::<Value>(line).unwrap();
+    let options = &["--json", "--lookahead", "3", "--weight", "gold=2", "--start", "0"][..];
+    let model = ["--model", "examples/figure-4/model.json"];
+    let here = stream(&[&model[..], options].concat());
+    let there = stream(&[&model[..], options, &["--server", &url]].concat());
+    let (done, steps) = there.split_last().unwrap();
+    assert_eq!(steps, &here[..here.len() - 1]);
+    let (done, done_here) = (json(done), json(here.last().unwrap()));
+    assert_eq!(
+        (&done["type"], &done["cost"], &done["actions"]),
+        (&"done".into(), &done_here["cost"], &done_here["actions"])
+    );
+    assert!(done["policy_id"].is_string() && done_here["policy_id"].is_null());
+    // By now it is registered under the file's name.
+    let by_name = stream(&[&["--model", "model", "--server", &url][..], options].concat());
+    assert_eq!(by_name[..by_name.len() - 1], *steps);
+
+    // Faults are told alike, but for what only a service knows.
+    for server in [&[][..], &["--server", &url]] {
+        let told = |lines: &[&str], flags: &[&str]| {
+            let mut streaming = Streaming::start(&[&model[..], flags, server].concat());
+            for line in lines {
+                streaming.write(line);
+            }
+            let (_, code, errors) = streaming.end();
+            assert_eq!(code, Some(1), "{errors}");
+            errors
+        };
+        let errors = told(&[r#"{"x": 1}"#, "", r#"{"x": "far", "speed": 1}"#], &[]);
+        assert!(errors.contains("line 3 of the input: /speed: unknown attribute"), "{errors}");
+        assert!(errors.contains("\n/x: expected a number, found \"far\""), "{errors}");
+        let errors = told(&[r#"{"x": 1}"#, "{"], &[]);
+        assert!(errors.contains("line 2 of the input: not JSON at line 1"), "{errors}");
+        assert!(told(&[], &[]).contains("nothing was observed"));
+        assert!(told(&[], &["--weight", "z=1"]).contains("/weights/z: unknown attribute"));
+    }
+    let mut unknown = Streaming::start(&["--model", "nothing", "--server", &url]);
+    unknown.write("{}");
+    let (_, code, errors) = unknown.end();
+    assert_eq!((code, errors.contains("nothing")), (Some(1), true), "{errors}");
+    service.signal("-TERM");
+}
+
+#[test]
+fn a_reader_that_leaves_ends_the_stream_quietly() {
+    let mut streaming = Streaming::start(&["--model", "examples/figure-4/model.json", "--lookahead", "1"]);
+    let mut input = streaming.input.take().unwrap();
+    drop(streaming.output);
+    // Whether the program is there to read them does not matter.
+    let _ = demonstration().iter().try_for_each(|line| writeln!(input, "{line}"));
+    drop(input);
+    let ended = streaming.child.wait_with_output().unwrap();
+    assert_eq!((ended.status.code(), text(&ended.stderr)), (Some(0), ""));
 }

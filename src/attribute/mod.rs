@@ -8,23 +8,22 @@
 //! D(o, s) = sum over observed k of  w_k * delta_k(o_k, s_k)^2        w_k >= 0
 //! ```
 //!
-//! with [`Attribute::delta`] depending on the attribute's [`Kind`]. Nothing here knows of actions or models.
+//! with [`Attribute::delta`] depending on the attribute's [`Kind`]; no term is more than [`MAX_COST`]. Nothing here knows of actions or models.
 
 mod by_attribute;
+mod labels;
 mod schema;
 mod value;
 mod weights;
 
 pub use by_attribute::ByAttribute;
+pub use labels::Labels;
 pub use schema::{AttributeDocument, KindName, Schema};
 pub use value::{Scalar, Value};
 pub use weights::Weights;
 
-use crate::document::{Faults, Place, Range};
-
-/// Largest term of a distance, and largest cost of an action. Keeps every sum along a path finite: even a hundred
-/// million of them stay below the largest float.
-pub const MAX_COST: f64 = 1e150;
+pub use crate::document::MAX_COST;
+use crate::document::{Faults, Place, Range, list_known};
 
 /// A named feature of a state.
 #[derive(Clone, Debug, PartialEq)]
@@ -33,7 +32,8 @@ pub struct Attribute {
     pub name: String,
     /// How its values are written and compared.
     pub kind: Kind,
-    /// Weight in the distance where a request names none. Finite, at least 0.
+    /// Weight in the distance where a request names none. Finite, at least 0; however large, the attribute adds at most
+    /// [`MAX_COST`] to a distance.
     pub weight: f64,
 }
 
@@ -61,8 +61,8 @@ pub enum Kind {
 pub enum Cycle {
     /// Values are numbers; the circumference is above 0.
     Period(f64),
-    /// Values are these labels, in order around the circle, one unit apart. At least 1, all different.
-    Labels(Vec<String>),
+    /// Values are these labels, in order around the circle, one unit apart.
+    Labels(Labels),
 }
 
 impl Cycle {
@@ -72,7 +72,7 @@ impl Cycle {
         match self {
             Self::Period(period) => *period,
             #[expect(clippy::cast_precision_loss, reason = "there are far fewer labels than 2^52")]
-            Self::Labels(labels) => labels.len() as f64,
+            Self::Labels(labels) => labels.names().len() as f64,
         }
     }
 }
@@ -80,18 +80,25 @@ impl Cycle {
 impl Attribute {
     /// Longest name, in characters.
     pub const MAX_NAME_CHARS: usize = 64;
+    /// Longest label, and longest string of a category, in bytes. They are repeated in every step of a policy.
+    pub const MAX_TEXT_BYTES: usize = 1024;
 
-    /// The difference between an observed and a state's value of this attribute, before weighting. Finite or
-    /// `+inf` (if numbers near the limit of floats are subtracted), at least 0.
+    /// The difference between an observed and a state's value of this attribute, before weighting. At least 0, never NaN;
+    /// `+inf` if it is beyond the range of floats.
     ///
     /// Values of another kind than the attribute's differ by 1; readers do not let them in.
     #[must_use]
     pub fn delta(&self, observed: &Value, own: &Value) -> f64 {
         match (&self.kind, observed, own) {
-            (Kind::Number { scale }, Value::Number(o), Value::Number(s)) => (o - s).abs() / scale,
+            (Kind::Number { scale }, Value::Number(o), Value::Number(s)) => {
+                let apart = (o - s).abs();
+                // Numbers near the limit of floats may be apart by more than a float, but not by more scales.
+                if apart.is_finite() { apart / scale } else { (o / scale - s / scale).abs() }
+            }
             (Kind::Cyclic { scale, cycle }, Value::Number(o), Value::Number(s)) => {
                 let period = cycle.period();
-                let along = (o - s).abs() % period;
+                // Reduced before they are subtracted, of which each may be as large as floats are.
+                let along = (o.rem_euclid(period) - s.rem_euclid(period)).abs();
                 along.min(period - along) / scale
             }
             (Kind::Cyclic { scale, cycle }, Value::Label(o), Value::Label(s)) => {
@@ -104,12 +111,14 @@ impl Attribute {
         }
     }
 
-    /// The attribute's term of the distance at weight `weight`: `weight * delta^2`, at most [`MAX_COST`].
+    /// The attribute's term of the distance at weight `weight`: `weight * delta^2`, at most [`MAX_COST`]. Finite, at least 0.
     #[must_use]
     pub fn term(&self, weight: f64, observed: &Value, own: &Value) -> f64 {
         let delta = self.delta(observed, own);
-        // Where nothing is weighed or nothing differs, an overflow of the other factor must not give NaN.
-        if weight == 0.0 || delta == 0.0 { 0.0 } else { (weight * (delta * delta)).min(MAX_COST) }
+        // Where nothing is weighed or nothing differs, an overflow of the other factor must not give NaN. Elsewhere
+        // `weight * delta` leaves the range of floats only where the whole is far beyond the cap, or next to nothing;
+        // `delta * delta` would leave it where a weight brings it back.
+        if weight == 0.0 || delta == 0.0 { 0.0 } else { (weight * delta * delta).min(MAX_COST) }
     }
 
     /// Reads a value of this attribute.
@@ -119,17 +128,13 @@ impl Attribute {
             (Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. }, _) => {
                 place.number(Range::Finite, faults).map(Value::Number)
             }
-            (Kind::Cyclic { cycle: Cycle::Labels(labels), .. }, Json::String(text)) => {
-                match labels.iter().position(|label| label == text) {
-                    #[expect(clippy::cast_possible_truncation, reason = "the schema bounds the number of labels")]
-                    Some(position) => Some(Value::Label(position as u32)),
-                    None => place.mismatch(&format!("one of the labels {}", labels.join(", ")), faults),
+            (Kind::Cyclic { cycle: Cycle::Labels(labels), .. }, value) => {
+                match value.as_str().and_then(|text| labels.position(text)) {
+                    Some(position) => Some(Value::Label(position)),
+                    None => place.mismatch(&format!("one of the labels {}", list_known(labels.names())), faults),
                 }
             }
-            (Kind::Cyclic { cycle: Cycle::Labels(labels), .. }, _) => {
-                place.mismatch(&format!("one of the labels {}", labels.join(", ")), faults)
-            }
-            (Kind::Category, Json::String(text)) => Some(Value::Text(text.as_str().into())),
+            (Kind::Category, Json::String(_)) => read_text(place, faults).map(|text| Value::Text(text.into())),
             (Kind::Category, Json::Bool(flag)) => Some(Value::Boolean(*flag)),
             (Kind::Category, Json::Number(number)) if number.is_i64() => number.as_i64().map(Value::Integer),
             (Kind::Category, _) => place.mismatch("a string, an integer or a boolean", faults),
@@ -141,7 +146,7 @@ impl Attribute {
     pub fn write_value(&self, value: &Value) -> Scalar {
         match (value, &self.kind) {
             (Value::Label(label), Kind::Cyclic { cycle: Cycle::Labels(labels), .. }) => {
-                Scalar::Text(labels[*label as usize].as_str().into())
+                Scalar::Text((&*labels.names()[*label as usize]).into())
             }
             (Value::Label(label), _) => Scalar::Integer((*label).into()),
             (Value::Number(number), _) => Scalar::number(*number),
@@ -149,6 +154,16 @@ impl Attribute {
             (Value::Integer(integer), _) => Scalar::Integer(*integer),
             (Value::Boolean(flag), _) => Scalar::Boolean(*flag),
         }
+    }
+}
+
+/// Reads a label, or a string of a category.
+fn read_text<'v>(place: &Place<'v, '_>, faults: &mut Faults) -> Option<&'v str> {
+    let text = place.string(faults)?;
+    if text.len() <= Attribute::MAX_TEXT_BYTES {
+        Some(text)
+    } else {
+        place.mismatch(&format!("a string of at most {} bytes", Attribute::MAX_TEXT_BYTES), faults)
     }
 }
 
@@ -171,7 +186,7 @@ mod tests {
     fn a_cyclic_value_differs_by_the_shorter_way_round() {
         let heading = attribute(Kind::Cyclic {
             scale: 1.0,
-            cycle: Cycle::Labels(["east", "north", "west", "south"].map(String::from).to_vec()),
+            cycle: Cycle::Labels(Labels::of(["east", "north", "west", "south"])),
         });
         let deltas: Vec<_> = (0..4).map(|label| heading.delta(&Value::Label(0), &Value::Label(label))).collect();
         assert_eq!(deltas, [0.0, 1.0, 2.0, 1.0]);
@@ -179,6 +194,40 @@ mod tests {
         let delta = degrees.delta(&Value::Number(-350.0), &Value::Number(730.0));
         assert!(delta.abs() < 1e-12, "{delta}");
         assert_eq!(degrees.delta(&Value::Number(350.0), &Value::Number(10.0)).to_bits(), 2.0_f64.to_bits());
+    }
+
+    #[test]
+    fn cyclic_values_as_large_as_floats_differ_by_less_than_their_period() {
+        let degrees = attribute(Kind::Cyclic { scale: 1.0, cycle: Cycle::Period(360.0) });
+        for (o, s) in [(f64::MAX, -f64::MAX), (-f64::MAX, 1.0), (f64::MIN_POSITIVE, -f64::MIN_POSITIVE)] {
+            let delta = degrees.delta(&Value::Number(o), &Value::Number(s));
+            assert!((0.0..=180.0).contains(&delta), "{o} and {s}: {delta}");
+        }
+    }
+
+    #[test]
+    fn a_term_is_lost_to_the_range_of_floats_only_where_it_is_beyond_it() {
+        let a = attribute(Kind::Number { scale: 1.0 });
+        let term = |weight, delta| a.term(weight, &Value::Number(delta), &Value::Number(0.0));
+        for (weight, delta, expected) in [(1e-300, 1e200, 1e100), (1e300, 1e-170, 1e-40), (3.0, 2.5, 18.75)] {
+            let term: f64 = term(weight, delta);
+            assert!((term / expected - 1.0).abs() < 1e-12, "{weight} * {delta}^2: {term}");
+        }
+        assert_eq!((term(1e300, 1e200), term(0.0, 1e200), term(1e300, 0.0)), (MAX_COST, 0.0, 0.0));
+        let wide = attribute(Kind::Number { scale: 1e308 });
+        assert_eq!(wide.delta(&Value::Number(1.5e308), &Value::Number(-1.5e308)), 3.0);
+    }
+
+    #[test]
+    fn a_value_that_is_too_long_or_unknown_is_not_repeated_at_length() {
+        let long = serde_json::Value::from("x".repeat(1_000_000));
+        let labels: Vec<String> = (0..60_000).map(|n| format!("label {n}")).collect();
+        for kind in [Kind::Category, Kind::Cyclic { scale: 1.0, cycle: Cycle::Labels(Labels::new(labels.into_iter())) }]
+        {
+            let mut faults = Faults::default();
+            assert_eq!(attribute(kind).read_value(&Place::root(&long), &mut faults), None);
+            assert!(faults.listed()[0].detail.len() < 500, "{faults}");
+        }
     }
 
     #[test]

@@ -1,12 +1,13 @@
 //! The attributes of a model, in order.
 
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Attribute, ByAttribute, Cycle, Kind, Value, Weights};
-use crate::document::{Faults, Path, Place, Range};
+use super::{Attribute, ByAttribute, Cycle, Kind, Labels, Value, Weights, read_text};
+use crate::document::{Faults, Path, Place, Quoted, Range, list_known};
 
 /// The attributes of a model, in order. Names are unique.
 #[derive(Clone, Debug, PartialEq)]
@@ -14,18 +15,19 @@ pub struct Schema {
     attributes: Vec<Attribute>,
     /// Shared copies of the names, for what is written once per step.
     names: Vec<Arc<str>>,
+    /// Where each name stands. Hashed with a seed, as clients choose the names.
+    positions: HashMap<Arc<str>, usize>,
 }
 
 impl Schema {
     /// Most attributes of a model. Distances are summed over all of them at every node of a search.
     pub const MAX_ATTRIBUTES: usize = 256;
-    /// Most labels of a cyclic attribute.
-    pub const MAX_LABELS: usize = 65_536;
 
     /// A schema of `attributes`, whose names the caller knows to differ.
     pub(crate) fn new(attributes: Vec<Attribute>) -> Self {
-        let names = attributes.iter().map(|attribute| attribute.name.as_str().into()).collect();
-        Self { attributes, names }
+        let names: Vec<Arc<str>> = attributes.iter().map(|attribute| attribute.name.as_str().into()).collect();
+        let positions = names.iter().cloned().zip(0..).collect();
+        Self { attributes, names, positions }
     }
 
     /// The attributes, in order.
@@ -49,7 +51,7 @@ impl Schema {
     /// The position of the attribute called `name`.
     #[must_use]
     pub fn position(&self, name: &str) -> Option<usize> {
-        self.attributes.iter().position(|attribute| attribute.name == name)
+        self.positions.get(name).copied()
     }
 
     /// Names `items`, one per attribute.
@@ -67,6 +69,15 @@ impl Schema {
     #[must_use]
     pub fn weights(&self) -> Weights {
         Weights::of(self.attributes.iter().map(|attribute| attribute.weight))
+    }
+
+    /// Reads weights by attribute name; those not named keep their default.
+    pub fn read_weights(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Weights> {
+        let mut weights = self.weights();
+        for (position, weight) in self.read_named_weights(place, faults)? {
+            weights.set(position, weight);
+        }
+        Some(weights)
     }
 
     /// Reads weights by attribute name: positions and weights of those that are named.
@@ -120,8 +131,8 @@ impl Schema {
     }
 
     fn note_unknown(&self, name: &str, place: &Place<'_, '_>, faults: &mut Faults) {
-        let known: Vec<&str> = self.attributes.iter().map(|attribute| attribute.name.as_str()).collect();
-        faults.note(place, format!("unknown attribute {name:?}; the model has {}", known.join(", ")));
+        let known = list_known(&self.names);
+        faults.note(place, format!("unknown attribute {}; the model has {known}", Quoted(name)));
     }
 
     /// Reads the attributes of a model: `None` for each that is faulty, so that states can still be checked
@@ -133,16 +144,15 @@ impl Schema {
             faults.note(place, detail);
             return None;
         }
-        let mut names = Vec::with_capacity(items.len());
+        let mut names = HashSet::with_capacity(items.len());
         let attributes = items.iter().enumerate().map(|(n, item)| {
             let item = place.item(n, item);
             let attribute = read_attribute(&item, faults);
-            if let Some(name) = item.value.get("name").and_then(serde_json::Value::as_str) {
-                if names.contains(&name) {
-                    let detail = format!("another attribute is called {name:?} already");
-                    faults.note_at(&Path::Member(&item.path, "name"), detail);
-                }
-                names.push(name);
+            if let Some(name) = item.value.get("name").and_then(serde_json::Value::as_str)
+                && !names.insert(name)
+            {
+                let detail = format!("another attribute is called {} already", Quoted(name));
+                faults.note_at(&Path::Member(&item.path, "name"), detail);
             }
             attribute
         });
@@ -205,22 +215,23 @@ fn read_name(place: &Place<'_, '_>, faults: &mut Faults) -> Option<String> {
     }
 }
 
-fn read_labels(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<String>> {
+fn read_labels(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Labels> {
     let items = place.array(faults)?;
-    if items.is_empty() || items.len() > Schema::MAX_LABELS {
-        return place.mismatch(&format!("1 to {} labels", Schema::MAX_LABELS), faults);
+    if items.is_empty() || items.len() > Labels::MAX_LABELS {
+        return place.mismatch(&format!("1 to {} labels", Labels::MAX_LABELS), faults);
     }
-    let mut seen = std::collections::HashSet::with_capacity(items.len());
+    let mut seen = HashSet::with_capacity(items.len());
     let mut labels = Vec::with_capacity(items.len());
     for (n, item) in items.iter().enumerate() {
         let item = place.item(n, item);
-        let Some(label) = item.string(faults) else { continue };
-        if !seen.insert(label) {
-            faults.note(&item, format!("the label {label:?} stands twice"));
+        let Some(label) = read_text(&item, faults) else { continue };
+        if seen.insert(label) {
+            labels.push(label);
+        } else {
+            faults.note(&item, format!("the label {} stands twice", Quoted(label)));
         }
-        labels.push(label.to_owned());
     }
-    (labels.len() == items.len()).then_some(labels)
+    (labels.len() == items.len()).then(|| Labels::new(labels.into_iter()))
 }
 
 /// How the values of an attribute are compared.
@@ -231,7 +242,7 @@ pub enum KindName {
     Number,
     /// `delta = min(d mod p, p - d mod p) / scale`, `d = |o - s|`, `p` the period or the number of labels.
     Cyclic,
-    /// `delta = 0` if equal, else 1.
+    /// `delta = 0` if equal, else 1. Strings have at most 1024 bytes.
     Category,
 }
 
@@ -252,10 +263,11 @@ pub struct AttributeDocument {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(exclusive_minimum = 0.0)]
     pub period: Option<f64>,
-    /// `cyclic`: the values, in order around the circle. All different.
+    /// `cyclic`: the values, in order around the circle: 1 to 65,536, each of at most 1024 bytes. All different.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub labels: Option<Vec<String>>,
-    /// Default weight in the distance. At least 0; 1 if left out.
+    /// Default weight `w` in the distance, to which the attribute adds `w * delta^2`, at most 1e150. At least 0; 1 if left
+    /// out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0.0)]
     pub weight: Option<f64>,
@@ -269,7 +281,7 @@ impl From<&Attribute> for AttributeDocument {
                 (KindName::Cyclic, Some(*scale), Some(*period), None)
             }
             Kind::Cyclic { scale, cycle: Cycle::Labels(labels) } => {
-                (KindName::Cyclic, Some(*scale), None, Some(labels.clone()))
+                (KindName::Cyclic, Some(*scale), None, Some(labels.names().iter().map(ToString::to_string).collect()))
             }
             Kind::Category => (KindName::Category, None, None, None),
         };

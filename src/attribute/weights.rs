@@ -1,6 +1,7 @@
 //! Weights of attributes in the distance.
 
-/// One weight per attribute, in schema order. Shape `[n_attributes]`; each finite and at least 0.
+/// One weight per attribute, in schema order. Shape `[n_attributes]`; each finite and at least 0. However large a
+/// weight is, a term of a distance is at most [`MAX_COST`](super::MAX_COST).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Weights(Vec<f64>);
 

@@ -16,9 +16,7 @@ pub(super) struct Client {
 impl Client {
     pub(super) fn new(base: &str) -> Result<Self, CliError> {
         let base = base.trim_end_matches('/').to_owned();
-        let http = reqwest::Client::builder().no_proxy().build();
-        let http = http.map_err(|source| CliError::Http { url: base.clone(), source })?;
-        Ok(Self { base, http })
+        Ok(Self { base, http: client()? })
     }
 
     pub(super) async fn get<T: DeserializeOwned>(&self, path: &str) -> Result<T, CliError> {
@@ -35,6 +33,11 @@ impl Client {
         let url = format!("{}{path}", self.base);
         answer(&url, self.http.post(&url).json(body)).await
     }
+}
+
+/// A client without proxies: services are asked directly.
+pub(super) fn client() -> Result<reqwest::Client, CliError> {
+    reqwest::Client::builder().no_proxy().build().map_err(|source| CliError::Http { url: String::new(), source })
 }
 
 /// Sends a request and reads the answer.

@@ -5,13 +5,12 @@ use std::net::{Ipv4Addr, SocketAddr};
 use std::path::Path;
 
 use clap::{Args, FromArgMatches};
-use reqwest::Client;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
-use super::client::answer;
-use super::{CliError, render, runtime};
+use super::client::{answer, client};
+use super::{CliError, render, runtime, side_by_side};
 use crate::config::ServeConfig;
 use crate::experiment::{CurvePlan, Scene};
 use crate::mapping::Policy;
@@ -49,8 +48,7 @@ fn config(database: &Path) -> Result<ServeConfig, CliError> {
 }
 
 async fn show(address: SocketAddr, out: &mut impl Write) -> Result<(), CliError> {
-    let client =
-        Client::builder().no_proxy().build().map_err(|source| CliError::Http { url: String::new(), source })?;
+    let client = client()?;
     let model = document(MODEL)?;
     let demonstration = document(DEMONSTRATION)?;
 
@@ -73,7 +71,15 @@ async fn show(address: SocketAddr, out: &mut impl Write) -> Result<(), CliError>
     write!(out, "{}", render::cave(&model, &demonstration, &policy))?;
     writeln!(out, "    o demonstrator   x imitator   S start   W wumpus   G gold\n")?;
     writeln!(out, "{}", render::steps(&policy))?;
-    writeln!(out, "{}", render::totals(&policy))?;
+    write!(out, "{}", render::totals(&policy))?;
+
+    writeln!(
+        out,
+        "\nPOST /v1/stream: the same while the demonstration is still running. Of what is observed, what has changed;\nof what \
+         is committed, step, move, observation, action, and whether it is proven or the lookahead was used up.\n"
+    )?;
+    side_by_side::stream(&client, &format!("http://{address}"), "figure-4", &demonstration, out).await?;
+    writeln!(out)?;
     learn(address, out).await
 }
 

@@ -3,6 +3,7 @@
 use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use clap::{Args, Subcommand};
 use jiff::Timestamp;
@@ -205,6 +206,7 @@ async fn with_database<T>(
         limits: Limits::DEFAULT,
         model_cache_bytes: 0,
         pool: PoolSettings { n_threads: 1, max_waiting: 0 },
+        session_idle_timeout: Duration::MAX,
     };
     let tasks = TaskTracker::new();
     let etude = Etude::open(&settings, &tasks, CancellationToken::new()).await;

@@ -2,7 +2,9 @@
 
 use std::fs;
 use std::io::{self, Read, Write};
+use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use clap::{Args, ValueEnum};
@@ -28,6 +30,9 @@ pub(super) struct Map {
     /// Where the imitator starts: a state's index, or a JSON object of attribute values.
     #[arg(long, value_name = "STATE", value_parser = parse_json)]
     start: Option<Value>,
+    /// Map as a stream with this lookahead would; left out: the global optimum.
+    #[arg(long, value_name = "OBSERVATIONS")]
+    lookahead: Option<u32>,
     /// What guides the search.
     #[arg(long, value_enum)]
     heuristic: Option<HeuristicArg>,
@@ -51,38 +56,31 @@ enum HeuristicArg {
 
 impl Map {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
-        let model_faults = |faults| CliError::Faults { what: self.model.display().to_string(), faults };
-        let limits = Limits { max_states: usize::MAX };
-        let definition = Definition::read(&read_json(&self.model)?, limits).map_err(model_faults)?;
-        let model = match Model::compile(&definition, limits, &mut Uninterrupted) {
-            Ok(model) => model,
-            Err(CompileError::Faults(faults)) => return Err(model_faults(faults)),
-            Err(CompileError::Cancelled(cancelled)) => return Err(cancelled.into()),
-        };
-        let mapper = Mapper::new(model);
+        let (definition, model) = read_model(&self.model)?;
+        let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
 
         let request = self.request()?;
         let mut faults = Faults::default();
         let object = Place::root(&request).object(&Request::FIELDS, &mut faults);
         let read = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
         let what = format!("the request made of {}", self.demonstration.display());
-        let Request { problem, settings, deadline } =
-            faults.check(read).map_err(|faults| CliError::Faults { what, faults })?;
+        let asked = faults.check(read).map_err(|faults| CliError::Faults { what, faults })?;
 
         let started = Instant::now();
-        let mut interrupt = || match deadline {
+        let mut interrupt = || match asked.deadline {
             Some(deadline) if started.elapsed() >= deadline => Signal::Finish,
             _ => Signal::Continue,
         };
-        let mapping = mapper.map(&problem, settings, &mut interrupt)?;
+        let mapping = asked.solve(&mapper, &mut interrupt)?;
         let stamp = Stamp {
             id: None,
             model: request["model"].as_str().unwrap_or_default().to_owned(),
             model_hash: hash_of(&definition.document().text()),
+            lookahead: asked.lookahead.map(NonZeroU32::get),
             elapsed_us: as_micros(started.elapsed()),
             ..Stamp::default()
         };
-        let policy = Policy::new(stamp, &problem, &mapping);
+        let policy = Policy::new(stamp, &asked.problem, &mapping);
         if self.json {
             serde_json::to_writer(&mut *out, &policy).map_err(io::Error::from)?;
             writeln!(out)?;
@@ -102,14 +100,20 @@ impl Map {
         let stem = || self.model.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
         request.entry("model").or_insert_with(|| stem().into());
         if !self.weights.is_empty() {
-            let weights = request.entry("weights").or_insert_with(|| json!({}));
-            for (attribute, weight) in &self.weights {
-                weights[attribute] = json!(weight);
+            let weights = request.entry("weights").or_insert(Value::Null);
+            if weights.is_null() {
+                *weights = json!({});
             }
+            let Value::Object(weights) = weights else {
+                let path = self.demonstration.display();
+                return Err(CliError::Option(format!("--weight: the `weights` of {path} are no object")));
+            };
+            weights.extend(self.weights.iter().map(|(attribute, weight)| (attribute.clone(), json!(weight))));
         }
         let heuristic = self.heuristic.and_then(|heuristic| heuristic.to_possible_value());
         let options = [
             ("start", self.start.clone()),
+            ("lookahead", self.lookahead.map(Value::from)),
             ("heuristic", heuristic.map(|heuristic| heuristic.get_name().into())),
             ("max_expansions", self.max_expansions.map(Value::from)),
             ("deadline_ms", self.deadline_ms.map(Value::from)),
@@ -123,6 +127,18 @@ fn as_micros(duration: Duration) -> u64 {
     u64::try_from(duration.as_micros()).unwrap_or(u64::MAX)
 }
 
+/// Reads and compiles a model. There is no limit but memory: nobody else is served.
+pub(super) fn read_model(path: &Path) -> Result<(Definition, Model), CliError> {
+    let model_error = |error| match error {
+        CompileError::Faults(faults) => CliError::Faults { what: path.display().to_string(), faults },
+        CompileError::Cancelled(cancelled) => cancelled.into(),
+    };
+    let limits = Limits { max_states: usize::MAX };
+    let definition = Definition::read(&read_json(path)?, limits, &mut Uninterrupted).map_err(model_error)?;
+    let model = Model::compile(&definition, limits, &mut Uninterrupted).map_err(model_error)?;
+    Ok((definition, model))
+}
+
 pub(super) fn read_json(path: &Path) -> Result<Value, CliError> {
     let read = if path == Path::new("-") {
         let mut text = Vec::new();
@@ -134,12 +150,12 @@ pub(super) fn read_json(path: &Path) -> Result<Value, CliError> {
     document::parse(&text).map_err(|source| CliError::Parse { path: path.to_owned(), source })
 }
 
-fn parse_weight(text: &str) -> Result<(String, f64), String> {
+pub(super) fn parse_weight(text: &str) -> Result<(String, f64), String> {
     let (attribute, weight) = text.rsplit_once('=').ok_or("expected ATTRIBUTE=WEIGHT")?;
     let weight: f64 = weight.parse().map_err(|_| format!("expected a number, found {weight:?}"))?;
     if weight.is_finite() { Ok((attribute.to_owned(), weight)) } else { Err("expected a finite number".to_owned()) }
 }
 
-fn parse_json(text: &str) -> Result<Value, String> {
+pub(super) fn parse_json(text: &str) -> Result<Value, String> {
     document::parse(text.as_bytes()).map_err(|error| error.to_string())
 }

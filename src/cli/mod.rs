@@ -9,6 +9,9 @@ mod map;
 mod openapi;
 mod render;
 mod serve;
+mod side_by_side;
+mod stream;
+mod stream_client;
 
 use std::error::Error;
 use std::io;
@@ -38,6 +41,9 @@ enum Command {
     Serve(serve::Serve),
     /// Map a demonstration from files, without a service.
     Map(map::Map),
+    /// Map a demonstration while it is still running: observations from standard input, one JSON line each; steps to
+    /// standard output.
+    Stream(stream::Stream),
     /// Start a service, send it the demonstration of figure 4, and show what comes back.
     Demo,
     /// Check, export and import learners.
@@ -97,6 +103,12 @@ enum CliError {
     /// A figure could not be drawn.
     #[error(transparent)]
     Plot(#[from] crate::experiment::plot::PlotError),
+    /// A line of the input is not an observation.
+    #[error("line {line} of the input: {problem}")]
+    Line { line: u64, problem: String },
+    /// A stream ended without a policy.
+    #[error("the stream ended without a policy: {0}")]
+    Stream(String),
     /// Input or output failed.
     #[error(transparent)]
     Io(#[from] io::Error),
@@ -114,6 +126,7 @@ pub fn run() -> ExitCode {
     let done = start_logging(&log, default_filter).map_err(CliError::from).and_then(|()| match command {
         Command::Serve(serve) => serve.run(),
         Command::Map(map) => map.run(&mut io::stdout().lock()),
+        Command::Stream(stream) => stream.run(&mut io::stdout()),
         Command::Demo => demo::run(&mut io::stdout()),
         Command::Experiment(experiment) => experiment.run(&mut io::stdout().lock()),
         Command::Learner(learner) => learner.run(&mut io::stdout().lock()),

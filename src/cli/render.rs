@@ -5,7 +5,8 @@ use std::fmt::Write;
 use comfy_table::{CellAlignment, ContentArrangement, Table, TableComponent, presets};
 use serde_json::Value;
 
-use crate::mapping::{MoveKind, Policy, Step};
+use crate::attribute::{ByAttribute, Scalar};
+use crate::mapping::{Cost, MoveKind, Policy, Step};
 
 /// The steps of a policy as a table: observation, move, action, state, distance, cost. Of a state, the attributes that
 /// have weight.
@@ -22,7 +23,7 @@ pub(super) fn steps(policy: &Policy) -> Table {
             step.observation.to_string(),
             name(step.kind).to_owned(),
             step.action.as_deref().unwrap_or("-").to_owned(),
-            state(policy, step),
+            state(Some(&policy.weights), &step.state),
             decimal(step.distance),
             decimal(step.cost),
         ]);
@@ -43,11 +44,9 @@ pub(super) fn totals(policy: &Policy) -> String {
     #[expect(clippy::cast_precision_loss, reason = "a time that is shown to three digits")]
     let elapsed_ms = search.elapsed_us as f64 / 1000.0;
     format!(
-        "cost      {} = actions {} + distance {}\nstatus    {}, {bound}\ncoverage  {} of {} observations met exactly\nsearch    \
+        "{}status    {}, {bound}\ncoverage  {} of {} observations met exactly\nsearch    \
          {} nodes expanded, {} generated, {elapsed_ms:.2} ms\n",
-        decimal(cost.total),
-        decimal(cost.actions),
-        decimal(cost.distance),
+        self::cost(cost),
         policy.status.name(),
         coverage.exact,
         coverage.observed,
@@ -56,7 +55,13 @@ pub(super) fn totals(policy: &Policy) -> String {
     )
 }
 
-fn name(kind: MoveKind) -> &'static str {
+/// The line of a cost.
+pub(super) fn cost(cost: &Cost) -> String {
+    let Cost { total, actions, distance, .. } = cost;
+    format!("cost      {} = actions {} + distance {}\n", decimal(*total), decimal(*actions), decimal(*distance))
+}
+
+pub(super) fn name(kind: MoveKind) -> &'static str {
     match kind {
         MoveKind::Start => "start",
         MoveKind::Match => "match",
@@ -65,14 +70,15 @@ fn name(kind: MoveKind) -> &'static str {
     }
 }
 
-fn state(policy: &Policy, step: &Step) -> String {
-    let weighs = |name: &str| policy.weights.get(name).is_some_and(|weight| *weight > 0.0);
-    let shown = step.state.iter().filter(|(name, _)| weighs(name));
+/// The attributes of a state that have weight; all, if weights are not known.
+pub(super) fn state(weights: Option<&ByAttribute<f64>>, state: &ByAttribute<Scalar>) -> String {
+    let weighs = |name: &str| weights.is_none_or(|weights| weights.get(name).is_some_and(|weight| *weight > 0.0));
+    let shown = state.iter().filter(|(name, _)| weighs(name));
     shown.map(|(name, value)| format!("{name}={value}")).collect::<Vec<_>>().join(" ")
 }
 
 /// A cost with one decimal at least and six at most.
-fn decimal(cost: f64) -> String {
+pub(super) fn decimal(cost: f64) -> String {
     let text = format!("{cost:.6}");
     let text = text.trim_end_matches('0');
     if text.ends_with('.') { format!("{text}0") } else { text.to_owned() }

@@ -14,11 +14,15 @@ pub(super) struct Serve {
 
 impl Serve {
     pub(super) fn run(&self) -> Result<(), CliError> {
-        runtime()?.block_on(async {
+        let runtime = runtime()?;
+        let served = runtime.block_on(async {
             // Listened for before anything is started, so that no signal is missed.
             let stop = stop_signal()?;
             let server = Server::start(&self.config).await?;
             Ok(server.run(stop).await?)
-        })
+        });
+        // A job that does not look up must not keep the process: the store is closed, and nobody waits any more.
+        runtime.shutdown_background();
+        served
     }
 }

@@ -54,9 +54,9 @@ impl Local {
 
     fn mapper(&mut self, scene: &Scene) -> Result<&Mapper, LocalError> {
         if !self.mappers.contains_key(scene.name()) {
-            let definition = Definition::read(scene.model(), Limits::DEFAULT)?;
+            let definition = Definition::read(scene.model(), Limits::DEFAULT, &mut Uninterrupted)?;
             let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted)?;
-            self.mappers.insert(scene.name(), Mapper::new(model));
+            self.mappers.insert(scene.name(), Mapper::new(model, &mut Uninterrupted)?);
         }
         self.mappers.get(scene.name()).ok_or_else(|| LocalError::Unknown(scene.name().to_owned()))
     }

@@ -2,6 +2,7 @@
 
 use serde_json::Value;
 
+use crate::interrupt::Uninterrupted;
 use crate::model::{Act, Cave, Cell, Definition, Limits};
 use crate::world::{Outcome, Rewards, WumpusWorld};
 
@@ -48,7 +49,7 @@ impl Scene {
     fn new(name: &'static str, model: &str, demonstration: &str) -> Self {
         let parse = |text| serde_json::from_str::<Value>(text).expect("examples are JSON");
         let model = parse(model);
-        let Ok(Definition::Wumpus(cave)) = Definition::read(&model, Limits::DEFAULT) else {
+        let Ok(Definition::Wumpus(cave)) = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted) else {
             unreachable!("the examples of figures are caves");
         };
         Self { name, model, demonstration: parse(demonstration), world: WumpusWorld::new(cave, Rewards::PAPER) }

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use axum::body::{Body, Bytes};
 use axum::extract::Request;
-use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE};
+use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, EXPECT};
 use axum::http::{HeaderMap, HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt;
@@ -24,10 +24,14 @@ pub(super) async fn read_json(request: Request, limit: usize) -> Result<Bytes, P
     let is_json = is_json(request.headers());
     let announced =
         request.headers().get(CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
+    let expects_leave = request.headers().contains_key(EXPECT);
     let body = request.into_body();
     let read = async {
         if announced.is_some_and(|length| length > limit) {
-            discard(body, limit).await;
+            // Whoever asks for leave to send gets the answer instead.
+            if !expects_leave {
+                discard(body, limit).await;
+            }
             return Err(too_large(limit));
         }
         let bytes = read(body, limit).await?;

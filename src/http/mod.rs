@@ -17,6 +17,7 @@ mod paging;
 mod path;
 mod policies;
 mod problem;
+mod stream;
 mod trials;
 
 use std::sync::Arc;
@@ -24,12 +25,15 @@ use std::sync::Arc;
 use axum::Router;
 use axum::middleware;
 use metrics_exporter_prometheus::PrometheusHandle;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 use utoipa::OpenApi;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::service::Etude;
+use crate::stream::Limits;
 use problem::{Problem, ProblemKind};
 
 /// What handlers work with.
@@ -43,6 +47,23 @@ pub struct Context {
     pub max_body_bytes: usize,
     /// Renders what was measured.
     pub metrics: PrometheusHandle,
+    /// What a stream may use.
+    pub stream_limits: Limits,
+    /// One for each stream that may run.
+    pub stream_places: Arc<Semaphore>,
+    /// The streams that run.
+    pub streams: TaskTracker,
+}
+
+impl Context {
+    /// A place for one more stream, until it is dropped.
+    fn admit_stream(&self) -> Result<OwnedSemaphorePermit, Problem> {
+        if self.stopping.is_cancelled() {
+            return Err(Problem::new(ProblemKind::Stopping, "the service is shutting down"));
+        }
+        let place = Arc::clone(&self.stream_places).try_acquire_owned();
+        place.map_err(|_| Problem::new(ProblemKind::Busy, "as many streams run as may"))
+    }
 }
 
 #[derive(OpenApi)]
@@ -58,6 +79,7 @@ pub struct Context {
     tags(
         (name = "models", description = "What a body can do in its world"),
         (name = "policies", description = "Demonstration in, policy out"),
+        (name = "streams", description = "Policy steps while the demonstration is still running"),
         (name = "learners", description = "Which attributes matter, learned from rewards"),
         (name = "trials", description = "Weights drawn from a learner, the policy that they gave, and the reward that it earned"),
         (name = "operation", description = "Health and measurements"),
@@ -67,11 +89,19 @@ pub struct Context {
 struct Description;
 
 fn routes() -> OpenApiRouter<Context> {
-    OpenApiRouter::with_openapi(Description::openapi())
+    let mut description = Description::openapi();
+    // Taken from Cargo.toml, which names none.
+    description.info.license = None;
+    let protocol = include_str!("../stream/protocol.md");
+    description.info.description = description.info.description.map(|text| format!("{text}\n\n{protocol}"));
+    OpenApiRouter::with_openapi(description)
         .routes(routes!(models::put_model, models::get_model, models::delete_model))
         .routes(routes!(models::list_models))
         .routes(routes!(policies::make_policy, policies::list_policies))
         .routes(routes!(policies::get_policy))
+        .routes(routes!(stream::websocket, stream::ndjson))
+        .routes(routes!(stream::list_sessions))
+        .routes(routes!(stream::get_session))
         .routes(routes!(learners::put_learner, learners::get_learner, learners::delete_learner))
         .routes(routes!(learners::list_learners))
         .routes(routes!(learners::get_weights))

@@ -123,6 +123,7 @@ pub(super) async fn put_model(
     responses(
         (status = 200, description = "The model", body = WholeModelBody),
         (status = 404, description = "`unknown-model`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn get_model(State(context): State<Context>, PathName(name): PathName) -> Result<Response, Problem> {
@@ -151,6 +152,7 @@ pub(super) async fn list_models(State(context): State<Context>, paging: Paging) 
     responses(
         (status = 204, description = "It is deleted"),
         (status = 404, description = "`unknown-model`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn delete_model(

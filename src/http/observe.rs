@@ -23,6 +23,7 @@ const MAX_REQUEST_ID_BYTES: usize = 64;
 pub(super) async fn observe(request: Request, next: Next) -> Response {
     let id = request_id(request.headers());
     let route = request.extensions().get::<MatchedPath>().map_or("(none)", MatchedPath::as_str).to_owned();
+    let is_probe = matches!(route.as_str(), "/livez" | "/readyz" | "/metrics");
     let method = request.method().clone();
     let span = tracing::info_span!("request", request_id = %id, %method, path = request.uri().path());
     let mut unanswered = Unanswered { span: span.clone(), started: Instant::now(), is_answered: false };
@@ -51,7 +52,14 @@ pub(super) async fn observe(request: Request, next: Next) -> Response {
     metrics::counter!("etude_http_requests_total", &labels).increment(1);
     metrics::histogram!("etude_http_request_duration_seconds", &labels).record(elapsed.as_secs_f64());
     let elapsed_us = u64::try_from(elapsed.as_micros()).unwrap_or(u64::MAX);
-    span.in_scope(|| tracing::info!(status, elapsed_us, "answered"));
+    span.in_scope(|| {
+        // Asked every few seconds by machines, these would drown the rest.
+        if is_probe && response.status().is_success() {
+            tracing::debug!(status, elapsed_us, "answered");
+        } else {
+            tracing::info!(status, elapsed_us, "answered");
+        }
+    });
     response
 }
 

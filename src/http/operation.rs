@@ -25,15 +25,17 @@ pub(super) async fn livez() -> &'static str {
     get, path = "/readyz", tag = "operation",
     responses(
         (status = 200, description = "They should", body = String, content_type = "text/plain"),
-        (status = 500, description = "`internal`: the database does not answer", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "`stopping`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`not-ready`: the database does not answer; `stopping`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn readyz(State(context): State<Context>) -> Result<&'static str, Problem> {
     if context.stopping.is_cancelled() {
         return Err(Problem::new(ProblemKind::Stopping, "the service is shutting down"));
     }
-    context.etude.check().await.map_err(crate::service::ServiceError::Store)?;
+    context.etude.check().await.map_err(|error| {
+        tracing::warn!(error = &error as &dyn std::error::Error, "not ready");
+        Problem::new(ProblemKind::NotReady, "the database does not answer")
+    })?;
     Ok("ready\n")
 }
 

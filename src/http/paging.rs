@@ -72,6 +72,14 @@ impl Paging {
     }
 }
 
+/// Where a page begins in a list that is ordered by sequence numbers.
+pub(super) fn after_sequence(paging: &Paging) -> Result<i64, Problem> {
+    match &paging.after {
+        Some(after) => after.parse().map_err(|_| Faults::one("/after", "expected the `next` of a page").into()),
+        None => Ok(0),
+    }
+}
+
 /// A part of a list.
 #[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
 pub(super) struct List<T> {

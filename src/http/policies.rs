@@ -10,10 +10,9 @@ use jiff::Timestamp;
 
 use super::Context;
 use super::body::{json, json_text, read_json};
-use super::paging::{List, Paging};
+use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::Problem;
-use crate::document::Faults;
 use crate::mapping::{Policy, PolicySummary, RequestDocument};
 
 /// Follow a demonstration: the policy whose effects come closest to it, stored.
@@ -66,10 +65,6 @@ pub(super) async fn get_policy(State(context): State<Context>, PathId(id): PathI
     ),
 )]
 pub(super) async fn list_policies(State(context): State<Context>, paging: Paging) -> Result<Response, Problem> {
-    let after = match &paging.after {
-        Some(after) => after.parse().map_err(|_| Faults::one("/after", "expected the `next` of a page"))?,
-        None => 0,
-    };
-    let page = context.etude.policies(after, paging.limit).await?;
+    let page = context.etude.policies(after_sequence(&paging)?, paging.limit).await?;
     Ok(json(StatusCode::OK, &List::of(page, |policy| policy)))
 }

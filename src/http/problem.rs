@@ -10,6 +10,7 @@ use utoipa::ToSchema;
 
 use crate::document::{Fault, Faults, ParseError};
 use crate::service::{self, PoolError, ServiceError};
+use crate::store::StoreError;
 
 /// What kind of problem it is: its `type`, title and status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,6 +21,7 @@ pub(super) enum ProblemKind {
     UnknownModel,
     UnknownPolicy,
     UnknownLearner,
+    UnknownSession,
     UnknownTrial,
     UnknownVersion,
     MethodNotAllowed,
@@ -32,6 +34,7 @@ pub(super) enum ProblemKind {
     Invalid,
     Internal,
     Busy,
+    NotReady,
     Stopping,
 }
 
@@ -45,6 +48,7 @@ impl ProblemKind {
             Self::UnknownModel => ("unknown-model", "There is no such model", StatusCode::NOT_FOUND),
             Self::UnknownPolicy => ("unknown-policy", "There is no such policy", StatusCode::NOT_FOUND),
             Self::UnknownLearner => ("unknown-learner", "There is no such learner", StatusCode::NOT_FOUND),
+            Self::UnknownSession => ("unknown-session", "There is no such session", StatusCode::NOT_FOUND),
             Self::UnknownTrial => ("unknown-trial", "There is no such trial", StatusCode::NOT_FOUND),
             Self::UnknownVersion => ("unknown-version", "There is no such version", StatusCode::NOT_FOUND),
             Self::MethodNotAllowed => {
@@ -61,6 +65,7 @@ impl ProblemKind {
             Self::Invalid => ("invalid", "The request has faults", StatusCode::UNPROCESSABLE_ENTITY),
             Self::Internal => ("internal", "Something went wrong here", StatusCode::INTERNAL_SERVER_ERROR),
             Self::Busy => ("busy", "Too many requests are waiting", StatusCode::SERVICE_UNAVAILABLE),
+            Self::NotReady => ("not-ready", "The database cannot be used now", StatusCode::SERVICE_UNAVAILABLE),
             Self::Stopping => ("stopping", "The service is shutting down", StatusCode::SERVICE_UNAVAILABLE),
         }
     }
@@ -156,6 +161,7 @@ impl From<ServiceError> for Problem {
                 let problem = match kind {
                     "policy" => ProblemKind::UnknownPolicy,
                     "learner" => ProblemKind::UnknownLearner,
+                    "session" => ProblemKind::UnknownSession,
                     "trial" => ProblemKind::UnknownTrial,
                     _ => ProblemKind::UnknownModel,
                 };
@@ -167,7 +173,10 @@ impl From<ServiceError> for Problem {
             ServiceError::AlreadyRewarded { .. } => Self::new(ProblemKind::AlreadyRewarded, detail),
             ServiceError::TrialFailed { .. } => Self::new(ProblemKind::TrialFailed, detail),
             ServiceError::Pool(PoolError::Busy) => Self::new(ProblemKind::Busy, detail),
-            ServiceError::Pool(PoolError::Stopped) => Self::new(ProblemKind::Stopping, detail),
+            ServiceError::Store(StoreError::Locked) => Self::new(ProblemKind::NotReady, detail),
+            ServiceError::Store(StoreError::Closed) | ServiceError::Pool(PoolError::Stopped) => {
+                Self::new(ProblemKind::Stopping, detail)
+            }
             ServiceError::Pool(PoolError::Panicked) | ServiceError::Store(_) | ServiceError::Write(_) => {
                 // The client gets nothing but its request id, under which the log has the rest.
                 tracing::error!(error = &error as &dyn Error, "a request failed");

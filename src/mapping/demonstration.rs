@@ -38,6 +38,19 @@ impl Demonstration {
         self.values.len() / self.n_attributes
     }
 
+    /// A demonstration of these observations, each of shape `[n_attributes]`. `None` if there are none.
+    #[must_use]
+    pub fn of(observations: impl IntoIterator<Item = Vec<Option<Value>>>) -> Option<Self> {
+        let mut observations = observations.into_iter().peekable();
+        let n_attributes = observations.peek()?.len();
+        Some(Self { values: observations.flatten().collect(), n_attributes })
+    }
+
+    /// The observations, in order.
+    pub fn iter(&self) -> impl Iterator<Item = &[Option<Value>]> {
+        self.values.chunks_exact(self.n_attributes)
+    }
+
     /// The observation at `index`. Shape `[n_attributes]`.
     #[must_use]
     pub fn observation(&self, index: usize) -> &[Option<Value>] {

@@ -64,7 +64,8 @@ impl<'m> Distances<'m> {
     #[inline]
     pub(crate) fn distance(&self, observation: usize, state: StateIdx) -> f64 {
         let row = self.states.row(state);
-        self.active.iter().map(|active| active.term(observation, row[active.position])).sum()
+        // Not `sum`, of which nothing is -0.
+        self.active.iter().fold(0.0, |sum, active| sum + active.term(observation, row[active.position]))
     }
 
     /// The terms of `D(o_i, s)`, in schema order; attributes that take no part are left out.
@@ -104,6 +105,41 @@ impl ActiveAttribute<'_> {
             let terms = self.domain.iter().map(|own| self.attribute.term(self.weight, observed, own));
             self.table.extend(terms);
         }
+    }
+}
+
+/// Weighted terms of the distance of a single observation.
+#[derive(Debug)]
+pub(crate) struct ObservedDistances {
+    /// Positions of the attributes that were observed and weigh something, ascending, with their terms by the state's
+    /// value. Shape `[domain size]` each.
+    terms: Vec<(usize, Vec<f64>)>,
+}
+
+impl ObservedDistances {
+    pub(crate) fn new(schema: &Schema, states: &States, observation: &[Option<Value>], weights: &Weights) -> Self {
+        let weighted = schema.attributes().iter().zip(weights.as_slice()).zip(observation).enumerate();
+        let terms =
+            weighted.filter(|(_, ((_, weight), _))| **weight > 0.0).filter_map(|(position, (weighted, observed))| {
+                let (attribute, weight) = weighted;
+                let observed = observed.as_ref()?;
+                let terms = states.domain(position).iter().map(|own| attribute.term(*weight, observed, own));
+                Some((position, terms.collect()))
+            });
+        Self { terms: terms.collect() }
+    }
+
+    /// `D(o, s)`: the same float as [`Distances::distance`] gives.
+    #[inline]
+    pub(crate) fn distance(&self, states: &States, state: StateIdx) -> f64 {
+        let row = states.row(state);
+        self.terms.iter().fold(0.0, |sum, (position, terms)| sum + terms[row[*position] as usize])
+    }
+
+    /// The terms of `D(o, s)`, in schema order; attributes that take no part are left out.
+    pub(crate) fn terms(&self, states: &States, state: StateIdx) -> impl Iterator<Item = (usize, f64)> {
+        let row = states.row(state);
+        self.terms.iter().map(move |(position, terms)| (*position, terms[row[*position] as usize]))
     }
 }
 

@@ -34,12 +34,15 @@ impl Default for Budget {
 }
 
 /// How a mapping is searched for.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Settings {
     /// What guides the search.
     pub heuristic: HeuristicName,
     /// What it may spend.
     pub budget: Budget,
+    /// The cost of a mapping that is known already: nothing that costs more is looked at. Has no effect with the paper's
+    /// heuristic.
+    pub upper_bound: Option<f64>,
 }
 
 /// What was proven of a mapping.
@@ -92,10 +95,13 @@ pub struct Mapper {
 
 impl Mapper {
     /// Prepares `model`. Takes time and memory proportional to its states and transitions times attributes.
-    #[must_use]
-    pub fn new(model: Model) -> Self {
-        let projections = Projections::new(&model);
-        Self { model, projections }
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
+    pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
+        let projections = Projections::new(&model, interrupt)?;
+        Ok(Self { model, projections })
     }
 
     /// The model.
@@ -127,16 +133,18 @@ impl Mapper {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
         assert!(std::ptr::eq(problem.model, &raw const self.model), "the problem must be of this mapper's model");
-        let budget = settings.budget;
+        let Settings { budget, upper_bound, .. } = settings;
+        // Sums in another order may be a little larger.
+        let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + ROUNDING));
         match settings.heuristic {
             HeuristicName::Default => match Projected::solve(&self.projections, problem, interrupt)? {
-                Some(projected) => admissible(problem, &projected, budget, interrupt),
+                Some(projected) => admissible(problem, &projected, budget, most_f, interrupt),
                 // No time for the estimate, so none for a search either.
-                None => admissible(problem, &Blind, Budget { max_expansions: 0, ..budget }, &mut Uninterrupted),
+                None => admissible(problem, &Blind, Budget { max_expansions: 0, ..budget }, most_f, &mut Uninterrupted),
             },
-            HeuristicName::None => admissible(problem, &Blind, budget, interrupt),
+            HeuristicName::None => admissible(problem, &Blind, budget, most_f, interrupt),
             HeuristicName::Paper => {
-                let found = search(problem, &Paper::new(problem), budget, interrupt)?;
+                let found = search(problem, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, problem.start);
                 Ok(match Projected::solve(&self.projections, problem, interrupt)? {
@@ -151,21 +159,23 @@ impl Mapper {
     }
 }
 
+/// Sums in different orders may differ by rounding; what is closer than this, relatively, is the same.
+const ROUNDING: f64 = 1e-12;
+
 fn admissible<H: Heuristic>(
     problem: &Problem<'_>,
     heuristic: &H,
     budget: Budget,
+    most_f: f64,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Mapping, Cancelled> {
-    let found = search(problem, heuristic, budget, interrupt)?;
+    let found = search(problem, heuristic, budget, most_f, interrupt)?;
     let lower_bound = if found.is_complete { f64::INFINITY } else { found.least_f };
     Ok(conclude(problem, heuristic, found, lower_bound))
 }
 
 /// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than `lower_bound`.
 fn conclude<H: Heuristic>(problem: &Problem<'_>, heuristic: &H, found: Found, lower_bound: f64) -> Mapping {
-    /// Sums in different orders may differ by rounding; what is closer than this, relatively, is the same.
-    const ROUNDING: f64 = 1e-12;
     let Found { paths, is_complete, n_expanded, n_generated, .. } = found;
     let completed = paths.into_iter().flat_map(|path| {
         let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };

@@ -22,6 +22,8 @@
 //! Mapping (moves, status, lower bound, counts) --> Policy (what a client gets)
 //! ```
 //!
+//! [`OnlineMapping`] does the same while the demonstration is still running.
+//!
 //! **Ties.** Among mappings of equal cost the search returns the one that it reaches first, which is determined: it
 //! expands nodes in the order of `f`, then the later observation, then the most recently found; keeps the first way found
 //! to a node at its least cost; and finds successors in the order `skip`, then by action `match` before `extra`.
@@ -33,6 +35,7 @@ mod demonstration;
 mod distances;
 mod heuristic;
 mod mapper;
+mod online;
 mod policy;
 mod problem;
 mod request;
@@ -42,7 +45,10 @@ pub use cost::Cost;
 pub use demonstration::Demonstration;
 pub use heuristic::HeuristicName;
 pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
+pub use online::{CommittedStep, OnlineMapping};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step};
 pub use problem::Problem;
-pub use request::{ObservationDocument, ObservedDocument, Request, RequestDocument, StartReference};
+pub use request::{
+    ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,
+};
 pub use search::{Move, MoveKind};

@@ -6,8 +6,9 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::cost::{Cost, CostSum};
-use super::{Mapping, MoveKind, Problem, Status};
+use super::{Mapping, Move, MoveKind, Problem, Status};
 use crate::attribute::{ByAttribute, Scalar};
+use crate::model::Model;
 
 /// What produced a policy, as far as its problem and mapping do not tell.
 #[derive(Clone, Debug, Default)]
@@ -18,6 +19,10 @@ pub struct Stamp {
     pub model: String,
     /// Hash of the model's content.
     pub model_hash: String,
+    /// How many observations past the current one a decision could wait for; `None`: all.
+    pub lookahead: Option<u32>,
+    /// The policy that this one refines, if any.
+    pub refines: Option<String>,
     /// The learner whose weights were used, if any.
     pub learner: Option<String>,
     /// The version of the learner's weights.
@@ -61,6 +66,10 @@ pub struct Policy {
     pub coverage: Coverage,
     /// What the search took.
     pub search: SearchReport,
+    /// The policy, decided by a finite lookahead, of which this is the global optimum.
+    pub refines: Option<String>,
+    /// The global optimum, found in the background, of what a finite lookahead decided here.
+    pub refined_by: Option<String>,
 }
 
 /// A policy without its steps, as in lists.
@@ -91,6 +100,10 @@ pub struct PolicySummary<'p> {
     pub coverage: Coverage,
     /// What the search took.
     pub search: SearchReport,
+    /// The policy, decided by a finite lookahead, of which this is the global optimum.
+    pub refines: Option<&'p str>,
+    /// The global optimum, found in the background, of what a finite lookahead decided here.
+    pub refined_by: Option<&'p str>,
 }
 
 impl<'p> PolicySummary<'p> {
@@ -110,6 +123,8 @@ impl<'p> PolicySummary<'p> {
             lower_bound: policy.lower_bound,
             coverage: policy.coverage,
             search: policy.search,
+            refines: policy.refines.as_deref(),
+            refined_by: policy.refined_by.as_deref(),
         }
     }
 }
@@ -182,7 +197,7 @@ impl Policy {
             learner: stamp.learner,
             weights_version: stamp.weights_version,
             weights: problem.model.schema().by_attribute(problem.weights.as_slice().iter().copied()),
-            lookahead: None,
+            lookahead: stamp.lookahead,
             status: mapping.status,
             cost: mapping.cost,
             lower_bound: mapping.lower_bound,
@@ -197,24 +212,44 @@ impl Policy {
                 generated: mapping.n_generated,
                 elapsed_us: stamp.elapsed_us,
             },
+            refines: stamp.refines,
+            refined_by: None,
         }
     }
 }
 
 fn steps(problem: &Problem<'_>, mapping: &Mapping) -> Vec<Step> {
-    let (model, schema) = (problem.model, problem.model.schema());
-    let mut sum = CostSum::default();
-    let moves = mapping.moves.iter().zip(0..);
-    let steps = moves.map(|(step, number)| {
+    let mut writer = StepWriter::default();
+    let steps = mapping.moves.iter().map(|step| {
+        let terms = problem.distances.terms(step.observation as usize, step.state);
+        writer.write(problem.model, step, terms)
+    });
+    steps.collect()
+}
+
+/// Writes the steps of a policy, one after the other.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct StepWriter {
+    sum: CostSum,
+    cost: Cost,
+    n_steps: u32,
+}
+
+impl StepWriter {
+    /// The next step, given the terms of its distance.
+    pub(super) fn write(&mut self, model: &Model, step: &Move, terms: impl Iterator<Item = (usize, f64)>) -> Step {
+        let schema = model.schema();
         let action_cost = step.action.map_or(0.0, |action| model.action(action).cost);
-        let i = step.observation as usize;
-        let distance = problem.distances.distance(i, step.state);
-        let mut terms = vec![None; schema.len()];
-        for (position, term) in problem.distances.terms(i, step.state).filter(|(_, term)| *term > 0.0) {
-            terms[position] = Some(term);
+        let mut distance = 0.0;
+        let mut by_attribute = vec![None; schema.len()];
+        for (position, term) in terms.filter(|(_, term)| *term > 0.0) {
+            distance += term;
+            by_attribute[position] = Some(term);
         }
+        self.cost = self.sum.add(action_cost, distance);
+        self.n_steps += 1;
         Step {
-            step: number,
+            step: self.n_steps - 1,
             observation: step.observation,
             kind: step.kind,
             action: step.action.map(|action| model.action_name(action)),
@@ -222,9 +257,13 @@ fn steps(problem: &Problem<'_>, mapping: &Mapping) -> Vec<Step> {
             state_index: step.state,
             action_cost,
             distance,
-            distance_by_attribute: schema.by_some_attributes(terms),
-            cost: sum.add(action_cost, distance).total,
+            distance_by_attribute: schema.by_some_attributes(by_attribute),
+            cost: self.cost.total,
         }
-    });
-    steps.collect()
+    }
+
+    /// What the steps cost so far.
+    pub(super) fn cost(&self) -> Cost {
+        self.cost
+    }
 }

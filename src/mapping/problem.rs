@@ -22,12 +22,26 @@ impl<'m> Problem<'m> {
     #[must_use]
     pub fn new(model: &'m Model, demonstration: Demonstration, weights: Weights, start: Option<StateIdx>) -> Self {
         let distances = Distances::new(model.schema(), model.states(), &demonstration, &weights);
-        let start = start.unwrap_or_else(|| match model.start() {
-            Start::State(state) => *state,
-            Start::Candidates(candidates) => closest(&distances, candidates.iter().copied()),
-            Start::Any => closest(&distances, (0..model.states().len()).filter(|state| !model.is_unsafe(*state))),
-        });
+        let start = start.unwrap_or_else(|| choose_start(model, |state| distances.distance(0, state)));
         Self { model, demonstration, weights, start, distances }
+    }
+
+    /// The demonstration.
+    #[must_use]
+    pub fn demonstration(&self) -> &Demonstration {
+        &self.demonstration
+    }
+
+    /// The weights of the distance.
+    #[must_use]
+    pub fn weights(&self) -> &Weights {
+        &self.weights
+    }
+
+    /// Where the imitator starts, `s_0`.
+    #[must_use]
+    pub fn start(&self) -> StateIdx {
+        self.start
     }
 
     /// Index of the last observation, `n`.
@@ -41,8 +55,17 @@ impl<'m> Problem<'m> {
     }
 }
 
-fn closest(distances: &Distances<'_>, candidates: impl Iterator<Item = StateIdx>) -> StateIdx {
-    let measured = candidates.map(|state| (distances.distance(0, state), state));
+/// `s_0` where the request names none, given the distances to `o_0`.
+pub(super) fn choose_start(model: &Model, distance: impl Fn(StateIdx) -> f64) -> StateIdx {
+    match model.start() {
+        Start::State(state) => *state,
+        Start::Candidates(candidates) => closest(candidates.iter().copied(), distance),
+        Start::Any => closest((0..model.states().len()).filter(|state| !model.is_unsafe(*state)), distance),
+    }
+}
+
+fn closest(candidates: impl Iterator<Item = StateIdx>, distance: impl Fn(StateIdx) -> f64) -> StateIdx {
+    let measured = candidates.map(|state| (distance(state), state));
     let closest = measured.min_by(|(d, state), (other_d, other)| d.total_cmp(other_d).then(state.cmp(other)));
     // Readers of models see to it that there is a candidate.
     closest.map_or(0, |(_, state)| state)

@@ -1,14 +1,17 @@
 //! What a client asks for: a demonstration, and how it is to be followed.
 
 use std::collections::BTreeMap;
+use std::num::NonZeroU32;
+use std::sync::Arc;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Budget, Demonstration, HeuristicName, Problem, Settings};
+use super::{Budget, Demonstration, HeuristicName, Mapper, Mapping, OnlineMapping, Problem, Settings};
 use crate::attribute::{Scalar, Weights};
 use crate::document::{Faults, Object, Place};
+use crate::interrupt::{Cancelled, Interrupt};
 use crate::model::{Model, StateIdx};
 
 /// A request for a policy, checked against its model.
@@ -18,6 +21,8 @@ pub struct Request<'m> {
     pub problem: Problem<'m>,
     /// How.
     pub settings: Settings,
+    /// How many observations past the current one a decision may wait for; `None` for all.
+    pub lookahead: Option<NonZeroU32>,
     /// How long it may take, counted from when the request arrived.
     pub deadline: Option<Duration>,
 }
@@ -68,20 +73,44 @@ impl<'m> Request<'m> {
         for (position, weight) in named? {
             weights.set(position, weight);
         }
-        let (settings, deadline) = options?;
+        let Options { settings, lookahead, deadline } = options?;
         let problem = Problem::new(model, demonstration?, weights, start?);
-        Some(Self { problem, settings, deadline })
+        Some(Self { problem, settings, lookahead, deadline })
+    }
+
+    /// The mapping that is asked for, of `mapper`'s model: with a lookahead, the one that a stream of the demonstration gives.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    ///
+    /// # Panics
+    ///
+    /// If the request is of another model.
+    pub fn solve(&self, mapper: &Arc<Mapper>, interrupt: &mut dyn Interrupt) -> Result<Mapping, Cancelled> {
+        let problem = &self.problem;
+        if self.lookahead.is_none() {
+            return mapper.map(problem, self.settings, interrupt);
+        }
+        let weights = problem.weights.clone();
+        let mut online = OnlineMapping::new(Arc::clone(mapper), weights, Some(problem.start), self.lookahead);
+        for observation in problem.demonstration.iter() {
+            online.observe(observation, interrupt)?;
+        }
+        let (_, mapping) = online.end().expect("a demonstration is never empty");
+        Ok(mapping)
     }
 
     /// Reads what does not depend on the model.
-    pub fn read_options(object: &Object<'_, '_>, faults: &mut Faults) -> Option<(Settings, Option<Duration>)> {
+    pub fn read_options(object: &Object<'_, '_>, faults: &mut Faults) -> Option<Options> {
         let heuristic = match object.optional("heuristic") {
             Some(place) => read_heuristic(&place, faults),
             None => Some(HeuristicName::Default),
         };
-        if let Some(place) = object.optional("lookahead") {
-            faults.note(&place, "policies are searched over the whole demonstration; leave this out or null");
-        }
+        let lookahead = match object.optional("lookahead") {
+            Some(place) => read_lookahead(&place, faults).map(Some),
+            None => Some(None),
+        };
         let max_expansions = match object.optional("max_expansions") {
             Some(place) => place.integer(0, u64::MAX, faults),
             None => Some(Budget::DEFAULT.max_expansions),
@@ -91,8 +120,26 @@ impl<'m> Request<'m> {
             None => Some(None),
         };
         let budget = Budget { max_expansions: max_expansions?, ..Budget::DEFAULT };
-        Some((Settings { heuristic: heuristic?, budget }, deadline?))
+        let settings = Settings { heuristic: heuristic?, budget, upper_bound: None };
+        Some(Options { settings, lookahead: lookahead?, deadline: deadline? })
     }
+}
+
+/// What a request says besides its problem.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Options {
+    /// How to search.
+    pub settings: Settings,
+    /// How many observations past the current one a decision may wait for; `None` for all.
+    pub lookahead: Option<NonZeroU32>,
+    /// How long it may take, counted from when the request arrived.
+    pub deadline: Option<Duration>,
+}
+
+/// Reads a lookahead: 1 to the most observations that there can be.
+pub fn read_lookahead(place: &Place<'_, '_>, faults: &mut Faults) -> Option<NonZeroU32> {
+    let lookahead = place.integer(1, Demonstration::MAX_OBSERVATIONS as u64, faults)?;
+    u32::try_from(lookahead).ok().and_then(NonZeroU32::new)
 }
 
 fn read_heuristic(place: &Place<'_, '_>, faults: &mut Faults) -> Option<HeuristicName> {
@@ -112,15 +159,17 @@ pub struct RequestDocument {
     pub model: String,
     /// The observed states, in order: 1 to 100,000. Attributes may be missing or null: not observed.
     pub demonstration: Vec<ObservationDocument>,
-    /// Weights by attribute name, each at least 0; attributes not named keep the model's.
+    /// Weights by attribute name, each at least 0; attributes not named keep the model's. No attribute adds more than 1e150 to
+    /// a distance, however large its weight.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub weights: Option<BTreeMap<String, f64>>,
     /// Name of a learner whose mean weights are used, for attributes that `weights` does not name.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub learner: Option<String>,
-    /// How many observations past the current one a decision may wait for; `null`: all.
+    /// How many observations past the current one a decision may wait for; `null`: all. With a number, the policy is what a
+    /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`).
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schema(minimum = 1)]
+    #[schema(minimum = 1, maximum = 100_000)]
     pub lookahead: Option<u32>,
     /// Where the imitator starts; the model's start if left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -59,7 +59,8 @@ pub(super) struct Found {
 /// take a millisecond.
 const POLL_EVERY: u64 = 16;
 
-/// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows. A node is expanded again if a cheaper
+/// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows, among those of at most `most_f`, of which
+/// there must be one. A node is expanded again if a cheaper
 /// way to it is found, so the heuristic need not be consistent.
 ///
 /// # Errors
@@ -69,6 +70,7 @@ pub(super) fn search<H: Heuristic>(
     problem: &Problem<'_>,
     heuristic: &H,
     budget: Budget,
+    most_f: f64,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
     let last = problem.last();
@@ -114,7 +116,10 @@ pub(super) fn search<H: Heuristic>(
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
             let observation = i as u32;
             if let Some(id) = nodes.reach(Way { observation, state, g, action, parent: entry.id }) {
-                open.push(Open { f: g + heuristic.cost_to_go(i, state), g, observation, id });
+                let f = g + heuristic.cost_to_go(i, state);
+                if f <= most_f {
+                    open.push(Open { f, g, observation, id });
+                }
             }
         };
         reach(i + 1, state, 0.0, NO_ACTION);

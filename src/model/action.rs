@@ -1,11 +1,13 @@
 //! Actions: what a body can do, and what it pays for it.
 
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::document::{Faults, Place, Range};
+use crate::document::{Faults, Place, Quoted, Range, list_known};
 
 /// Index of an action in its model.
 pub type ActionIdx = u16;
@@ -45,23 +47,61 @@ impl From<&Action> for ActionDocument {
     }
 }
 
-/// Reads the actions of a body. The list may be shorter than the document's if that has faults.
-pub(super) fn read_actions(place: &Place<'_, '_>, default_cost: f64, faults: &mut Faults) -> Option<Vec<Action>> {
-    let items = place.array(faults)?;
-    if items.len() > Action::MAX_ACTIONS {
-        faults.note(place, format!("expected at most {} actions, found {}", Action::MAX_ACTIONS, items.len()));
-        return None;
-    }
-    let mut actions: Vec<Action> = Vec::with_capacity(items.len());
-    for (n, item) in items.iter().enumerate() {
-        let place = place.item(n, item);
-        let Some(action) = read_action(&place, default_cost, faults) else { continue };
-        if actions.iter().any(|other| other.name == action.name) {
-            faults.note(&place, format!("another action is called {:?} already", action.name));
+/// The actions of a document, as far as they could be read.
+#[derive(Debug)]
+pub(super) struct ReadActions<'v> {
+    /// `None` for each that is faulty, so that transitions can still be checked against the others.
+    actions: Vec<Option<Action>>,
+    /// The index of each name that could be read, faulty actions' too. Hashed with a seed, as clients choose the names.
+    positions: HashMap<&'v str, ActionIdx>,
+    /// Whether every action's name could be read.
+    is_named: bool,
+}
+
+impl<'v> ReadActions<'v> {
+    /// Reads the actions of a body.
+    pub(super) fn read(place: &Place<'v, '_>, default_cost: f64, faults: &mut Faults) -> Option<Self> {
+        let items = place.array(faults)?;
+        if items.len() > Action::MAX_ACTIONS {
+            faults.note(place, format!("expected at most {} actions, found {}", Action::MAX_ACTIONS, items.len()));
+            return None;
         }
-        actions.push(action);
+        let mut read = Self { actions: Vec::with_capacity(items.len()), positions: HashMap::new(), is_named: true };
+        for (item, index) in items.iter().zip(0..) {
+            let place = place.item(index.into(), item);
+            read.actions.push(read_action(&place, default_cost, faults));
+            match item.get("name").and_then(serde_json::Value::as_str) {
+                None => read.is_named = false,
+                Some(name) => match read.positions.entry(name) {
+                    Entry::Vacant(entry) => drop(entry.insert(index)),
+                    Entry::Occupied(_) => {
+                        faults.note(&place, format!("another action is called {} already", Quoted(name)));
+                    }
+                },
+            }
+        }
+        Some(read)
     }
-    Some(actions)
+
+    /// Reads a reference to an action: its name or index. `None` also where it may refer to an action that could not be
+    /// read.
+    pub(super) fn read_reference(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<ActionIdx> {
+        let Some(name) = place.value.as_str() else {
+            let index = place.index(self.actions.len(), "action", faults)?;
+            return ActionIdx::try_from(index).ok();
+        };
+        let position = self.positions.get(name).copied();
+        if position.is_none() && self.is_named {
+            let names = self.actions.iter().flatten().map(|action| &action.name);
+            return place.mismatch(&format!("one of the actions {}", list_known(names)), faults);
+        }
+        position
+    }
+
+    /// The actions, if none is faulty.
+    pub(super) fn complete(self) -> Option<Vec<Action>> {
+        self.actions.into_iter().collect()
+    }
 }
 
 fn read_action(place: &Place<'_, '_>, default_cost: f64, faults: &mut Faults) -> Option<Action> {

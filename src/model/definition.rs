@@ -4,10 +4,11 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use utoipa::ToSchema;
 
-use super::action::read_actions;
-use super::{Action, ActionDocument, Cave, Limits, TableDocument, WumpusDocument, table};
+use super::action::ReadActions;
+use super::{ActionDocument, Cave, CompileError, Limits, TableDocument, WumpusDocument, table};
 use crate::attribute::{AttributeDocument, Schema};
 use crate::document::{Faults, Place};
+use crate::interrupt::{Cancelled, Interrupt, Meter};
 
 /// What a client registers as a model: checked, with defaults filled in, not yet compiled.
 #[derive(Clone, Debug)]
@@ -23,11 +24,18 @@ impl Definition {
     ///
     /// # Errors
     ///
-    /// All faults of the document.
-    pub fn read(document: &serde_json::Value, limits: Limits) -> Result<Self, Faults> {
+    /// [`CompileError::Faults`] with all faults of the document, [`CompileError::Cancelled`] if `interrupt` said so.
+    pub fn read(
+        document: &serde_json::Value,
+        limits: Limits,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Self, CompileError> {
+        /// How many values are read between two looks at the interrupt: less than a millisecond.
+        const POLL_EVERY: u64 = 4096;
         let mut faults = Faults::default();
-        let definition = read_definition(&Place::root(document), limits, &mut faults);
-        faults.check(definition)
+        let mut meter = Meter::new(interrupt, POLL_EVERY);
+        let definition = read_definition(&Place::root(document), limits, &mut meter, &mut faults)?;
+        Ok(faults.check(definition)?)
     }
 
     /// The definition as a document in canonical form: defaults filled in, actions of transitions by name. Reading it
@@ -47,56 +55,50 @@ impl Definition {
             },
         }
     }
-
-    /// The attributes that states of the model will have.
-    #[must_use]
-    pub fn schema(&self) -> Schema {
-        match self {
-            Self::Table(table) => table.schema().clone(),
-            Self::Wumpus(cave) => cave.schema(),
-        }
-    }
-
-    /// The actions of the body.
-    #[must_use]
-    pub fn actions(&self) -> &[Action] {
-        match self {
-            Self::Table(table) => table.actions(),
-            Self::Wumpus(cave) => cave.actions(),
-        }
-    }
 }
 
-fn read_definition(place: &Place<'_, '_>, limits: Limits, faults: &mut Faults) -> Option<Definition> {
-    let object = place.object(&["attributes", "actions", "dynamics"], faults)?;
-    let dynamics = object.required("dynamics", faults)?;
-    match dynamics.value.get("kind").and_then(serde_json::Value::as_str) {
-        Some("table") => {
+fn read_definition(
+    place: &Place<'_, '_>,
+    limits: Limits,
+    meter: &mut Meter<'_>,
+    faults: &mut Faults,
+) -> Result<Option<Definition>, Cancelled> {
+    let Some(object) = place.object(&["attributes", "actions", "dynamics"], faults) else { return Ok(None) };
+    let dynamics = object.required("dynamics", faults);
+    let kind = dynamics.and_then(|dynamics| dynamics.value.get("kind")).and_then(serde_json::Value::as_str);
+    match (dynamics, kind) {
+        (Some(dynamics), Some("table")) => {
             let attributes = object.required("attributes", faults);
             let attributes = attributes.and_then(|place| Schema::read(&place, faults));
             let actions = object.required("actions", faults);
-            let actions = actions.and_then(|place| read_actions(&place, table::DEFAULT_ACTION_COST, faults));
-            table::read(&dynamics, attributes, actions, limits, faults).map(Definition::Table)
+            let actions = actions.and_then(|place| ReadActions::read(&place, table::DEFAULT_ACTION_COST, faults));
+            Ok(table::read(&dynamics, attributes, actions, limits, meter, faults)?.map(Definition::Table))
         }
-        Some("wumpus") => {
+        (Some(dynamics), Some("wumpus")) => {
             if let Some(place) = object.optional("attributes") {
                 faults.note(&place, "the attributes of a wumpus world are implied; leave this out");
             }
-            let actions = object.optional("actions").map(|place| {
-                let actions = read_actions(&place, Cave::DEFAULT_ACTION_COST, faults);
-                actions.map(|actions| (place, actions))
-            });
-            let actions = match actions {
+            let actions = match object.optional("actions") {
                 None => Some(None),
-                Some(None) => None,
-                Some(Some((place, actions))) => Cave::check_actions(&place, &actions, faults).then_some(Some(actions)),
+                Some(place) => {
+                    let actions = ReadActions::read(&place, Cave::DEFAULT_ACTION_COST, faults);
+                    Cave::check_actions(&place, faults);
+                    actions.and_then(ReadActions::complete).map(Some)
+                }
             };
-            let world = Cave::read(&dynamics, faults);
-            world.zip(actions).map(|(cave, actions)| Definition::Wumpus(cave.with_actions(actions)))
+            let world = Cave::read(&dynamics, meter, faults)?;
+            Ok(world.zip(actions).map(|(cave, actions)| Definition::Wumpus(cave.with_actions(actions))))
         }
-        _ => {
-            let object = dynamics.open_object(faults)?;
-            object.required("kind", faults)?.mismatch("one of \"table\", \"wumpus\"", faults)
+        (dynamics, _) => {
+            // What the rest is to be is not known, but what it cannot be in any case is.
+            object.optional("attributes").map(|place| Schema::read(&place, faults));
+            object.optional("actions").map(|place| ReadActions::read(&place, table::DEFAULT_ACTION_COST, faults));
+            if let Some(object) = dynamics.and_then(|dynamics| dynamics.open_object(faults))
+                && let Some(kind) = object.required("kind", faults)
+            {
+                kind.mismatch::<()>("one of \"table\", \"wumpus\"", faults);
+            }
+            Ok(None)
         }
     }
 }
@@ -151,4 +153,165 @@ pub enum DynamicsDocument {
     /// They follow from the rules of the wumpus world.
     #[schema(title = "WumpusDynamics")]
     Wumpus(WumpusDocument),
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::num::f64::{NEGATIVE, NORMAL, POSITIVE, SUBNORMAL, ZERO};
+    use proptest::prelude::*;
+    use serde_json::json;
+
+    use super::*;
+    use crate::attribute::MAX_COST;
+    use crate::document;
+    use crate::interrupt::{Signal, Uninterrupted};
+
+    fn read(text: &str) -> Definition {
+        let document = document::parse(text.as_bytes()).unwrap();
+        Definition::read(&document, Limits::DEFAULT, &mut Uninterrupted).unwrap()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+        #[test]
+        fn a_definition_that_is_read_again_is_the_same_to_the_last_bit(
+            weight in POSITIVE | NORMAL | SUBNORMAL | ZERO,
+            scale in POSITIVE | NORMAL | SUBNORMAL,
+            cost in 0.0..=MAX_COST,
+            x in POSITIVE | NEGATIVE | NORMAL | SUBNORMAL | ZERO,
+        ) {
+            let model = json!({
+                "attributes": [{"name": "x", "kind": "number", "scale": scale, "weight": weight}],
+                "actions": [{"name": "a", "cost": cost}],
+                "dynamics": {"kind": "table", "states": [[x]], "transitions": []},
+            });
+            let first = read(&model.to_string()).document().text();
+            let again = read(&first).document().text();
+            prop_assert_eq!(&first, &again);
+            let read: DefinitionDocument = serde_json::from_str(&first).unwrap();
+            let attributes = read.attributes.unwrap();
+            prop_assert_eq!((attributes[0].weight, attributes[0].scale), (Some(weight), Some(scale)));
+            prop_assert_eq!(read.actions.unwrap()[0].cost, Some(cost));
+        }
+    }
+
+    /// The pointers of the faults of `model`, in the order of their text.
+    fn faults_of(model: &serde_json::Value) -> Vec<String> {
+        let read = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted);
+        let Err(CompileError::Faults(faults)) = read else { panic!("{model} has faults") };
+        let mut pointers: Vec<_> = faults.listed().iter().map(|fault| fault.pointer.clone()).collect();
+        pointers.sort_unstable();
+        pointers
+    }
+
+    fn two_states() -> serde_json::Value {
+        json!({
+            "attributes": [{"name": "x", "kind": "number"}],
+            "actions": [{"name": "a"}, {"name": "b"}],
+            "dynamics": {"kind": "table", "states": [[0], [1]], "transitions": [[0, "a", 1]]},
+        })
+    }
+
+    #[test]
+    fn without_known_dynamics_attributes_and_actions_are_checked_all_the_same() {
+        let mut model = two_states();
+        model["attributes"][0]["scale"] = json!(0);
+        model["actions"][1]["cost"] = json!(-1);
+        for (dynamics, pointer) in
+            [(json!(null), "/dynamics"), (json!({"kind": "maze"}), "/dynamics/kind"), (json!({}), "/dynamics/kind")]
+        {
+            model["dynamics"] = dynamics;
+            assert_eq!(faults_of(&model), ["/actions/1/cost", "/attributes/0/scale", pointer]);
+        }
+    }
+
+    #[test]
+    fn without_states_the_rest_of_a_table_is_checked_all_the_same() {
+        let mut model = two_states();
+        model["dynamics"] = json!({
+            "kind": "table", "states": [], "transitions": [[0, "c", 1], [0]], "start": "here", "unsafe": [-1],
+        });
+        assert_eq!(
+            faults_of(&model),
+            [
+                "/dynamics/start",
+                "/dynamics/states",
+                "/dynamics/transitions/0/1",
+                "/dynamics/transitions/1",
+                "/dynamics/unsafe/0"
+            ]
+        );
+    }
+
+    #[test]
+    fn a_faulty_action_keeps_its_index_and_its_name() {
+        let mut model = two_states();
+        model["actions"] = json!([{"name": "a", "cost": -1}, {"name": "b"}, {"name": "a"}]);
+        model["dynamics"]["transitions"] = json!([[0, "a", 1], [0, 1, 1], [1, 2, 0], [1, 3, 0], [1, "c", 0]]);
+        let expected = ["/actions/0/cost", "/actions/2", "/dynamics/transitions/3/1", "/dynamics/transitions/4/1"];
+        assert_eq!(faults_of(&model), expected);
+        // What an action without a name is called is not known.
+        model["actions"] = json!([{"name": 7}, {"name": "b"}, {"cost": 1}, {"name": "b"}]);
+        model["dynamics"]["transitions"] = json!([[0, "c", 1]]);
+        assert_eq!(faults_of(&model), ["/actions/0/name", "/actions/2/name", "/actions/3"]);
+    }
+
+    #[test]
+    fn unsafe_states_are_a_set() {
+        let text = |listed: serde_json::Value| {
+            let mut model = two_states();
+            model["dynamics"]["states"] = json!([[0], [1], [2], [3]]);
+            model["dynamics"]["unsafe"] = listed;
+            read(&model.to_string()).document().text()
+        };
+        assert_eq!(text(json!([3, 1, 3])), text(json!([1, 3])));
+    }
+
+    #[test]
+    fn what_a_fault_says_is_short_however_long_the_document() {
+        let long = "x".repeat(100_000);
+        let actions: Vec<_> = (0..4000).map(|n| json!({"name": format!("action {n}")})).collect();
+        let mut model = two_states();
+        model["actions"] = actions.into();
+        model["dynamics"]["transitions"] = json!([[0, long, 1], [0, "fly", 1]]);
+        model["attributes"] = json!([{"name": long, "kind": long}, {"name": long, "kind": "number"}]);
+        let read = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted);
+        let Err(CompileError::Faults(faults)) = read else { panic!("the model has faults") };
+        for fault in faults.listed() {
+            assert!(fault.detail.len() < 500, "{fault:?}");
+        }
+        let cave = json!({"dynamics": {"kind": "wumpus", "width": 2, "height": 2}, "actions": [{"name": long}]});
+        let read = Definition::read(&cave, Limits::DEFAULT, &mut Uninterrupted);
+        let Err(CompileError::Faults(faults)) = read else { panic!("the cave has faults") };
+        assert!(faults.listed().iter().all(|fault| fault.detail.len() < 500));
+    }
+
+    #[test]
+    fn reading_asks_again_and_again_whether_to_go_on() {
+        let many: Vec<_> = (0..20_000).map(|n| json!([n])).collect();
+        let edges: Vec<_> = (0..20_000).map(|n| json!([n, "a", 0])).collect();
+        let mut states = two_states();
+        states["dynamics"]["states"] = many.into();
+        let mut transitions = states.clone();
+        transitions["dynamics"]["transitions"] = edges.into();
+        let pits: Vec<_> = (0..20_000).map(|n| json!([n % 200 + 1, n / 200])).collect();
+        let cave = json!({"dynamics": {"kind": "wumpus", "width": 300, "height": 300, "pits": pits}});
+        for (model, n_polls_least) in [(states, 5), (transitions, 9), (cave, 4)] {
+            let mut n_polls = 0;
+            let mut count = || {
+                n_polls += 1;
+                Signal::Continue
+            };
+            assert!(Definition::read(&model, Limits::DEFAULT, &mut count).is_ok());
+            assert!(n_polls >= n_polls_least, "{n_polls}");
+            let mut n_left = n_polls_least;
+            let mut cancel = || {
+                n_left -= 1;
+                if n_left == 0 { Signal::Cancel } else { Signal::Continue }
+            };
+            let cancelled = Definition::read(&model, Limits::DEFAULT, &mut cancel);
+            assert!(matches!(cancelled, Err(CompileError::Cancelled(_))));
+        }
+    }
 }

@@ -4,10 +4,12 @@ use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::action::ReadActions;
 use super::states::Interner;
 use super::{Action, ActionIdx, Graph, Limits, Model, Start, StateIdx, States, Transition};
 use crate::attribute::{Attribute, Scalar, Schema};
 use crate::document::{Faults, Object, Place};
+use crate::interrupt::{Cancelled, Meter};
 
 /// Cost of an action that names none.
 pub(super) const DEFAULT_ACTION_COST: f64 = 1.0;
@@ -21,6 +23,7 @@ pub struct Table {
     /// In the order of the document.
     edges: Vec<(StateIdx, Transition)>,
     start: Start,
+    /// Ascending, all different.
     unsafe_states: Vec<StateIdx>,
 }
 
@@ -84,48 +87,64 @@ impl Table {
 pub(super) fn read(
     place: &Place<'_, '_>,
     attributes: Option<Vec<Option<Attribute>>>,
-    actions: Option<Vec<Action>>,
+    actions: Option<ReadActions<'_>>,
     limits: Limits,
+    meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Option<Table> {
-    let object = place.object(&["kind", "states", "transitions", "start", "unsafe"], faults)?;
+) -> Result<Option<Table>, Cancelled> {
+    let Some(object) = place.object(&["kind", "states", "transitions", "start", "unsafe"], faults) else {
+        return Ok(None);
+    };
     let rows = object.required("states", faults).and_then(|place| place.array(faults).map(|rows| (place, rows)));
-    if let Some((place, rows)) = rows
-        && (rows.is_empty() || rows.len() > limits.max_states)
-    {
-        faults.note(&place, format!("expected 1 to {} states, found {}", limits.max_states, rows.len()));
-        return None;
-    }
-    let states = rows.zip(attributes.as_ref());
-    let states = states.and_then(|((place, rows), attributes)| read_states(&place, rows, attributes, faults));
+    let rows = rows.filter(|(place, rows)| {
+        let is_number_right = (1..=limits.max_states).contains(&rows.len());
+        if !is_number_right {
+            faults.note(place, format!("expected 1 to {} states, found {}", limits.max_states, rows.len()));
+        }
+        is_number_right
+    });
+    let states = match rows.zip(attributes.as_ref()) {
+        Some(((place, rows), attributes)) => read_states(&place, rows, attributes, meter, faults)?,
+        None => None,
+    };
     // Where the states are missing, any index may be right.
     let n_states = rows.map_or(StateIdx::MAX as usize, |(_, rows)| rows.len());
-    let edges = read_transitions(&object, n_states, actions.as_deref(), faults);
+    let edges = read_transitions(&object, n_states, actions.as_ref(), meter, faults)?;
     let unsafe_states = match object.optional("unsafe") {
-        Some(place) => read_state_list(&place, n_states, faults),
+        Some(place) => read_state_list(&place, n_states, faults).map(|mut states| {
+            // A set, however it is written.
+            states.sort_unstable();
+            states.dedup();
+            states
+        }),
         None => Some(Vec::new()),
     };
     let start = read_start(&object, n_states, unsafe_states.as_deref().unwrap_or_default(), faults);
-    Some(Table {
-        schema: Schema::new(attributes?.into_iter().collect::<Option<_>>()?),
-        actions: actions?,
-        states: states?,
-        edges: edges?,
-        start: start?,
-        unsafe_states: unsafe_states?,
-    })
+    let table = || {
+        Some(Table {
+            schema: Schema::new(attributes?.into_iter().collect::<Option<_>>()?),
+            actions: actions?.complete()?,
+            states: states?,
+            edges: edges?,
+            start: start?,
+            unsafe_states: unsafe_states?,
+        })
+    };
+    Ok(table())
 }
 
 fn read_states(
     place: &Place<'_, '_>,
     rows: &[serde_json::Value],
     attributes: &[Option<Attribute>],
+    meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Option<States> {
+) -> Result<Option<States>, Cancelled> {
     let n_before = faults.count();
     let mut interner = Interner::new(attributes.len());
     let mut state = Vec::with_capacity(attributes.len());
     for (n, row) in rows.iter().enumerate() {
+        meter.spend_or_cancel(attributes.len() as u64)?;
         let place = place.item(n, row);
         let Some(values) = place.array(faults) else { continue };
         if values.len() != attributes.len() {
@@ -142,20 +161,24 @@ fn read_states(
             interner.push(state.drain(..));
         }
     }
-    (faults.count() == n_before).then(|| interner.finish())
+    Ok((faults.count() == n_before).then(|| interner.finish()))
 }
 
 fn read_transitions(
     object: &Object<'_, '_>,
     n_states: usize,
-    actions: Option<&[Action]>,
+    actions: Option<&ReadActions<'_>>,
+    meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Option<Vec<(StateIdx, Transition)>> {
-    let place = object.required("transitions", faults)?;
-    let items = place.array(faults)?;
+) -> Result<Option<Vec<(StateIdx, Transition)>>, Cancelled> {
+    let place = object.required("transitions", faults);
+    let Some((place, items)) = place.and_then(|place| place.array(faults).map(|items| (place, items))) else {
+        return Ok(None);
+    };
     let mut edges = Vec::with_capacity(items.len());
     let mut seen: FxHashMap<(StateIdx, ActionIdx), usize> = FxHashMap::default();
     for (n, item) in items.iter().enumerate() {
+        meter.spend_or_cancel(1)?;
         let place = place.item(n, item);
         let Some(parts) = place.array(faults) else { continue };
         let [from, action, to] = parts else {
@@ -163,7 +186,7 @@ fn read_transitions(
             continue;
         };
         let from = place.item(0, from).index(n_states, "state", faults);
-        let action = actions.and_then(|actions| read_action(&place.item(1, action), actions, faults));
+        let action = actions.and_then(|actions| actions.read_reference(&place.item(1, action), faults));
         let to = place.item(2, to).index(n_states, "state", faults);
         let (Some(from), Some(action), Some(to)) = (from, action, to) else { continue };
         if let Some(other) = seen.insert((from, action), n) {
@@ -172,19 +195,7 @@ fn read_transitions(
         }
         edges.push((from, Transition { action, to }));
     }
-    (edges.len() == items.len()).then_some(edges)
-}
-
-fn read_action(place: &Place<'_, '_>, actions: &[Action], faults: &mut Faults) -> Option<ActionIdx> {
-    let index = match place.value.as_str() {
-        Some(name) => actions.iter().position(|action| &*action.name == name),
-        None => place.index(actions.len(), "action", faults).map(|index| index as usize),
-    };
-    if index.is_none() && place.value.is_string() {
-        let known: Vec<&str> = actions.iter().map(|action| &*action.name).collect();
-        return place.mismatch(&format!("one of the actions {}", known.join(", ")), faults);
-    }
-    index.and_then(|index| ActionIdx::try_from(index).ok())
+    Ok((edges.len() == items.len()).then_some(edges))
 }
 
 fn read_state_list(place: &Place<'_, '_>, n_states: usize, faults: &mut Faults) -> Option<Vec<StateIdx>> {
@@ -223,7 +234,7 @@ fn read_start(
             Some(Start::State(state))
         }
         None => {
-            if is_unsafe.len() == n_states {
+            if is_unsafe.len() >= n_states {
                 faults.note_at(&object.path, "every state is unsafe: there is nowhere to start");
             }
             Some(Start::Any)
@@ -243,7 +254,7 @@ pub struct TableDocument {
     /// observation is taken. Left out: every safe state is a candidate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<StartDocument>,
-    /// States that must never be entered.
+    /// States that must never be entered, in any order.
     #[serde(default, rename = "unsafe")]
     pub unsafe_states: Vec<StateIdx>,
 }

@@ -12,9 +12,9 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::{Action, ActionIdx, CompileError, Graph, Limits, Model, Start, StateIdx, States, Transition};
-use crate::attribute::{Attribute, Cycle, Kind, Schema, Value};
-use crate::document::{Faults, Object, Path, Place};
-use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::attribute::{Attribute, Cycle, Kind, Labels, Schema, Value};
+use crate::document::{Faults, Object, Path, Place, Quoted};
+use crate::interrupt::{Cancelled, Interrupt, Meter};
 
 /// A direction in the grid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
@@ -117,6 +117,8 @@ pub struct Cave {
     width: u16,
     height: u16,
     pits: Vec<Cell>,
+    /// Whether there is a pit, by [`cell_index`]. Shape `[height, width]`.
+    is_pit: Vec<bool>,
     wumpi: Vec<Cell>,
     gold: Vec<Cell>,
     start: (Cell, Heading),
@@ -200,7 +202,7 @@ impl Cave {
     /// Whether the agent is dead in `state`: in a pit, or with a live wumpus.
     #[must_use]
     pub fn is_deadly(&self, state: &CaveState) -> bool {
-        self.pits.contains(&state.cell) || first_in(&self.wumpi, state.cell, state.alive).is_some()
+        self.is_pit[cell_index(state.cell, self.width)] || first_in(&self.wumpi, state.cell, state.alive).is_some()
     }
 
     fn ahead(&self, (x, y): Cell, heading: Heading) -> Option<Cell> {
@@ -217,7 +219,7 @@ impl Cave {
     #[must_use]
     pub fn schema(&self) -> Schema {
         let number = Kind::Number { scale: 1.0 };
-        let labels = Heading::ALL.map(|heading| heading.name().to_owned()).to_vec();
+        let labels = Labels::of(Heading::ALL.map(Heading::name));
         let heading = Kind::Cyclic { scale: 1.0, cycle: Cycle::Labels(labels) };
         let attribute =
             |name: &str, kind: &Kind, weight: f64| Attribute { name: name.to_owned(), kind: kind.clone(), weight };
@@ -264,7 +266,10 @@ impl Cave {
 
     /// Explores, breadth first, every state that the body reaches from the start. States are numbered as they are found.
     pub(super) fn compile(&self, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, CompileError> {
-        const POLL_EVERY: usize = 4096;
+        /// How many successors are made between two looks at the interrupt. One may take the flight of an arrow past every
+        /// wumpus: tens of microseconds.
+        const POLL_EVERY: u64 = 256;
+        let mut meter = Meter::new(interrupt, POLL_EVERY);
         let acts: Vec<Act> = self.actions.iter().filter_map(|action| Act::named(&action.name)).collect();
         let first = self.first_state();
         let mut found: Vec<CaveState> = vec![first];
@@ -272,9 +277,7 @@ impl Cave {
         let mut edges = Vec::new();
         let mut from = 0;
         while let Some(state) = found.get(from).copied() {
-            if from.is_multiple_of(POLL_EVERY) && interrupt.poll() != Signal::Continue {
-                return Err(Cancelled.into());
-            }
+            meter.spend_or_cancel(acts.len() as u64)?;
             for (action, act) in acts.iter().enumerate() {
                 let next = self.after(state, *act);
                 if next == state || self.is_deadly(&next) {
@@ -309,9 +312,13 @@ impl Cave {
     }
 
     /// Reads the world, with a body of all six actions.
-    pub(super) fn read(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Self> {
+    pub(super) fn read(
+        place: &Place<'_, '_>,
+        meter: &mut Meter<'_>,
+        faults: &mut Faults,
+    ) -> Result<Option<Self>, Cancelled> {
         let fields = ["kind", "width", "height", "pits", "wumpi", "gold", "start", "arrows"];
-        let object = place.object(&fields, faults)?;
+        let Some(object) = place.object(&fields, faults) else { return Ok(None) };
         let side = |name: &str, faults: &mut Faults| {
             let side = object.required(name, faults)?.integer(1, Self::MAX_SIDE.into(), faults)?;
             u16::try_from(side).ok()
@@ -321,9 +328,9 @@ impl Cave {
         // Where a side is missing, any cell may be right.
         let grid = (width.unwrap_or(Self::MAX_SIDE), height.unwrap_or(Self::MAX_SIDE));
         let max_pits = usize::from(Self::MAX_SIDE) * usize::from(Self::MAX_SIDE);
-        let pits = read_cells(&object, "pits", grid, max_pits, faults);
-        let wumpi = read_cells(&object, "wumpi", grid, Self::MAX_THINGS, faults);
-        let gold = read_cells(&object, "gold", grid, Self::MAX_THINGS, faults);
+        let pits = read_cells(&object, "pits", grid, max_pits, meter, faults)?;
+        let wumpi = read_cells(&object, "wumpi", grid, Self::MAX_THINGS, meter, faults)?;
+        let gold = read_cells(&object, "gold", grid, Self::MAX_THINGS, meter, faults)?;
         let start = match object.optional("start") {
             Some(place) => read_pose(&place, grid, faults),
             None => Some(((0, 0), Heading::East)),
@@ -332,35 +339,44 @@ impl Cave {
             Some(place) => place.integer(0, Self::MAX_ARROWS.into(), faults).and_then(|n| u8::try_from(n).ok()),
             None => Some(1),
         };
-        let cave = Self {
-            width: width?,
-            height: height?,
-            pits: pits?,
-            wumpi: wumpi?,
-            gold: gold?,
-            start: start?,
-            arrows: arrows?,
-            actions: Act::ALL.map(|act| Action { name: act.name().into(), cost: Self::DEFAULT_ACTION_COST }).to_vec(),
+        let cave = || {
+            let (width, height, pits) = (width?, height?, pits?);
+            let mut is_pit = vec![false; usize::from(width) * usize::from(height)];
+            for (x, y) in &pits {
+                is_pit[cell_index((*x, *y), width)] = true;
+            }
+            Some(Self {
+                width,
+                height,
+                pits,
+                is_pit,
+                wumpi: wumpi?,
+                gold: gold?,
+                start: start?,
+                arrows: arrows?,
+                actions: Act::ALL
+                    .map(|act| Action { name: act.name().into(), cost: Self::DEFAULT_ACTION_COST })
+                    .to_vec(),
+            })
         };
-        if cave.is_deadly(&cave.first_state()) {
+        let cave = cave();
+        if cave.as_ref().is_some_and(|cave| cave.is_deadly(&cave.first_state())) {
             faults.note_at(&Path::Member(&object.path, "start"), "the start cell holds a pit or a wumpus");
         }
-        Some(cave)
+        Ok(cave)
     }
 
-    /// Notes actions that the agent of a wumpus world does not have. Says whether there are none.
-    pub(super) fn check_actions(place: &Place<'_, '_>, actions: &[Action], faults: &mut Faults) -> bool {
-        let n_before = faults.count();
+    /// Notes actions that the agent of a wumpus world does not have.
+    pub(super) fn check_actions(place: &Place<'_, '_>, faults: &mut Faults) {
         let items = place.value.as_array().map(Vec::as_slice).unwrap_or_default();
         for (n, item) in items.iter().enumerate() {
             let name = item.get("name").and_then(serde_json::Value::as_str);
             if let Some(name) = name.filter(|name| Act::named(name).is_none()) {
                 let known = Act::ALL.map(Act::name).join(", ");
-                let detail = format!("unknown action {name:?}; a wumpus world has {known}");
+                let detail = format!("unknown action {}; a wumpus world has {known}", Quoted(name));
                 faults.note_at(&Path::Member(&Path::Item(&place.path, n), "name"), detail);
             }
         }
-        faults.count() == n_before && actions.len() == items.len()
     }
 
     /// The world with a body of these actions; `None` leaves it all six.
@@ -386,6 +402,11 @@ impl Cave {
     }
 }
 
+/// Where a cell stands in a list of all, row by row.
+fn cell_index((x, y): Cell, width: u16) -> usize {
+    usize::from(y) * usize::from(width) + usize::from(x)
+}
+
 fn all_set(n_bits: usize) -> u64 {
     (0..n_bits).fold(0, |word, bit| word | 1 << bit)
 }
@@ -401,15 +422,17 @@ fn read_cells(
     name: &str,
     size: (u16, u16),
     most: usize,
+    meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Option<Vec<Cell>> {
-    let Some(place) = object.optional(name) else { return Some(Vec::new()) };
-    let items = place.array(faults)?;
+) -> Result<Option<Vec<Cell>>, Cancelled> {
+    let Some(place) = object.optional(name) else { return Ok(Some(Vec::new())) };
+    let Some(items) = place.array(faults) else { return Ok(None) };
     if items.len() > most {
-        return place.mismatch(&format!("at most {most} cells"), faults);
+        return Ok(place.mismatch(&format!("at most {most} cells"), faults));
     }
     let mut cells = Vec::with_capacity(items.len());
     for (n, item) in items.iter().enumerate() {
+        meter.spend_or_cancel(1)?;
         let place = place.item(n, item);
         let Some(parts) = place.array(faults) else { continue };
         let [x, y] = parts else {
@@ -420,7 +443,7 @@ fn read_cells(
         let y = read_coordinate(&place.item(1, y), size.1, faults);
         cells.extend(x.zip(y));
     }
-    (cells.len() == items.len()).then_some(cells)
+    Ok((cells.len() == items.len()).then_some(cells))
 }
 
 fn read_coordinate(place: &Place<'_, '_>, side: u16, faults: &mut Faults) -> Option<u16> {

@@ -15,6 +15,8 @@ mod models;
 mod name;
 mod policies;
 mod pool;
+mod refiner;
+mod sessions;
 mod trials;
 
 use std::path::PathBuf;
@@ -24,15 +26,18 @@ pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnsw
 pub use models::{ModelAnswer, Registered};
 pub use name::{InvalidName, Name};
 pub use policies::MadePolicy;
-pub use pool::{PoolError, PoolSettings, SearchPool};
+pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
+pub use sessions::{Ended, Observation, Resumed, Session, SessionError};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 pub use trials::TrialAnswer;
 
-use crate::document::{Faults, ParseError};
+use crate::document::{Faults, ParseError, Quoted};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
 use cache::MapperCache;
+use refiner::Refiner;
+use sessions::Owners;
 use trials::TrialNumbers;
 
 /// How the service is set up.
@@ -44,6 +49,8 @@ pub struct Settings {
     pub limits: Limits,
     /// Most bytes of models kept ready to be searched.
     pub model_cache_bytes: u64,
+    /// How long a session may be idle before it expires.
+    pub session_idle_timeout: Duration,
     /// Threads and queue of the searches.
     pub pool: PoolSettings,
 }
@@ -58,7 +65,7 @@ pub enum ServiceError {
     #[error("{0}")]
     Faults(#[from] Faults),
     /// There is nothing of this kind with this name or id.
-    #[error("there is no {kind} {name:?}")]
+    #[error("there is no {kind} {}", Quoted(name))]
     Unknown {
         /// What was looked for.
         kind: &'static str,
@@ -116,6 +123,9 @@ pub struct Etude {
     store: Store,
     pool: SearchPool,
     mappers: MapperCache,
+    refiner: Refiner,
+    owners: Owners,
+    session_idle_timeout: Duration,
     limits: Limits,
     trial_numbers: TrialNumbers,
     /// Held while rewards are folded.
@@ -134,6 +144,9 @@ impl Etude {
             store: Store::open(&settings.database, tasks).await?,
             pool: SearchPool::new(settings.pool, tasks.clone(), abort),
             mappers: MapperCache::new(settings.model_cache_bytes),
+            refiner: Refiner::default(),
+            owners: Owners::default(),
+            session_idle_timeout: settings.session_idle_timeout,
             limits: settings.limits,
             trial_numbers: TrialNumbers::default(),
             learning: tokio::sync::Mutex::new(()),

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use jiff::{Timestamp, Unit};
 use serde_json::value::RawValue;
 
+use super::pool::Admission;
 use super::{Etude, Name, ServiceError};
 use crate::attribute::AttributeDocument;
 use crate::document;
@@ -44,12 +45,14 @@ impl Etude {
         now: Timestamp,
     ) -> Result<(Registered, ModelSummary), ServiceError> {
         let limits = self.limits;
-        let prepared = self.pool.run(None, move |interrupt| prepare(body.as_ref(), limits, interrupt)).await??;
-        let Prepared { definition, mapper, attributes, actions } = prepared;
+        let place = self.pool.admit()?;
+        let prepared = place.run(None, move |interrupt| prepare(body.as_ref(), limits, interrupt)).await??;
+        drop(place);
+        let Prepared { definition, hash, mapper, attributes, actions } = prepared;
         let model = mapper.model();
         let summary = ModelSummary {
             name: name.to_string(),
-            hash: hash_of(&definition),
+            hash,
             attributes,
             actions,
             n_states: model.graph().n_states() as u64,
@@ -99,11 +102,13 @@ impl Etude {
         if self.store.delete_model(name.as_str()).await? { Ok(()) } else { Err(unknown(name.as_str(), None)) }
     }
 
-    /// The model called `name`, ready to be searched, and its hash. `pointer` is where a request names it.
+    /// The model called `name`, ready to be searched, and its hash. `pointer` is where a request names it; what must be
+    /// compiled is compiled by its `place` in the pool, if it has one.
     pub(super) async fn mapper(
         &self,
         name: &str,
         pointer: &'static str,
+        place: Option<&Admission>,
     ) -> Result<(String, Arc<Mapper>), ServiceError> {
         let unknown = || unknown(name, Some(pointer));
         let hash = self.store.model_hash(name).await?.ok_or_else(unknown)?;
@@ -112,7 +117,11 @@ impl Etude {
             let row = self.store.model(name).await?.filter(|row| row.summary.hash == hash).ok_or_else(unknown)?;
             let limits = Limits { max_states: usize::MAX };
             let text = row.definition;
-            let prepared = self.pool.run(None, move |interrupt| prepare(text.as_bytes(), limits, interrupt)).await?;
+            let job = move |interrupt: &mut dyn Interrupt| prepare(text.as_bytes(), limits, interrupt);
+            let prepared = match place {
+                Some(place) => place.run(None, job).await?,
+                None => self.pool.run_patiently(job).await?,
+            };
             // What was once accepted is read again without faults.
             let prepared = prepared.map_err(|error| corrupt_definition(error.into()))?;
             Ok::<_, ServiceError>(Arc::new(prepared.mapper))
@@ -133,6 +142,7 @@ fn corrupt_definition(source: Box<dyn std::error::Error + Send + Sync>) -> Servi
 struct Prepared {
     /// The canonical text.
     definition: String,
+    hash: String,
     mapper: Mapper,
     attributes: Vec<AttributeDocument>,
     actions: Vec<ActionDocument>,
@@ -145,12 +155,13 @@ fn prepare(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Prepared, ServiceError>, Cancelled> {
     let definition = match document::parse(text) {
-        Ok(document) => Definition::read(&document, limits),
+        Ok(document) => Definition::read(&document, limits, interrupt),
         Err(error) => return Ok(Err(error.into())),
     };
     let definition = match definition {
         Ok(definition) => definition,
-        Err(faults) => return Ok(Err(faults.into())),
+        Err(CompileError::Faults(faults)) => return Ok(Err(faults.into())),
+        Err(CompileError::Cancelled(cancelled)) => return Err(cancelled),
     };
     let model = match Model::compile(&definition, limits, interrupt) {
         Ok(model) => model,
@@ -159,5 +170,8 @@ fn prepare(
     };
     let attributes = model.schema().attributes().iter().map(AttributeDocument::from).collect();
     let actions = model.actions().iter().map(ActionDocument::from).collect();
-    Ok(Ok(Prepared { definition: definition.document().text(), mapper: Mapper::new(model), attributes, actions }))
+    let mapper = Mapper::new(model, interrupt)?;
+    let definition = definition.document().text();
+    let hash = hash_of(&definition);
+    Ok(Ok(Prepared { definition, hash, mapper, attributes, actions }))
 }

@@ -1,5 +1,7 @@
 //! Policies: searched, stored, read.
 
+use std::num::NonZeroU32;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
@@ -9,12 +11,13 @@ use serde_json::value::RawValue;
 use uuid::Uuid;
 
 use super::learners::Ready;
-use super::{Etude, ServiceError};
+use super::{Admission, Etude, ServiceError};
 use crate::attribute::Weights;
-use crate::document::{self, Faults, Place};
+use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{Mapper, Policy, PolicySummary, Request, Stamp};
-use crate::store::{NewPolicy, Page, StoreError};
+use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Status};
+use crate::model::Model;
+use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
 /// Bodies up to this size are parsed where they arrive, which takes less than a millisecond; larger ones in the pool.
 const MAX_INLINE_BYTES: usize = 64 * 1024;
@@ -41,8 +44,9 @@ impl Etude {
         arrived: Instant,
         now: Timestamp,
     ) -> Result<MadePolicy, ServiceError> {
-        let document = self.parse(body).await?;
-        let (envelope, faults) = Envelope::read(&document);
+        let place = self.pool.admit()?;
+        let document = parse(body, &place).await?;
+        let (envelope, mut faults) = Envelope::read(&document);
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
         let found = async {
@@ -50,10 +54,15 @@ impl Etude {
                 Some(learner) => Some(self.ready(learner, Some("/learner")).await?),
                 None => None,
             };
-            Ok((learner, self.mapper(&envelope.model, "/model").await?))
+            Ok((learner, self.mapper(&envelope.model, "/model", Some(&place)).await?))
         };
         let (learner, (model_hash, mapper)) = match found.await {
-            Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
+            // What is unknown is then one fault among others.
+            Err(ref error @ ServiceError::Unknown { pointer: Some(pointer), .. }) if !faults.is_empty() => {
+                let name = pointer.trim_start_matches('/');
+                faults.note_at(&Path::Member(&Path::Root, name), error.to_string());
+                return Err(faults.into());
+            }
             found => found?,
         };
 
@@ -64,7 +73,7 @@ impl Etude {
             model_hash,
             learner: learner.as_ref().map(|ready| ready.name.clone()),
             weights_version: learner.as_ref().map(|ready| ready.weights.version),
-            elapsed_us: 0,
+            ..Stamp::default()
         };
         let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
         let job = move |interrupt: &mut dyn Interrupt| {
@@ -73,25 +82,22 @@ impl Etude {
                 None => Some(schema.weights()),
                 Some(Ready { learner, weights, .. }) => {
                     let learned = learner.weights_for(schema, &weights.distribution.mean);
-                    learned.map_err(|missing| faults.append(Faults::one("/learner", missing.to_string()))).ok()
+                    learned
+                        .map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string()))
+                        .ok()
                 }
             };
             search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)
         };
-        let Searched { policy, summary } = self.pool.run(deadline, job).await??;
-        let row = NewPolicy { id: id.clone(), summary, policy: policy.clone(), created_at: now };
-        self.store.add_policy(row).await?;
+        let Searched { policy, row, refinement } = place.run(deadline, job).await??;
+        // The disk is no concern of those who wait for a thread.
+        drop(place);
+        let is_refined = refinement.is_some();
+        self.store.add_policy(row.at(now), refinement).await?;
+        if is_refined {
+            self.refiner.wake();
+        }
         Ok(MadePolicy { id, policy })
-    }
-
-    /// Parses a body.
-    pub(super) async fn parse(&self, body: impl AsRef<[u8]> + Send + 'static) -> Result<Value, ServiceError> {
-        let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
-            document::parse(body.as_ref())
-        } else {
-            self.pool.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
-        };
-        Ok(document?)
     }
 
     /// The policy with this id: JSON.
@@ -123,6 +129,16 @@ impl Etude {
     }
 }
 
+/// Parses a body, by its `place` in the pool if it is large.
+pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admission) -> Result<Value, ServiceError> {
+    let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
+        document::parse(body.as_ref())
+    } else {
+        place.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
+    };
+    Ok(document?)
+}
+
 /// What must be known of a request before its model is at hand.
 struct Envelope {
     model: String,
@@ -145,48 +161,112 @@ impl Envelope {
         let envelope = names.map(|(model, learner)| Self {
             model: model.to_owned(),
             learner: learner.map(str::to_owned),
-            deadline: options.and_then(|(_, deadline)| deadline),
+            deadline: options.and_then(|options| options.deadline),
         });
         (envelope, faults)
     }
 }
 
-/// A policy and its summary: JSON.
+/// What a search gave.
 pub(super) struct Searched {
+    /// The policy: JSON.
     pub(super) policy: String,
-    pub(super) summary: String,
+    pub(super) row: PolicyText,
+    /// What is to be done about the policy, if it is local.
+    pub(super) refinement: Option<NewRefinement>,
+}
+
+/// A policy as it will be stored.
+pub(super) struct PolicyText {
+    id: String,
+    policy: String,
+    summary: String,
+}
+
+impl PolicyText {
+    /// Writes a policy that has an id.
+    pub(super) fn of(policy: &Policy) -> Result<Self, ServiceError> {
+        let id = policy.id.clone().unwrap_or_default();
+        Ok(Self { id, policy: write(policy)?, summary: write(&PolicySummary::of(policy))? })
+    }
+
+    pub(super) fn at(self, created_at: Timestamp) -> NewPolicy {
+        let Self { id, policy, summary } = self;
+        NewPolicy { id, summary, policy, created_at }
+    }
 }
 
 /// Reads the request against its model, with weights from `base` where it names none, searches, and writes the policy.
 pub(super) fn search(
-    mapper: &Mapper,
+    mapper: &Arc<Mapper>,
     document: &Value,
     fields: &[&str],
     base: impl FnOnce(&mut Faults) -> Option<Weights>,
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
-    let mut faults = Faults::default();
-    let root = Place::root(document);
-    let object = root.object(fields, &mut faults);
-    let request = object.and_then(|object| Request::read_over(mapper.model(), &object, base, &mut faults));
-    let Request { problem, settings, .. } = match faults.check(request) {
+    let request = match read_request(mapper.model(), document, fields, base) {
         Ok(request) => request,
         Err(faults) => return Ok(Err(faults.into())),
     };
     let started = Instant::now();
-    let mapping = mapper.map(&problem, settings, interrupt)?;
-    let elapsed_us = u64::try_from(started.elapsed().as_micros()).unwrap_or(u64::MAX);
+    let mapping = request.solve(mapper, interrupt)?;
+    let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
+    report(&stamp, &mapping);
+    let policy = Policy::new(stamp, &request.problem, &mapping);
+    Ok(searched(&policy, document))
+}
+
+fn searched(policy: &Policy, document: &Value) -> Result<Searched, ServiceError> {
+    let row = PolicyText::of(policy)?;
+    let refinement = (policy.status == Status::Local).then(|| {
+        let mut request = document.clone();
+        // The weights that were used, wherever they came from.
+        request["weights"] = serde_json::json!(policy.weights);
+        for name in ["learner", "lookahead"] {
+            request[name] = Value::Null;
+        }
+        NewRefinement { policy_id: row.id.clone(), model_hash: policy.model_hash.clone(), request: request.to_string() }
+    });
+    Ok(Searched { policy: row.policy.clone(), row, refinement })
+}
+
+/// Reads a request that may have these `fields` against its model, with weights from `base` where it names none.
+fn read_request<'m>(
+    model: &'m Model,
+    document: &Value,
+    fields: &[&str],
+    base: impl FnOnce(&mut Faults) -> Option<Weights>,
+) -> Result<Request<'m>, Faults> {
+    let mut faults = Faults::default();
+    let root = Place::root(document);
+    let object = root.object(fields, &mut faults);
+    let request = object.and_then(|object| Request::read_over(model, &object, base, &mut faults));
+    faults.check(request)
+}
+
+/// Reads a request that names all weights.
+pub(super) fn read_weighted_request<'m>(model: &'m Model, document: &Value) -> Result<Request<'m>, Faults> {
+    read_request(model, document, &Request::FIELDS, |_| Some(model.schema().weights()))
+}
+
+/// Logs what a search gave.
+pub(super) fn report(stamp: &Stamp, mapping: &Mapping) {
+    metrics::counter!("etude_searches_total", "status" => mapping.status.name()).increment(1);
+    #[expect(clippy::cast_precision_loss, reason = "searches take less than centuries")]
+    metrics::histogram!("etude_search_duration_seconds").record(stamp.elapsed_us as f64 / 1e6);
     tracing::info!(
         model = stamp.model,
         status = mapping.status.name(),
         cost = mapping.cost.total,
         expanded = mapping.n_expanded,
-        elapsed_us,
+        elapsed_us = stamp.elapsed_us,
         "searched"
     );
-    let policy = Policy::new(Stamp { elapsed_us, ..stamp }, &problem, &mapping);
-    Ok(write(&policy).and_then(|text| Ok(Searched { policy: text, summary: write(&PolicySummary::of(&policy))? })))
+}
+
+pub(super) fn as_micros(since: Instant) -> u64 {
+    u64::try_from(since.elapsed().as_micros()).unwrap_or(u64::MAX)
 }
 
 pub(super) fn write(document: &impl Serialize) -> Result<String, ServiceError> {

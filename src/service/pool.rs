@@ -6,7 +6,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use tokio::sync::Semaphore;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
@@ -65,18 +65,39 @@ impl SearchPool {
         self.settings.n_threads.max(1) + self.settings.max_waiting - self.admitted.available_permits()
     }
 
-    /// Runs `job` on a thread of the pool. It is told to finish when `deadline` has passed, and to stop when the returned
-    /// future is dropped or the service ends.
+    /// A place in the pool, for all that a request needs.
     ///
     /// # Errors
     ///
-    /// [`PoolError::Busy`] at once if the queue is full; [`PoolError::Stopped`] if the job was told to stop.
-    pub async fn run<T, F>(&self, deadline: Option<Instant>, job: F) -> Result<T, PoolError>
+    /// [`PoolError::Busy`] at once if the queue is full.
+    pub fn admit(&self) -> Result<Admission, PoolError> {
+        let admitted = Arc::clone(&self.admitted).try_acquire_owned().map_err(|_| PoolError::Busy)?;
+        Ok(Admission { pool: self.clone(), admitted: Arc::new(admitted) })
+    }
+
+    /// Runs `job` when there is a thread for it, however many wait. For callers that are bounded in number themselves.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the job was told to stop.
+    pub async fn run_patiently<T, F>(&self, job: F) -> Result<T, PoolError>
     where
         T: Send + 'static,
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
-        let admitted = Arc::clone(&self.admitted).try_acquire_owned().map_err(|_| PoolError::Busy)?;
+        self.run_admitted(None, None, job).await
+    }
+
+    async fn run_admitted<T, F>(
+        &self,
+        admitted: Option<Arc<OwnedSemaphorePermit>>,
+        deadline: Option<Instant>,
+        job: F,
+    ) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
         let cancel = self.abort.child_token();
         // Dropped with this future: whoever waited is gone.
         let _gone: DropGuard = cancel.clone().drop_guard();
@@ -96,6 +117,29 @@ impl SearchPool {
             Ok(Err(Cancelled)) => Err(PoolError::Stopped),
             Err(_) => Err(PoolError::Panicked),
         }
+    }
+}
+
+/// A place in the pool. Given back when this is dropped and the last job that ran by it has ended.
+#[derive(Debug)]
+pub struct Admission {
+    pool: SearchPool,
+    admitted: Arc<OwnedSemaphorePermit>,
+}
+
+impl Admission {
+    /// Runs `job` on a thread of the pool. It is told to finish when `deadline` has passed, and to stop when the returned
+    /// future is dropped or the service ends.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the job was told to stop.
+    pub async fn run<T, F>(&self, deadline: Option<Instant>, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
+        self.pool.run_admitted(Some(Arc::clone(&self.admitted)), deadline, job).await
     }
 }
 
@@ -141,7 +185,7 @@ mod tests {
         let (pool, _abort) = pool(1, 0);
         let waiting = tokio::spawn({
             let pool = pool.clone();
-            async move { pool.run(None, until_cancelled).await }
+            async move { pool.admit()?.run(None, until_cancelled).await }
         });
         while pool.n_jobs() == 0 {
             tokio::task::yield_now().await;
@@ -150,7 +194,7 @@ mod tests {
         while pool.n_jobs() > 0 {
             tokio::task::yield_now().await;
         }
-        assert_eq!(pool.run(None, |_| Ok(7)).await, Ok(7));
+        assert_eq!(pool.admit().unwrap().run(None, |_| Ok(7)).await, Ok(7));
     }
 
     #[tokio::test]
@@ -158,16 +202,16 @@ mod tests {
         let (pool, abort) = pool(1, 1);
         let running = tokio::spawn({
             let pool = pool.clone();
-            async move { pool.run(None, until_cancelled).await }
+            async move { pool.admit()?.run(None, until_cancelled).await }
         });
         let waiting = tokio::spawn({
             let pool = pool.clone();
-            async move { pool.run(None, until_cancelled).await }
+            async move { pool.admit()?.run(None, until_cancelled).await }
         });
         while pool.n_jobs() < 2 {
             tokio::task::yield_now().await;
         }
-        assert_eq!(pool.run(None, |_| Ok(())).await, Err(PoolError::Busy));
+        assert_eq!(pool.admit().map(drop), Err(PoolError::Busy));
         abort.cancel();
         assert_eq!(running.await.unwrap(), Err(PoolError::Stopped));
         assert_eq!(waiting.await.unwrap(), Err(PoolError::Stopped));
@@ -176,6 +220,6 @@ mod tests {
     #[tokio::test]
     async fn a_passed_deadline_asks_the_job_to_finish() {
         let (pool, _abort) = pool(1, 0);
-        assert_eq!(pool.run(Some(Instant::now()), until_cancelled).await, Ok(()));
+        assert_eq!(pool.admit().unwrap().run(Some(Instant::now()), until_cancelled).await, Ok(()));
     }
 }

@@ -12,12 +12,11 @@ use uuid::Uuid;
 use super::learners::{Ready, unknown};
 use super::policies::{self, Searched};
 use super::{Etude, Name, ServiceError};
-use crate::document::{Faults, Place, Range};
+use crate::attribute::{Schema, Weights};
+use crate::document::{Faults, Path, Place, Range};
 use crate::interrupt::Interrupt;
 use crate::mapping::Stamp;
-use crate::store::{
-    FailTrial, NewPolicy, NewReward, NewTrial, Page, PutReward, Store, StoreError, TrialRow, TrialStatus,
-};
+use crate::store::{FailTrial, NewReward, NewTrial, Page, PutReward, Store, StoreError, TrialRow, TrialStatus};
 
 /// Longest reason for a failure, in characters.
 const MAX_REASON_CHARS: usize = 1000;
@@ -48,7 +47,8 @@ impl Etude {
         now: Timestamp,
     ) -> Result<TrialAnswer, ServiceError> {
         let Ready { sequence, name, learner, weights } = self.ready(name.as_str(), None).await?;
-        let document = self.parse(body).await?;
+        let place = self.pool.admit()?;
+        let document = policies::parse(body, &place).await?;
         let mut faults = Faults::default();
         let root = Place::root(&document);
         let model = root.object(&TRIAL_FIELDS, &mut faults).and_then(|object| {
@@ -56,7 +56,7 @@ impl Etude {
             object.required("model", &mut faults)?.string(&mut faults).map(str::to_owned)
         });
         let Some(model) = model else { return Err(faults.into()) };
-        let (model_hash, mapper) = match self.mapper(&model, "/model").await {
+        let (model_hash, mapper) = match self.mapper(&model, "/model", Some(&place)).await {
             Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
             found => found?,
         };
@@ -70,7 +70,7 @@ impl Etude {
             model_hash,
             learner: Some(name.clone()),
             weights_version: Some(weights_version),
-            elapsed_us: 0,
+            ..Stamp::default()
         };
         let lease_s = learner.lease_s();
         let job = move |interrupt: &mut dyn Interrupt| {
@@ -78,7 +78,7 @@ impl Etude {
             let base = |faults: &mut Faults| {
                 let schema = mapper.model().schema();
                 if let Err(missing) = learner.weights_for(schema, &learner.initial().mean) {
-                    faults.append(Faults::one("/model", missing.to_string()));
+                    faults.note_at(&Path::Member(&Path::Root, "model"), missing.to_string());
                 }
                 // A request with faults takes no number: the next trial is the same as if it had not been made.
                 if !faults.is_empty() {
@@ -93,7 +93,8 @@ impl Etude {
             let searched = policies::search(&mapper, &document, &TRIAL_FIELDS, base, stamp, interrupt)?;
             Ok(searched.map(|searched| (searched, drawn)))
         };
-        let (Searched { policy, summary }, drawn) = self.pool.run(None, job).await??;
+        let (Searched { policy, row, refinement }, drawn) = place.run(None, job).await??;
+        drop(place);
         let (number, weights) = drawn.ok_or(StoreError::Closed)?;
         let weights = weights?;
 
@@ -105,11 +106,18 @@ impl Etude {
             number,
             weights: weights.clone(),
             weights_version,
-            policy: NewPolicy { id: policy_id.clone(), summary, policy: policy.clone(), created_at: now },
+            policy_id: policy_id.clone(),
+            policy: Some(row.at(now)),
+            refinement,
+            created_at: now,
             lease_expires_at,
         };
+        let is_refined = new.refinement.is_some();
         if !self.store.add_trial(new).await? {
             return Err(unknown(&name, None));
+        }
+        if is_refined {
+            self.refiner.wake();
         }
         metrics::counter!("etude_trials_total").increment(1);
         let row = TrialRow {
@@ -126,6 +134,31 @@ impl Etude {
             learned_version: None,
         };
         Ok(TrialAnswer { row, status: TrialStatus::Active, policy: Some(read_policy(policy)?) })
+    }
+
+    /// Draws a trial for a policy that is still in the making. The caller stores it.
+    pub(super) async fn draw(&self, ready: &Ready, schema: &Schema, now: Timestamp) -> Result<Draw, ServiceError> {
+        let Ready { sequence, learner, weights, .. } = ready;
+        let numbers = self.trial_numbers.of(*sequence, &self.store).await?;
+        let number = numbers.fetch_add(1, Ordering::Relaxed) + 1;
+        let drawn = learner.draw(&weights.distribution, number);
+        let missing = |missing: crate::learning::MissingAttributes| Faults::one("/learner", missing.to_string());
+        let all = learner.weights_for(schema, &drawn).map_err(missing)?;
+        let now = as_stored(now);
+        let trial = NewTrial {
+            id: Uuid::now_v7().to_string(),
+            learner: *sequence,
+            number,
+            weights: policies::write(&learner.by_attribute(drawn))?,
+            weights_version: weights.version,
+            policy_id: Uuid::now_v7().to_string(),
+            policy: None,
+            refinement: None,
+            created_at: now,
+            lease_expires_at: now.checked_add(Duration::from_secs(learner.lease_s())).unwrap_or(Timestamp::MAX),
+        };
+        metrics::counter!("etude_trials_total").increment(1);
+        Ok(Draw { trial, weights: all })
     }
 
     /// The trial with this id, with its policy.
@@ -170,7 +203,15 @@ impl Etude {
         let object = Place::root(&document).object(&["reward"], &mut faults);
         let reward =
             object.and_then(|object| object.required("reward", &mut faults)?.number(Range::Finite, &mut faults));
-        let reward = faults.check(reward)?;
+        self.accept_reward(id, faults.check(reward)?, now).await
+    }
+
+    /// Accepts a reward, which must be finite, for a trial; durable when this returns. The same reward again changes nothing.
+    ///
+    /// # Errors
+    ///
+    /// If there is no such trial, or it has another reward or has failed.
+    pub async fn accept_reward(&self, id: &str, reward: f64, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
         let new = NewReward { trial: id.to_owned(), reward, accepted_at: now };
         let row = match self.store.put_reward(new).await? {
             PutReward::Accepted(row) => {
@@ -216,6 +257,12 @@ impl Etude {
     }
 }
 
+/// A trial that was drawn, and the weights of the distance that it gives.
+pub(super) struct Draw {
+    pub(super) trial: NewTrial,
+    pub(super) weights: Weights,
+}
+
 /// Every field of a request for a trial.
 const TRIAL_FIELDS: [&str; 4] = ["model", "demonstration", "start", "lookahead"];
 
@@ -228,7 +275,7 @@ pub(super) struct TrialNumbers {
 
 impl TrialNumbers {
     /// The last number given out by the learner with this sequence number.
-    async fn of(&self, learner: i64, store: &Store) -> Result<Arc<AtomicU64>, StoreError> {
+    pub(super) async fn of(&self, learner: i64, store: &Store) -> Result<Arc<AtomicU64>, StoreError> {
         let known = self.last.lock().unwrap_or_else(PoisonError::into_inner).get(&learner).cloned();
         if let Some(last) = known {
             return Ok(last);
@@ -256,6 +303,6 @@ fn read_policy(policy: String) -> Result<Box<RawValue>, ServiceError> {
 }
 
 /// A time as exact as it is stored.
-fn as_stored(time: Timestamp) -> Timestamp {
+pub(super) fn as_stored(time: Timestamp) -> Timestamp {
     time.round(jiff::Unit::Millisecond).unwrap_or(time)
 }

@@ -12,6 +12,8 @@
 mod learners;
 mod models;
 mod policies;
+mod refinements;
+mod sessions;
 mod trials;
 mod writer;
 
@@ -21,6 +23,8 @@ use std::time::Duration;
 pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
 pub use models::{ModelRow, ModelSummary, NewModel, PutModel};
 pub use policies::{NewPolicy, PolicySummaryRow};
+pub use refinements::{NewRefinement, RefinementEnd};
+pub use sessions::{NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus};
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection};
@@ -42,7 +46,10 @@ const N_READERS: u32 = 4;
 pub enum StoreError {
     /// The database failed.
     #[error("the database failed")]
-    Database(#[from] sqlx::Error),
+    Database(#[source] sqlx::Error),
+    /// Another process has held the database for too long; later it may go through.
+    #[error("the database is locked by another process")]
+    Locked,
     /// The database could not be brought to this version's schema.
     #[error("the database could not be migrated")]
     Migrate(#[from] sqlx::migrate::MigrateError),
@@ -65,9 +72,18 @@ pub enum StoreError {
         #[source]
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    /// The store is shutting down, or its writer failed with the error that was given to another waiter.
+    /// The store is shutting down.
     #[error("the store takes no more writes")]
     Closed,
+}
+
+impl From<sqlx::Error> for StoreError {
+    fn from(error: sqlx::Error) -> Self {
+        /// Primary result code of SQLite; extended codes have it in their low byte.
+        const SQLITE_BUSY: u32 = 5;
+        let code = error.as_database_error().and_then(|error| error.code()?.parse::<u32>().ok());
+        if code.is_some_and(|code| code & 0xff == SQLITE_BUSY) { Self::Locked } else { Self::Database(error) }
+    }
 }
 
 /// The durable state of the service.
@@ -95,6 +111,8 @@ impl Store {
         let mut connection = SqliteConnection::connect_with(&options).await?;
         check_version(&mut connection).await?;
         migrator().run_direct(None, &mut connection, false).await?;
+        // A database that cannot be written to should be told of now, not with the first request.
+        connection.begin_with("BEGIN IMMEDIATE").await?.rollback().await?;
         let readers = SqlitePoolOptions::new()
             .max_connections(N_READERS)
             .connect_with(options.create_if_missing(false).pragma("query_only", "ON"))
@@ -115,7 +133,7 @@ impl Store {
     ///
     /// If it does not.
     pub async fn check(&self) -> Result<(), StoreError> {
-        sqlx::query("SELECT 1").execute(&self.readers).await?;
+        sqlx::query("SELECT count(*) FROM (SELECT 1 FROM models LIMIT 1)").execute(&self.readers).await?;
         Ok(())
     }
 }
@@ -128,6 +146,7 @@ fn migrator() -> Migrator {
     Migrator {
         migrations: vec![
             migration(1, "models and policies", include_str!("../../migrations/0001_models_and_policies.sql")),
+            migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
             migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
         ]
         .into(),

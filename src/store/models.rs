@@ -168,7 +168,11 @@ pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> 
     if inserted.rows_affected() == 1 {
         return Ok(PutModel::Created(summary.clone()));
     }
-    let query = sqlx::query("SELECT * FROM models WHERE name = $1").bind(&summary.name);
+    let query = sqlx::query(
+        "SELECT name, hash, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms
+         FROM models WHERE name = $1",
+    );
+    let query = query.bind(&summary.name);
     let existing = read_summary(&query.fetch_one(connection).await?)?;
     Ok(if existing.hash == summary.hash {
         PutModel::Unchanged(existing)

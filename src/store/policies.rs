@@ -3,7 +3,8 @@
 use jiff::Timestamp;
 use sqlx::{Row, SqliteConnection};
 
-use super::writer::{Write, Written};
+use super::refinements::NewRefinement;
+use super::writer::Write;
 use super::{Page, Store, StoreError, corrupt};
 
 /// A policy to be stored.
@@ -29,16 +30,13 @@ pub struct PolicySummaryRow {
 }
 
 impl Store {
-    /// Stores a policy.
+    /// Stores a policy, and notes that it is to be refined if `refinement` says so.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn add_policy(&self, policy: NewPolicy) -> Result<(), StoreError> {
-        match self.writer.write(Write::AddPolicy(policy)).await? {
-            Written::AddPolicy => Ok(()),
-            _ => Err(StoreError::Closed),
-        }
+    pub async fn add_policy(&self, policy: NewPolicy, refinement: Option<NewRefinement>) -> Result<(), StoreError> {
+        self.writer.write(Write::AddPolicy(policy, refinement)).await.map(drop)
     }
 
     /// The policy with this id: JSON.

@@ -9,7 +9,7 @@ use sqlx::{AssertSqlSafe, QueryBuilder, Row, SqliteConnection};
 
 use super::learners::as_integer;
 use super::writer::{Write, Written};
-use super::{NewPolicy, Page, Store, StoreError, count, policies, timestamp};
+use super::{NewPolicy, NewRefinement, Page, Store, StoreError, count, policies, refinements, timestamp};
 
 /// A trial to be stored.
 #[derive(Clone, Debug)]
@@ -24,8 +24,14 @@ pub struct NewTrial {
     pub weights: String,
     /// The version that they were drawn from.
     pub weights_version: u64,
-    /// The policy that they gave.
-    pub policy: NewPolicy,
+    /// The id of the policy that they give.
+    pub policy_id: String,
+    /// That policy, unless it is still in the making.
+    pub policy: Option<NewPolicy>,
+    /// What is to be done about the policy, if it is local.
+    pub refinement: Option<NewRefinement>,
+    /// When it is drawn.
+    pub created_at: Timestamp,
     /// When it expires.
     pub lease_expires_at: Timestamp,
 }
@@ -189,7 +195,7 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn add_trial(&self, trial: NewTrial) -> Result<bool, StoreError> {
-        match self.writer.write(Write::AddTrial(trial)).await? {
+        match self.writer.write(Write::AddTrial(Box::new(trial))).await? {
             Written::AddTrial(added) => Ok(added),
             _ => Err(StoreError::Closed),
         }
@@ -309,15 +315,20 @@ pub(super) async fn add(connection: &mut SqliteConnection, trial: &NewTrial) -> 
     .bind(as_integer(trial.number))
     .bind(&trial.weights)
     .bind(as_integer(trial.weights_version))
-    .bind(&trial.policy.id)
+    .bind(&trial.policy_id)
     .bind(trial.lease_expires_at.as_millisecond())
-    .bind(trial.policy.created_at.as_millisecond())
+    .bind(trial.created_at.as_millisecond())
     .execute(&mut *connection)
     .await?;
     if inserted.rows_affected() == 0 {
         return Ok(false);
     }
-    policies::add(connection, &trial.policy).await?;
+    if let Some(policy) = &trial.policy {
+        policies::add(connection, policy).await?;
+    }
+    if let Some(refinement) = &trial.refinement {
+        refinements::add(connection, refinement).await?;
+    }
     Ok(true)
 }
 

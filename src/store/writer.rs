@@ -3,14 +3,19 @@
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies
 //! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves.
 
+use std::collections::{HashMap, HashSet};
+
 use sqlx::{Connection, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use jiff::Timestamp;
+
 use super::{
-    FailTrial, NewLearner, NewModel, NewPolicy, NewReward, NewTrial, PutLearner, PutModel, PutReward, StoreError,
-    WeightsRow, learners, models, policies, trials,
+    FailTrial, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement, NewReward, NewSession, NewTrial,
+    PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, WeightsRow, learners, models, policies,
+    refinements, sessions, trials,
 };
 
 /// Most writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
@@ -24,12 +29,24 @@ const MAX_WAITING: usize = 1024;
 pub(super) enum Write {
     PutModel(NewModel),
     DeleteModel(String),
-    AddPolicy(NewPolicy),
+    AddPolicy(NewPolicy, Option<NewRefinement>),
+    EndRefinement(Box<RefinementEnd>),
+    OpenSession(Box<NewSession>),
+    AddObservations(NewObservations),
+    EndSession(Box<SessionEnd>),
+    /// Those last active before this time.
+    ExpireSessions(Timestamp),
     PutLearner(NewLearner),
     DeleteLearner(String),
-    AddWeights { learner: i64, weights: WeightsRow },
-    AddTrial(NewTrial),
-    FailTrial { id: String, reason: Option<String> },
+    AddWeights {
+        learner: i64,
+        weights: WeightsRow,
+    },
+    AddTrial(Box<NewTrial>),
+    FailTrial {
+        id: String,
+        reason: Option<String>,
+    },
     PutReward(NewReward),
 }
 
@@ -39,7 +56,8 @@ pub(super) enum Written {
     PutModel(PutModel),
     /// Whether there was one.
     DeleteModel(bool),
-    AddPolicy,
+    /// Whether things were as expected, so that it was done.
+    Done(bool),
     PutLearner(PutLearner),
     /// The sequence number of the deleted one, if there was one.
     DeleteLearner(Option<i64>),
@@ -108,6 +126,12 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
                     let _ = job.answer.send(Ok(written));
                 }
             }
+            Err(StoreError::Locked) => {
+                // Each on its own would wait as long again.
+                for job in group.drain(..) {
+                    let _ = job.answer.send(Err(StoreError::Locked));
+                }
+            }
             Err(_) if group.len() > 1 => {
                 // One write must not spoil the others: each gets a transaction and an error of its own.
                 for job in group.drain(..) {
@@ -134,12 +158,14 @@ async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     let mut written = Vec::with_capacity(group.len());
     let mut rewards = Vec::new();
-    for job in group {
+    let mut added = add_observations(&mut transaction, group).await?;
+    for (n, job) in group.iter().enumerate() {
         written.push(match &job.write {
             Write::PutReward(reward) => {
                 rewards.push(reward);
                 None
             }
+            Write::AddObservations(_) if let Some(was_next) = added.remove(&n) => Some(Written::Done(was_next)),
             write => Some(apply(&mut transaction, write).await?),
         });
     }
@@ -159,9 +185,25 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
     Ok(match write {
         Write::PutModel(model) => Written::PutModel(models::put(connection, model).await?),
         Write::DeleteModel(name) => Written::DeleteModel(models::delete(connection, name).await?),
-        Write::AddPolicy(policy) => {
+        Write::AddPolicy(policy, refinement) => {
             policies::add(connection, policy).await?;
-            Written::AddPolicy
+            if let Some(refinement) = refinement {
+                refinements::add(connection, refinement).await?;
+            }
+            Written::Done(true)
+        }
+        Write::EndRefinement(end) => {
+            refinements::end(connection, end).await?;
+            Written::Done(true)
+        }
+        Write::OpenSession(session) => Written::Done(sessions::open(connection, session).await?),
+        Write::AddObservations(observations) => {
+            Written::Done(sessions::add(connection, &[observations]).await? == [true])
+        }
+        Write::EndSession(end) => Written::Done(sessions::end(connection, end).await?),
+        Write::ExpireSessions(before) => {
+            sessions::expire(connection, *before).await?;
+            Written::Done(true)
         }
         Write::PutLearner(learner) => Written::PutLearner(learners::put(connection, learner).await?),
         Write::DeleteLearner(name) => Written::DeleteLearner(learners::delete(connection, name).await?),
@@ -177,4 +219,26 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
             Written::PutReward(Box::new(put.pop().ok_or(StoreError::Closed)?))
         }
     })
+}
+
+/// Adds the observations of a group at once, but for those to a session that the group has already added to: a session was
+/// resumed meanwhile. Gives by index in the group whether they came next. What else a group does to these
+/// sessions was not waited for by their owner, so any order will do.
+async fn add_observations(
+    connection: &mut SqliteConnection,
+    group: &[Job],
+) -> Result<HashMap<usize, bool>, StoreError> {
+    let mut sessions_added = HashSet::new();
+    let (indices, news): (Vec<usize>, Vec<&NewObservations>) = group
+        .iter()
+        .enumerate()
+        .filter_map(|(n, job)| match &job.write {
+            Write::AddObservations(new) => sessions_added.insert(&new.session_id).then_some((n, new)),
+            _ => None,
+        })
+        .unzip();
+    if news.is_empty() {
+        return Ok(HashMap::new());
+    }
+    Ok(indices.into_iter().zip(sessions::add(connection, &news).await?).collect())
 }

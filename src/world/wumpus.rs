@@ -90,11 +90,14 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+    use crate::interrupt::Uninterrupted;
     use crate::model::{Definition, Limits};
 
     fn world(wumpi: &[[u16; 2]], gold: &[[u16; 2]]) -> WumpusWorld {
         let model = json!({"dynamics": {"kind": "wumpus", "width": 4, "height": 2, "wumpi": wumpi, "gold": gold}});
-        let Ok(Definition::Wumpus(cave)) = Definition::read(&model, Limits::DEFAULT) else { panic!("a cave") };
+        let Ok(Definition::Wumpus(cave)) = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted) else {
+            panic!("a cave")
+        };
         WumpusWorld::new(cave, Rewards::PAPER)
     }
 

@@ -125,3 +125,31 @@ pub(crate) fn distance(model: &Value, weights: &Value, observation: &Value, stat
     }
     sum
 }
+
+/// The least cost of going from the node `(i, s)`, itself not counted, to any state at the observation `to`.
+pub(crate) fn cost_to_go(
+    model: &Value,
+    demonstration: &Value,
+    weights: &Value,
+    (i, s): (usize, usize),
+    to: usize,
+) -> f64 {
+    let states = model["dynamics"]["states"].as_array().unwrap();
+    let d = |i: usize, s: usize| distance(model, weights, &demonstration[i], &states[s]);
+    let edges = edges(model);
+    let mut layer = vec![f64::INFINITY; states.len()];
+    layer[s] = 0.0;
+    relax_extras(&mut layer, &edges, |s| d(i, s));
+    for j in i + 1..=to {
+        let mut next = vec![f64::INFINITY; states.len()];
+        for s in 0..states.len() {
+            next[s] = next[s].min(layer[s] + d(j, s));
+        }
+        for &(from, cost, to) in &edges {
+            next[to] = next[to].min(layer[from] + cost + d(j, to));
+        }
+        relax_extras(&mut next, &edges, |s| d(j, s));
+        layer = next;
+    }
+    layer.into_iter().fold(f64::INFINITY, f64::min)
+}

@@ -19,7 +19,7 @@ use std::collections::BinaryHeap;
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::Heuristic;
-use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
 use crate::model::{ActionIdx, Model, StateIdx};
 
@@ -42,6 +42,8 @@ struct Group {
     class_rows: Vec<u32>,
     /// Distinct ways to change the class.
     edges: Vec<ProjectedEdge>,
+    /// Whether its edges fit.
+    is_kept: bool,
 }
 
 type ClassIdx = u32;
@@ -55,69 +57,142 @@ struct ProjectedEdge {
     change_set: u32,
 }
 
+/// Most edges of all groups together, and most entries of all change sets: 256 and 32 MB. Groups whose edges do not fit are
+/// left out, which keeps the bound a bound.
+const MAX_EDGES: usize = 1 << 24;
+
 impl Projections {
     /// Projects `model` on each of its attributes that varies.
-    pub(crate) fn new(model: &Model) -> Self {
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    pub(crate) fn new(model: &Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
+        Self::bounded(model, MAX_EDGES, interrupt)
+    }
+
+    fn bounded(model: &Model, max_edges: usize, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
+        /// How many classes are looked up between two looks at the interrupt: about a millisecond.
+        const POLL_EVERY: u64 = 1 << 14;
+        let mut meter = Meter::new(interrupt, POLL_EVERY);
         let states = model.states();
         let varies = |attribute: &usize| states.domain(*attribute).len() > 1;
-        let mut groups: Vec<Group> =
-            (0..model.schema().len()).filter(varies).map(|attribute| Group::new(model, &[attribute])).collect();
+        let groups =
+            (0..model.schema().len()).filter(varies).map(|attribute| Group::new(model, &[attribute], &mut meter));
+        let mut groups: Vec<Group> = groups.collect::<Result<_, _>>()?;
 
-        let mut change_sets: Vec<Vec<u16>> = Vec::new();
-        let mut numbers: FxHashMap<Vec<u16>, u32> = FxHashMap::default();
-        let mut edges: Vec<FxHashSet<ProjectedEdge>> = vec![FxHashSet::default(); groups.len()];
+        let mut change_sets = ChangeSets::default();
+        // `None` for a group that is left out.
+        let mut edges: Vec<Option<FxHashSet<ProjectedEdge>>> = vec![Some(FxHashSet::default()); groups.len()];
+        let mut n_edges = 0;
         let mut changed = Vec::new();
         for (from, transition) in model.graph().iter() {
+            meter.spend_or_cancel(groups.len() as u64)?;
             let is_changed = |group: &Group| group.class(from) != group.class(transition.to);
+            let kept = groups.iter().zip(&edges).zip(0u16..).filter(|((_, edges), _)| edges.is_some());
             changed.clear();
-            changed.extend(groups.iter().zip(0u16..).filter(|(group, _)| is_changed(group)).map(|(_, number)| number));
-            let change_set = numbers.get(&changed).copied().unwrap_or_else(|| {
-                #[expect(clippy::cast_possible_truncation, reason = "at most one per transition, fewer than 2^32")]
-                let number = change_sets.len() as u32;
-                numbers.insert(changed.clone(), number);
-                change_sets.push(changed.clone());
-                number
-            });
+            changed.extend(kept.filter(|((group, _), _)| is_changed(group)).map(|(_, number)| number));
+            let change_set = change_sets.number_of(&changed);
             for number in &changed {
                 let group = &groups[usize::from(*number)];
                 let (from, to) = (group.class(from), group.class(transition.to));
-                edges[usize::from(*number)].insert(ProjectedEdge { from, to, action: transition.action, change_set });
+                let edge = ProjectedEdge { from, to, action: transition.action, change_set };
+                let is_new = edges[usize::from(*number)].as_mut().is_some_and(|edges| edges.insert(edge));
+                n_edges += usize::from(is_new);
+            }
+            if n_edges > max_edges || change_sets.n_entries > max_edges {
+                leave_out_larger_half(&mut edges);
+                change_sets.rebuild(&mut edges);
+                n_edges = edges.iter().flatten().map(FxHashSet::len).sum();
             }
         }
         for (group, edges) in groups.iter_mut().zip(edges) {
-            group.edges = edges.into_iter().collect();
+            group.is_kept = edges.is_some();
+            group.edges = edges.into_iter().flatten().collect();
             // The order of a hash set must not reach the results.
             group.edges.sort_unstable();
         }
-        Self { groups, change_sets }
+        Ok(Self { groups, change_sets: change_sets.sets })
     }
 
     /// Approximate size in memory, in bytes.
     pub(crate) fn size_bytes(&self) -> usize {
-        self.groups.iter().map(Group::size_bytes).sum()
+        let change_sets: usize =
+            self.change_sets.iter().map(|set| size_of_val(set) + size_of_val(set.as_slice())).sum();
+        change_sets + self.groups.iter().map(Group::size_bytes).sum::<usize>()
+    }
+}
+
+/// Leaves out half of the groups that are kept, those with the most edges; the later ones among equals.
+fn leave_out_larger_half(edges: &mut [Option<FxHashSet<ProjectedEdge>>]) {
+    let kept = edges.iter().enumerate().filter_map(|(number, edges)| Some((edges.as_ref()?.len(), number)));
+    let mut kept: Vec<_> = kept.collect();
+    kept.sort_unstable();
+    for (_, number) in kept.drain(kept.len() / 2..) {
+        edges[number] = None;
+    }
+}
+
+/// Distinct sets of groups, numbered as they are found.
+#[derive(Default)]
+struct ChangeSets {
+    sets: Vec<Vec<u16>>,
+    numbers: FxHashMap<Vec<u16>, u32>,
+    n_entries: usize,
+}
+
+impl ChangeSets {
+    fn number_of(&mut self, set: &[u16]) -> u32 {
+        self.numbers.get(set).copied().unwrap_or_else(|| {
+            #[expect(clippy::cast_possible_truncation, reason = "at most one per transition, fewer than 2^32")]
+            let number = self.sets.len() as u32;
+            self.numbers.insert(set.to_vec(), number);
+            self.sets.push(set.to_vec());
+            self.n_entries += set.len();
+            number
+        })
+    }
+
+    /// Removes the groups that have no edges any more, and numbers the sets anew.
+    fn rebuild(&mut self, edges: &mut [Option<FxHashSet<ProjectedEdge>>]) {
+        let old = std::mem::take(self);
+        let numbers: Vec<u32> = old
+            .sets
+            .into_iter()
+            .map(|mut set| {
+                set.retain(|group| edges[usize::from(*group)].is_some());
+                self.number_of(&set)
+            })
+            .collect();
+        for edges in edges.iter_mut().flatten() {
+            let renumbered =
+                |edge: ProjectedEdge| ProjectedEdge { change_set: numbers[edge.change_set as usize], ..edge };
+            *edges = std::mem::take(edges).into_iter().map(renumbered).collect();
+        }
     }
 }
 
 impl Group {
-    fn new(model: &Model, attributes: &[usize]) -> Self {
+    fn new(model: &Model, attributes: &[usize], meter: &mut Meter<'_>) -> Result<Self, Cancelled> {
         let states = model.states();
         let mut classes: FxHashMap<Vec<u32>, ClassIdx> = FxHashMap::default();
         let mut class_rows = Vec::new();
         let mut key = Vec::with_capacity(attributes.len());
         let class_of = (0..states.len()).map(|state| {
+            meter.spend_or_cancel(1)?;
             let row = states.row(state);
             key.clear();
             key.extend(attributes.iter().map(|attribute| row[*attribute]));
-            classes.get(&key).copied().unwrap_or_else(|| {
+            Ok(classes.get(&key).copied().unwrap_or_else(|| {
                 #[expect(clippy::cast_possible_truncation, reason = "at most one per state")]
                 let class = classes.len() as ClassIdx;
                 classes.insert(key.clone(), class);
                 class_rows.extend_from_slice(&key);
                 class
-            })
+            }))
         });
-        let class_of = class_of.collect();
-        Self { attributes: attributes.to_vec(), class_of, class_rows, edges: Vec::new() }
+        let class_of = class_of.collect::<Result<_, _>>()?;
+        Ok(Self { attributes: attributes.to_vec(), class_of, class_rows, edges: Vec::new(), is_kept: true })
     }
 
     fn class(&self, state: StateIdx) -> ClassIdx {
@@ -155,7 +230,8 @@ struct Table<'m> {
     cost_to_go: Vec<f64>,
 }
 
-/// Most entries of a table: 128 MB. A group that would need more is left out, which keeps the bound a bound.
+/// Most entries of all tables together: 128 MB. Groups that do not fit, the largest, are left out, which keeps the bound a
+/// bound.
 const MAX_TABLE_ENTRIES: usize = 1 << 24;
 
 impl<'m> Projected<'m> {
@@ -169,13 +245,7 @@ impl<'m> Projected<'m> {
         problem: &Problem<'_>,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
-        let n_observations = problem.demonstration.len();
-        // A group whose attributes weigh nothing would take its share of the actions' costs to no purpose.
-        let is_used = |group: &Group| {
-            group.attributes.iter().any(|attribute| problem.distances.is_active(*attribute))
-                && n_observations.saturating_mul(group.n_classes()) <= MAX_TABLE_ENTRIES
-        };
-        let used: Vec<bool> = projections.groups.iter().map(is_used).collect();
+        let used = used_groups(projections, problem, MAX_TABLE_ENTRIES);
         let n_sharing: Vec<f64> = projections
             .change_sets
             .iter()
@@ -192,6 +262,26 @@ impl<'m> Projected<'m> {
         }
         Ok(Some(Self { tables }))
     }
+}
+
+/// Which groups have tables, the smallest first as far as `max_entries` go.
+fn used_groups(projections: &Projections, problem: &Problem<'_>, max_entries: usize) -> Vec<bool> {
+    let groups = &projections.groups;
+    // A group whose attributes weigh nothing would take its share of the actions' costs to no purpose.
+    let is_wanted = |group: &Group| {
+        group.is_kept && group.attributes.iter().any(|attribute| problem.distances.is_active(*attribute))
+    };
+    let mut wanted: Vec<usize> = (0..groups.len()).filter(|number| is_wanted(&groups[*number])).collect();
+    wanted.sort_by_key(|number| groups[*number].n_classes());
+    let mut used = vec![false; groups.len()];
+    let mut n_left = max_entries;
+    for number in wanted {
+        let n_entries = problem.demonstration.len().saturating_mul(groups[number].n_classes());
+        let Some(left) = n_left.checked_sub(n_entries) else { break };
+        n_left = left;
+        used[number] = true;
+    }
+    used
 }
 
 impl Heuristic for Projected<'_> {
@@ -223,6 +313,9 @@ impl<'m> Table<'m> {
         share: impl Fn(&ProjectedEdge) -> f64,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
+        /// How many classes are looked at between two looks at the interrupt: about a millisecond.
+        const POLL_EVERY: u64 = 1 << 14;
+        let mut meter = Meter::new(interrupt, POLL_EVERY);
         let (n_observations, n_classes) = (problem.demonstration.len(), group.n_classes());
         let predecessors = Predecessors::new(n_classes, &group.edges, share);
         let mut cost_to_go = vec![0.0; n_observations * n_classes];
@@ -231,7 +324,7 @@ impl<'m> Table<'m> {
         let mut here: Vec<f64> = terms(problem.last()).collect();
         let mut open = BinaryHeap::new();
         for i in (0..problem.last()).rev() {
-            match interrupt.poll() {
+            match meter.spend(n_classes as u64) {
                 Signal::Continue => {}
                 Signal::Finish => return Ok(None),
                 Signal::Cancel => return Err(Cancelled),
@@ -251,6 +344,11 @@ impl<'m> Table<'m> {
             }
             open.extend(row.iter().zip(0..).map(|(cost, class)| Open { cost: *cost, class }));
             while let Some(Open { cost, class }) = open.pop() {
+                match meter.spend(1) {
+                    Signal::Continue => {}
+                    Signal::Finish => return Ok(None),
+                    Signal::Cancel => return Err(Cancelled),
+                }
                 if cost > row[class as usize] {
                     continue;
                 }

@@ -1,0 +1,652 @@
+//! Sessions: streams of observations in, committed steps out, durable.
+//!
+//! Of a session only what it was opened with and its observations are stored. Whoever resumes it gets the same steps
+//! again, because they follow from those. A session belongs to one connection at a time; resuming takes it over.
+
+use std::collections::HashMap;
+use std::num::NonZeroU32;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use jiff::Timestamp;
+use serde_json::Value;
+use tokio::sync::OwnedMutexGuard;
+use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
+
+use super::learners::Ready;
+use super::policies::{PolicyText, as_micros, report};
+use super::{Etude, PoolError, ServiceError};
+use crate::attribute::{ByAttribute, Weights};
+use crate::document::{self, Faults, Object, Path, Place};
+use crate::interrupt::{Interrupt, Uninterrupted};
+use crate::mapping::{
+    CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, read_lookahead,
+};
+use crate::store::{
+    NewObservations, NewRefinement, NewSession, Page, SessionEnd, SessionRow, SessionStatus, StoreError,
+};
+
+/// Why a session could not do as told.
+#[derive(Debug, thiserror::Error)]
+pub enum SessionError {
+    /// Observations are missing in between.
+    #[error("expected seq {expected}")]
+    Gap {
+        /// The observation that comes next.
+        expected: u32,
+    },
+    /// There would be more observations than a session may have.
+    #[error("a session has at most {} observations", Demonstration::MAX_OBSERVATIONS)]
+    TooMany,
+    /// There is no demonstration to end.
+    #[error("nothing was observed yet")]
+    Empty,
+    /// The demonstration has ended already.
+    #[error("the demonstration has ended")]
+    Ended,
+    /// Something is wrong with the frame.
+    #[error("{0}")]
+    Faults(#[from] Faults),
+    /// The session has expired, or was ended or taken over by another connection.
+    #[error("the session is not open any more")]
+    NotOpen,
+    /// Whatever else can go wrong.
+    #[error(transparent)]
+    Service(#[from] ServiceError),
+}
+
+impl From<StoreError> for SessionError {
+    fn from(error: StoreError) -> Self {
+        Self::Service(error.into())
+    }
+}
+
+impl From<PoolError> for SessionError {
+    fn from(error: PoolError) -> Self {
+        Self::Service(error.into())
+    }
+}
+
+/// Work up to this many states times layers is done where it arrives, which takes less than a millisecond; more in the
+/// pool.
+const MAX_INLINE_WORK: usize = 1 << 14;
+
+/// Lookahead of a session that names none.
+const DEFAULT_LOOKAHEAD: u32 = 8;
+
+/// An open session, and the right to drive it.
+#[derive(Debug)]
+pub struct Session {
+    id: String,
+    model: String,
+    model_hash: String,
+    mapper: Arc<Mapper>,
+    weights: Weights,
+    lookahead: Option<NonZeroU32>,
+    start: Option<u32>,
+    source: Source,
+    n_received: u32,
+    n_steps: usize,
+    /// `None` once the session has ended.
+    online: Option<OnlineMapping>,
+    ownership: Ownership,
+}
+
+/// Where a session's weights come from.
+#[derive(Clone, Debug)]
+struct Source {
+    learner: Option<String>,
+    weights_version: Option<u64>,
+    trial_id: Option<String>,
+}
+
+/// A session that was resumed.
+#[derive(Debug)]
+pub struct Resumed {
+    /// The session.
+    pub session: Session,
+    /// Every step that was committed so far.
+    pub steps: Vec<CommittedStep>,
+    /// Its policy, if it has ended.
+    pub policy: Option<Policy>,
+}
+
+/// The end of a session.
+#[derive(Debug)]
+pub struct Ended {
+    /// The steps committed by the end.
+    pub steps: Vec<CommittedStep>,
+    /// The policy of the whole, stored.
+    pub policy: Policy,
+}
+
+impl Etude {
+    /// Opens a session as `request` says: an object with the fields [`Session::OPEN_FIELDS`].
+    ///
+    /// # Errors
+    ///
+    /// If the request has faults or names what is unknown.
+    pub async fn open_session(&self, request: &Value, now: Timestamp) -> Result<Session, SessionError> {
+        let mut faults = Faults::default();
+        let root = Place::root(request);
+        let object = root.object(&Session::OPEN_FIELDS, &mut faults);
+        let names = object.as_ref().and_then(|object| read_names(object, &mut faults));
+        let Names { model, learner, explores } = faults.clone().check(names)?;
+        let learner = match learner {
+            Some(learner) => Some(self.ready(&learner, Some("/learner")).await?),
+            None => None,
+        };
+        let (model_hash, mapper) = self.mapper(&model, "/model", None).await?;
+        let opening = object.as_ref().and_then(|object| Opening::read(&mapper, learner.as_ref(), object, &mut faults));
+        let Opening { mut weights, lookahead, start } = faults.check(opening)?;
+
+        let mut trial = None;
+        if let (true, Some(ready)) = (explores, &learner) {
+            let draw = self.draw(ready, mapper.model().schema(), now).await?;
+            weights = draw.weights;
+            trial = Some(draw.trial);
+        }
+        let id = Uuid::now_v7().to_string();
+        let ownership = self.owners.take(&id).await;
+        let source = Source {
+            learner: learner.as_ref().map(|ready| ready.name.clone()),
+            weights_version: learner.as_ref().map(|ready| ready.weights.version),
+            trial_id: trial.as_ref().map(|trial| trial.id.clone()),
+        };
+        let opened = self
+            .store
+            .open_session(NewSession {
+                id: id.clone(),
+                model: model.clone(),
+                model_hash: model_hash.clone(),
+                weights: weights.as_slice().to_vec(),
+                lookahead: lookahead.map(NonZeroU32::get),
+                start,
+                learner: source.learner.clone(),
+                weights_version: source.weights_version,
+                trial,
+                created_at: now,
+            })
+            .await?;
+        if !opened {
+            // Deleted in between.
+            let name = source.learner.unwrap_or_default();
+            return Err(ServiceError::Unknown { kind: "learner", name, pointer: Some("/learner") }.into());
+        }
+        let online = OnlineMapping::new(Arc::clone(&mapper), weights.clone(), start, lookahead);
+        let online = Some(online);
+        Ok(Session {
+            id,
+            model,
+            model_hash,
+            mapper,
+            weights,
+            lookahead,
+            start,
+            source,
+            n_received: 0,
+            n_steps: 0,
+            online,
+            ownership,
+        })
+    }
+
+    /// Takes over the session `id`, from whatever connection drives it, and makes its steps again.
+    ///
+    /// # Errors
+    ///
+    /// If there is none, it has expired, or its model is gone.
+    pub async fn resume_session(&self, id: &str) -> Result<Resumed, SessionError> {
+        // Looked up first, so that nobody is bothered for what does not exist.
+        self.session(id).await?;
+        let ownership = self.owners.take(id).await;
+        let row = self.session(id).await?;
+        if row.status == SessionStatus::Expired {
+            return Err(SessionError::NotOpen);
+        }
+        let (hash, mapper) = self.mapper(&row.model, "/model", None).await?;
+        if hash != row.model_hash {
+            let name = format!("{} with hash {}", row.model, row.model_hash);
+            return Err(ServiceError::Unknown { kind: "model", name, pointer: None }.into());
+        }
+        let weights = Weights::of(row.weights);
+        let lookahead = row.lookahead.and_then(NonZeroU32::new);
+        let mut session = Session {
+            id: row.id,
+            model: row.model,
+            model_hash: row.model_hash,
+            weights: weights.clone(),
+            lookahead,
+            start: row.start,
+            source: Source { learner: row.learner, weights_version: row.weights_version, trial_id: row.trial_id },
+            n_received: row.n_observations,
+            n_steps: 0,
+            online: Some(OnlineMapping::new(Arc::clone(&mapper), weights, row.start, lookahead)),
+            mapper,
+            ownership,
+        };
+        let texts = self.store.observations(id).await?;
+        let observations = read_stored(&session.mapper, &texts)?;
+        let mut steps = session.advance(self, observations).await?;
+        let policy = match row.policy_id {
+            None => None,
+            Some(policy_id) => {
+                let rest = session.online.take().and_then(OnlineMapping::end);
+                steps.extend(rest.map(|(rest, _)| rest).unwrap_or_default());
+                session.n_steps = steps.len();
+                let policy = self.policy(&policy_id).await?;
+                let corrupt = |error: serde_json::Error| StoreError::Corrupt {
+                    table: "policies",
+                    column: "policy",
+                    source: error.into(),
+                };
+                Some(serde_json::from_str(&policy).map_err(corrupt)?)
+            }
+        };
+        Ok(Resumed { session, steps, policy })
+    }
+
+    /// The session with this id.
+    ///
+    /// # Errors
+    ///
+    /// If there is none.
+    pub async fn session(&self, id: &str) -> Result<SessionRow, ServiceError> {
+        let unknown = || ServiceError::Unknown { kind: "session", name: id.to_owned(), pointer: None };
+        self.store.session(id).await?.ok_or_else(unknown)
+    }
+
+    /// At most `limit` sessions in the order in which they were opened, from the first after the sequence number `after`.
+    ///
+    /// # Errors
+    ///
+    /// If the store failed.
+    pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRow>, ServiceError> {
+        Ok(self.store.sessions(after, limit).await?)
+    }
+
+    /// Expires open sessions that have been idle for too long, now and then, until `stopping` is cancelled.
+    pub async fn expire_until(self: Arc<Self>, stopping: CancellationToken) {
+        /// Sessions live at most this fraction of their time too long.
+        const CHECKS_PER_TIMEOUT: u32 = 10;
+        let mut ticks = tokio::time::interval((self.session_idle_timeout / CHECKS_PER_TIMEOUT).max(MIN_CHECK_INTERVAL));
+        loop {
+            tokio::select! {
+                _ = ticks.tick() => {}
+                () = stopping.cancelled() => return,
+            }
+            let before = Timestamp::now().checked_sub(self.session_idle_timeout).unwrap_or(Timestamp::MIN);
+            if let Err(error) = self.store.expire_sessions(before).await {
+                tracing::warn!(error = &error as &dyn std::error::Error, "idle sessions could not be expired");
+            }
+        }
+    }
+}
+
+/// Looking for idle sessions more often than this would only keep the disk busy.
+const MIN_CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_millis(50);
+
+impl Session {
+    /// Every field of a request to open a session.
+    pub const OPEN_FIELDS: [&'static str; 7] = ["type", "model", "learner", "explore", "weights", "lookahead", "start"];
+
+    /// Its id.
+    #[must_use]
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+
+    /// The trial that it explores, if any.
+    #[must_use]
+    pub fn trial_id(&self) -> Option<&str> {
+        self.source.trial_id.as_deref()
+    }
+
+    /// Whether its demonstration has ended.
+    #[must_use]
+    pub fn has_ended(&self) -> bool {
+        self.online.is_none()
+    }
+
+    /// The weights of the distance.
+    #[must_use]
+    pub fn weights(&self) -> ByAttribute<f64> {
+        self.mapper.model().schema().by_attribute(self.weights.as_slice().iter().copied())
+    }
+
+    /// How many observations are durable.
+    #[must_use]
+    pub fn n_received(&self) -> u32 {
+        self.n_received
+    }
+
+    /// How many steps were committed.
+    #[must_use]
+    pub fn n_steps(&self) -> usize {
+        self.n_steps
+    }
+
+    /// Completes when another connection takes the session over.
+    pub async fn taken_over(&self) {
+        self.ownership.taken_over.cancelled().await;
+    }
+
+    /// Takes the states from `seq` on, of which those received before are ignored: they are durable when this returns. Gives
+    /// the new ones, for [`Self::advance`].
+    ///
+    /// # Errors
+    ///
+    /// If something is wrong with them; then none was taken.
+    pub async fn receive(
+        &mut self,
+        etude: &Etude,
+        seq: u32,
+        states: &Place<'_, '_>,
+        now: Timestamp,
+    ) -> Result<Vec<Observation>, SessionError> {
+        if self.has_ended() {
+            return Err(SessionError::Ended);
+        }
+        if seq > self.n_received {
+            return Err(SessionError::Gap { expected: self.n_received });
+        }
+        let mut faults = Faults::default();
+        let Some(items) = states.array(&mut faults) else { return Err(faults.into()) };
+        let n_known = (self.n_received - seq) as usize;
+        let new = items.get(n_known..).unwrap_or_default();
+        if new.is_empty() {
+            return Ok(Vec::new());
+        }
+        if self.n_received as usize + new.len() > Demonstration::MAX_OBSERVATIONS {
+            return Err(SessionError::TooMany);
+        }
+        let schema = self.mapper.model().schema();
+        let read = new.iter().enumerate().map(|(n, state)| {
+            let place = states.item(n_known + n, state);
+            schema.read_observation(&place, &mut faults)
+        });
+        let observations: Vec<_> = read.collect();
+        let observations = faults.check(observations.into_iter().collect::<Option<Vec<_>>>())?;
+        #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
+        let n_states = new.len() as u32;
+        let added = etude
+            .store
+            .add_observations(NewObservations {
+                session_id: self.id.clone(),
+                seq: self.n_received,
+                n_states,
+                states: serde_json::to_string(new).map_err(ServiceError::Write)?,
+                at: now,
+            })
+            .await?;
+        if !added {
+            return Err(SessionError::NotOpen);
+        }
+        self.n_received += n_states;
+        Ok(observations)
+    }
+
+    /// Maps observations that were received, and gives the steps that they commit.
+    ///
+    /// # Errors
+    ///
+    /// If the service ends; the session is then to be resumed.
+    pub async fn advance(
+        &mut self,
+        etude: &Etude,
+        observations: Vec<Observation>,
+    ) -> Result<Vec<CommittedStep>, SessionError> {
+        let mut online = self.online.take().ok_or(SessionError::NotOpen)?;
+        let n_layers = observations.len() * self.lookahead.map_or(1, |lookahead| lookahead.get() as usize);
+        let job = move |interrupt: &mut dyn Interrupt| {
+            let mut steps = Vec::new();
+            for observation in &observations {
+                steps.extend(online.observe(observation, interrupt)?);
+            }
+            Ok((online, steps))
+        };
+        let work = n_layers.saturating_mul(self.mapper.model().graph().n_states());
+        let (online, steps) = if work <= MAX_INLINE_WORK {
+            job(&mut Uninterrupted).map_err(|_| PoolError::Stopped)?
+        } else {
+            etude.pool.run_patiently(job).await?
+        };
+        self.online = Some(online);
+        self.n_steps += steps.len();
+        Ok(steps)
+    }
+
+    /// Ends the demonstration, which must have `seq` observations, and stores its policy.
+    ///
+    /// # Errors
+    ///
+    /// If observations are missing, or the service ends.
+    pub async fn end(&mut self, etude: &Etude, seq: u32, now: Timestamp) -> Result<Ended, SessionError> {
+        if self.has_ended() {
+            return Err(SessionError::Ended);
+        }
+        if seq != self.n_received {
+            return Err(SessionError::Gap { expected: self.n_received });
+        }
+        if seq == 0 {
+            return Err(SessionError::Empty);
+        }
+        let texts = etude.store.observations(&self.id).await?;
+        let online = self.online.take().ok_or(SessionError::NotOpen)?;
+        let (mapper, weights, start) = (Arc::clone(&self.mapper), self.weights.clone(), self.start);
+        let policy_id = match &self.source.trial_id {
+            Some(trial) => etude.store.trial(trial).await?.map(|trial| trial.policy_id),
+            None => None,
+        };
+        let stamp = Stamp {
+            id: Some(policy_id.unwrap_or_else(|| Uuid::now_v7().to_string())),
+            model: self.model.clone(),
+            model_hash: self.model_hash.clone(),
+            learner: self.source.learner.clone(),
+            weights_version: self.source.weights_version,
+            lookahead: self.lookahead.map(NonZeroU32::get),
+            ..Stamp::default()
+        };
+        let job = move |_: &mut dyn Interrupt| Ok(conclude(online, &mapper, &texts, weights, start, stamp));
+        let (steps, policy, row, refinement) = etude.pool.run_patiently(job).await??;
+        let is_refined = refinement.is_some();
+        let end = SessionEnd { session_id: self.id.clone(), policy: row.at(now), refinement };
+        if !etude.store.end_session(end).await? {
+            return Err(SessionError::NotOpen);
+        }
+        if is_refined {
+            etude.refiner.wake();
+        }
+        self.n_steps += steps.len();
+        Ok(Ended { steps, policy })
+    }
+}
+
+/// An observation as it was read. Shape `[n_attributes]`; `None` where an attribute was not observed.
+pub type Observation = Vec<Option<crate::attribute::Value>>;
+
+type Concluded = (Vec<CommittedStep>, Policy, PolicyText, Option<NewRefinement>);
+
+/// Commits the rest, and writes the policy of the whole.
+fn conclude(
+    online: OnlineMapping,
+    mapper: &Mapper,
+    texts: &[String],
+    weights: Weights,
+    start: Option<u32>,
+    stamp: Stamp,
+) -> Result<Concluded, SessionError> {
+    let started = Instant::now();
+    let (steps, mapping) = online.end().ok_or(SessionError::Empty)?;
+    let demonstration = Demonstration::of(read_stored(mapper, texts)?).ok_or(SessionError::Empty)?;
+    let problem = Problem::new(mapper.model(), demonstration, weights, start);
+    let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
+    report(&stamp, &mapping);
+    let policy = Policy::new(stamp, &problem, &mapping);
+    let row = PolicyText::of(&policy)?;
+    let refinement = (policy.status == Status::Local).then(|| {
+        let parsed = texts.iter().map(|text| serde_json::from_str::<Vec<Value>>(text).unwrap_or_default());
+        let demonstration: Vec<Value> = parsed.flatten().collect();
+        let request = serde_json::json!({
+            "model": policy.model,
+            "weights": policy.weights,
+            "start": problem.start(),
+            "demonstration": demonstration,
+        });
+        let request = request.to_string();
+        NewRefinement {
+            policy_id: policy.id.clone().unwrap_or_default(),
+            model_hash: policy.model_hash.clone(),
+            request,
+        }
+    });
+    Ok((steps, policy, row, refinement))
+}
+
+/// Reads observations that were stored, which were read without faults before.
+fn read_stored(mapper: &Mapper, texts: &[String]) -> Result<Vec<Observation>, SessionError> {
+    let corrupt = |source: Box<dyn std::error::Error + Send + Sync>| StoreError::Corrupt {
+        table: "observations",
+        column: "states",
+        source,
+    };
+    let mut observations = Vec::new();
+    for text in texts {
+        let document = document::parse(text.as_bytes()).map_err(|error| corrupt(error.into()))?;
+        let mut faults = Faults::default();
+        let root = Place::root(&document);
+        for (n, state) in root.array(&mut faults).unwrap_or_default().iter().enumerate() {
+            observations.extend(mapper.model().schema().read_observation(&root.item(n, state), &mut faults));
+        }
+        faults.check(Some(())).map_err(|faults| corrupt(faults.into()))?;
+    }
+    Ok(observations)
+}
+
+/// The names in a request to open a session.
+struct Names {
+    model: String,
+    learner: Option<String>,
+    explores: bool,
+}
+
+fn read_names(object: &Object<'_, '_>, faults: &mut Faults) -> Option<Names> {
+    let model = object.required("model", faults).and_then(|place| place.string(faults));
+    let learner = object.optional("learner").map(|place| place.string(faults));
+    let explores = match object.optional("explore") {
+        Some(place) => {
+            let explores = place.boolean(faults);
+            if explores == Some(true) && learner.is_none() {
+                faults.note(&place, "exploring needs a learner");
+            }
+            explores
+        }
+        None => Some(false),
+    };
+    if let (Some(true), Some(place)) = (explores, object.optional("weights"))
+        && place.value.as_object().is_some_and(|weights| !weights.is_empty())
+    {
+        faults.note(&place, "an exploring session draws its weights");
+    }
+    let learner = learner.map_or(Some(None), |learner| learner.map(Some));
+    Some(Names { model: model?.to_owned(), learner: learner?.map(str::to_owned), explores: explores? })
+}
+
+/// What a session is opened with.
+struct Opening {
+    weights: Weights,
+    lookahead: Option<NonZeroU32>,
+    start: Option<u32>,
+}
+
+impl Opening {
+    fn read(mapper: &Mapper, learner: Option<&Ready>, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
+        let model = mapper.model();
+        let base = match learner {
+            None => Some(model.schema().weights()),
+            Some(Ready { learner, weights, .. }) => {
+                let learned = learner.weights_for(model.schema(), &weights.distribution.mean);
+                learned
+                    .map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string()))
+                    .ok()
+            }
+        };
+        let named = match object.optional("weights") {
+            Some(place) => model.schema().read_named_weights(&place, faults),
+            None => Some(Vec::new()),
+        };
+        let weights = base.zip(named).map(|(mut weights, named)| {
+            for (position, weight) in named {
+                weights.set(position, weight);
+            }
+            weights
+        });
+        let lookahead = match (object.optional("lookahead"), object.members.contains_key("lookahead")) {
+            (Some(place), _) => read_lookahead(&place, faults).map(Some),
+            (None, true) => Some(None),
+            (None, false) => Some(NonZeroU32::new(DEFAULT_LOOKAHEAD)),
+        };
+        let start = match object.optional("start") {
+            Some(place) => model.read_start(&place, faults).map(Some),
+            None => Some(None),
+        };
+        Some(Self { weights: weights?, lookahead: lookahead?, start: start? })
+    }
+}
+
+/// Which connection drives which session.
+#[derive(Debug, Default)]
+pub(super) struct Owners {
+    owners: Arc<Mutex<HashMap<String, Owner>>>,
+}
+
+#[derive(Debug)]
+struct Owner {
+    /// Held while a session is driven.
+    driving: Arc<tokio::sync::Mutex<()>>,
+    /// Cancelled when the newest owner is to give way.
+    taken_over: CancellationToken,
+    /// How many owners there were, to tell the newest.
+    generation: u64,
+}
+
+/// The right to drive a session, until it is dropped.
+#[derive(Debug)]
+struct Ownership {
+    id: String,
+    generation: u64,
+    taken_over: CancellationToken,
+    owners: Arc<Mutex<HashMap<String, Owner>>>,
+    _driving: OwnedMutexGuard<()>,
+}
+
+impl Owners {
+    /// Waits until whoever drives the session has given way.
+    async fn take(&self, id: &str) -> Ownership {
+        let taken_over = CancellationToken::new();
+        let (driving, generation) = {
+            let mut owners = self.owners.lock().unwrap_or_else(PoisonError::into_inner);
+            let owner = owners.entry(id.to_owned()).or_insert_with(|| Owner {
+                driving: Arc::default(),
+                taken_over: CancellationToken::new(),
+                generation: 0,
+            });
+            owner.taken_over.cancel();
+            owner.taken_over = taken_over.clone();
+            owner.generation += 1;
+            (Arc::clone(&owner.driving), owner.generation)
+        };
+        let driving = driving.lock_owned().await;
+        Ownership { id: id.to_owned(), generation, taken_over, owners: Arc::clone(&self.owners), _driving: driving }
+    }
+}
+
+impl Drop for Ownership {
+    fn drop(&mut self) {
+        let mut owners = self.owners.lock().unwrap_or_else(PoisonError::into_inner);
+        if owners.get(&self.id).is_some_and(|owner| owner.generation == self.generation) {
+            owners.remove(&self.id);
+        }
+    }
+}

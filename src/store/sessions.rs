@@ -1,0 +1,336 @@
+//! The tables of sessions and their observations.
+
+use std::collections::HashSet;
+
+use jiff::Timestamp;
+use serde_json::Value;
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
+
+use super::policies::NewPolicy;
+use super::refinements::NewRefinement;
+use super::trials::{self, NewTrial};
+use super::writer::{Write, Written};
+use super::{Page, Store, StoreError, corrupt, policies, refinements, timestamp};
+
+/// How far a session has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SessionStatus {
+    /// It takes observations.
+    Open,
+    /// Its demonstration has ended, and its policy is stored.
+    Done,
+    /// It was idle for too long.
+    Expired,
+}
+
+impl SessionStatus {
+    /// The status, as in JSON and SQL.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Open => "open",
+            Self::Done => "done",
+            Self::Expired => "expired",
+        }
+    }
+
+    fn named(name: &str) -> Option<Self> {
+        [Self::Open, Self::Done, Self::Expired].into_iter().find(|status| status.name() == name)
+    }
+}
+
+/// A session, without its observations.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SessionRow {
+    /// The order in which it was opened.
+    pub sequence: i64,
+    /// Its id.
+    pub id: String,
+    /// Name of its model.
+    pub model: String,
+    /// Hash of its model's content.
+    pub model_hash: String,
+    /// One weight per attribute, in the model's order.
+    pub weights: Vec<f64>,
+    /// How many observations past the current one a decision may wait for; `None` for all.
+    pub lookahead: Option<u32>,
+    /// Index of the start state, if the request named one.
+    pub start: Option<u32>,
+    /// The learner whose weights are used, if any.
+    pub learner: Option<String>,
+    /// The version of the learner's weights.
+    pub weights_version: Option<u64>,
+    /// The trial that is explored, if any.
+    pub trial_id: Option<String>,
+    /// How far it has come.
+    pub status: SessionStatus,
+    /// How many observations are stored.
+    pub n_observations: u32,
+    /// Its policy, if it is done.
+    pub policy_id: Option<String>,
+    /// When it was opened.
+    pub created_at: Timestamp,
+    /// When something last came.
+    pub active_at: Timestamp,
+}
+
+/// A session to be opened.
+#[derive(Clone, Debug)]
+pub struct NewSession {
+    /// Its id, unique.
+    pub id: String,
+    /// Name of its model.
+    pub model: String,
+    /// Hash of its model's content.
+    pub model_hash: String,
+    /// One weight per attribute, in the model's order.
+    pub weights: Vec<f64>,
+    /// How many observations past the current one a decision may wait for; `None` for all.
+    pub lookahead: Option<u32>,
+    /// Index of the start state, if the request named one.
+    pub start: Option<u32>,
+    /// The learner whose weights are used, if any.
+    pub learner: Option<String>,
+    /// The version of the learner's weights.
+    pub weights_version: Option<u64>,
+    /// The trial that is explored, if any.
+    pub trial: Option<NewTrial>,
+    /// When it is opened.
+    pub created_at: Timestamp,
+}
+
+/// Observations to be added to a session.
+#[derive(Clone, Debug)]
+pub struct NewObservations {
+    /// The session.
+    pub session_id: String,
+    /// Index of the first of them.
+    pub seq: u32,
+    /// How many there are.
+    pub n_states: u32,
+    /// JSON: an array of states.
+    pub states: String,
+    /// When they came.
+    pub at: Timestamp,
+}
+
+/// The end of a session.
+#[derive(Clone, Debug)]
+pub struct SessionEnd {
+    /// The session.
+    pub session_id: String,
+    /// Its policy.
+    pub policy: NewPolicy,
+    /// What is to be done about its policy, if that is local.
+    pub refinement: Option<NewRefinement>,
+}
+
+impl Store {
+    /// Opens a session, and its trial if it explores. Says whether the trial's learner was there.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn open_session(&self, session: NewSession) -> Result<bool, StoreError> {
+        self.done(Write::OpenSession(Box::new(session))).await
+    }
+
+    /// Adds observations to an open session. Says whether it was open and they came next.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn add_observations(&self, observations: NewObservations) -> Result<bool, StoreError> {
+        self.done(Write::AddObservations(observations)).await
+    }
+
+    /// Ends a session: stores its policy and links them. Says whether it was open.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed; then nothing was stored.
+    pub async fn end_session(&self, end: SessionEnd) -> Result<bool, StoreError> {
+        self.done(Write::EndSession(Box::new(end))).await
+    }
+
+    /// Ends every open session that was last active before `before`, and forgets its observations.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn expire_sessions(&self, before: Timestamp) -> Result<(), StoreError> {
+        self.writer.write(Write::ExpireSessions(before)).await.map(drop)
+    }
+
+    async fn done(&self, write: Write) -> Result<bool, StoreError> {
+        match self.writer.write(write).await? {
+            Written::Done(was_done) => Ok(was_done),
+            _ => Err(StoreError::Closed),
+        }
+    }
+
+    /// The session with this id.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn session(&self, id: &str) -> Result<Option<SessionRow>, StoreError> {
+        let query = sqlx::query("SELECT * FROM sessions WHERE id = $1").bind(id);
+        let row = query.fetch_optional(&self.readers).await?;
+        row.as_ref().map(read_session).transpose()
+    }
+
+    /// At most `limit` sessions in the order in which they were opened, from the first after the sequence number `after`.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRow>, StoreError> {
+        let query = sqlx::query("SELECT * FROM sessions WHERE sequence > $1 ORDER BY sequence LIMIT $2");
+        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch_all(&self.readers).await?;
+        let sessions = rows.iter().map(read_session).collect::<Result<Vec<_>, _>>()?;
+        Ok(Page::of(sessions, limit, |session| session.sequence.to_string()))
+    }
+
+    /// The observations of a session, in order: JSON arrays of states.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn observations(&self, session_id: &str) -> Result<Vec<String>, StoreError> {
+        let query = sqlx::query_scalar("SELECT states FROM observations WHERE session_id = $1 ORDER BY seq");
+        Ok(query.bind(session_id).fetch_all(&self.readers).await?)
+    }
+}
+
+fn read_session(row: &SqliteRow) -> Result<SessionRow, StoreError> {
+    const TABLE: &str = "sessions";
+    let count = |column: &'static str| -> Result<Option<u32>, StoreError> {
+        let count: Option<i64> = row.try_get(column)?;
+        count.map(u32::try_from).transpose().map_err(corrupt(TABLE, column))
+    };
+    let status: &str = row.try_get("status")?;
+    Ok(SessionRow {
+        sequence: row.try_get("sequence")?,
+        id: row.try_get("id")?,
+        model: row.try_get("model")?,
+        model_hash: row.try_get("model_hash")?,
+        weights: serde_json::from_str(row.try_get("weights")?).map_err(corrupt(TABLE, "weights"))?,
+        lookahead: count("lookahead")?,
+        start: count("start")?,
+        learner: row.try_get("learner")?,
+        weights_version: count("weights_version")?.map(u64::from),
+        trial_id: row.try_get("trial_id")?,
+        status: SessionStatus::named(status).ok_or_else(|| corrupt(TABLE, "status")(status.to_owned()))?,
+        n_observations: count("n_observations")?.unwrap_or(0),
+        policy_id: row.try_get("policy_id")?,
+        created_at: timestamp(TABLE, "created_at_ms", row.try_get("created_at_ms")?)?,
+        active_at: timestamp(TABLE, "active_at_ms", row.try_get("active_at_ms")?)?,
+    })
+}
+
+pub(super) async fn open(connection: &mut SqliteConnection, session: &NewSession) -> Result<bool, StoreError> {
+    if let Some(trial) = &session.trial
+        && !trials::add(connection, trial).await?
+    {
+        return Ok(false);
+    }
+    let created_at_ms = session.created_at.as_millisecond();
+    sqlx::query(
+        "INSERT INTO sessions
+             (id, model, model_hash, weights, lookahead, start, learner, weights_version, trial_id,
+              status, n_observations, created_at_ms, active_at_ms)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', 0, $10, $10)",
+    )
+    .bind(&session.id)
+    .bind(&session.model)
+    .bind(&session.model_hash)
+    .bind(serde_json::to_string(&session.weights).map_err(corrupt("sessions", "weights"))?)
+    .bind(session.lookahead)
+    .bind(session.start)
+    .bind(&session.learner)
+    .bind(session.weights_version.and_then(|version| i64::try_from(version).ok()))
+    .bind(session.trial.as_ref().map(|trial| &trial.id))
+    .bind(created_at_ms)
+    .execute(connection)
+    .await?;
+    Ok(true)
+}
+
+/// Adds to several sessions, each of them once. Gives for each whether it was open and this was what came next. Two
+/// statements, however many there are: each one costs the driver a change of threads.
+pub(super) async fn add(
+    connection: &mut SqliteConnection,
+    group: &[&NewObservations],
+) -> Result<Vec<bool>, StoreError> {
+    let rows = group
+        .iter()
+        .map(|new| serde_json::json!([new.session_id, new.seq, new.n_states, new.states, new.at.as_millisecond()]));
+    let rows = Value::Array(rows.collect()).to_string();
+    // Only what comes next, and only once, whatever is retried or raced.
+    let updated = sqlx::query_scalar::<_, String>(
+        "UPDATE sessions SET n_observations = n_observations + (new.value ->> 2), active_at_ms = new.value ->> 4
+         FROM json_each($1) AS new
+         WHERE sessions.id = new.value ->> 0 AND status = 'open' AND n_observations = new.value ->> 1
+         RETURNING sessions.id",
+    )
+    .bind(&rows)
+    .fetch_all(&mut *connection)
+    .await?;
+    let updated: HashSet<String> = updated.into_iter().collect();
+    let is_updated: Vec<bool> = group.iter().map(|new| updated.contains(&new.session_id)).collect();
+    if updated.is_empty() {
+        return Ok(is_updated);
+    }
+    let rows = if updated.len() == group.len() {
+        rows
+    } else {
+        let rows = group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated);
+        let rows = rows.map(|(new, _)| serde_json::json!([new.session_id, new.seq, new.n_states, new.states]));
+        Value::Array(rows.collect()).to_string()
+    };
+    sqlx::query(
+        "INSERT INTO observations (session_id, seq, n_states, states)
+         SELECT value ->> 0, value ->> 1, value ->> 2, value ->> 3 FROM json_each($1)",
+    )
+    .bind(rows)
+    .execute(connection)
+    .await?;
+    Ok(is_updated)
+}
+
+pub(super) async fn end(connection: &mut SqliteConnection, end: &SessionEnd) -> Result<bool, StoreError> {
+    let updated = sqlx::query(
+        "UPDATE sessions SET status = 'done', policy_id = $2, active_at_ms = $3 WHERE id = $1 AND status = 'open'",
+    )
+    .bind(&end.session_id)
+    .bind(&end.policy.id)
+    .bind(end.policy.created_at.as_millisecond())
+    .execute(&mut *connection)
+    .await?;
+    if updated.rows_affected() == 0 {
+        return Ok(false);
+    }
+    policies::add(connection, &end.policy).await?;
+    if let Some(refinement) = &end.refinement {
+        refinements::add(connection, refinement).await?;
+    }
+    Ok(true)
+}
+
+pub(super) async fn expire(connection: &mut SqliteConnection, before: Timestamp) -> Result<(), StoreError> {
+    let before_ms = before.as_millisecond();
+    sqlx::query(
+        "DELETE FROM observations WHERE session_id IN
+             (SELECT id FROM sessions WHERE status = 'open' AND active_at_ms < $1)",
+    )
+    .bind(before_ms)
+    .execute(&mut *connection)
+    .await?;
+    sqlx::query("UPDATE sessions SET status = 'expired' WHERE status = 'open' AND active_at_ms < $1")
+        .bind(before_ms)
+        .execute(connection)
+        .await?;
+    Ok(())
+}

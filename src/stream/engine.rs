@@ -1,0 +1,365 @@
+//! The protocol, one connection at a time.
+
+use std::error::Error;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use serde_json::Value;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem};
+use crate::document::{self, ParseError, Place};
+use crate::mapping::{CommittedStep, Demonstration};
+use crate::service::{Ended, Etude, PoolError, Resumed, ServiceError, Session, SessionError};
+
+/// The protocol's name; also the websocket subprotocol.
+pub const PROTOCOL: &str = "etude.v1+json";
+
+/// What a connection may use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Limits {
+    /// Largest frame, in bytes.
+    pub frame_bytes: usize,
+    /// How long a client may take to read what waits for it.
+    pub slow_after: Duration,
+    /// How long a connection may stay silent.
+    pub idle_after: Duration,
+}
+
+/// What came from the client.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Incoming {
+    /// A frame.
+    Frame(Vec<u8>),
+    /// Something that is no frame: a binary message.
+    Binary,
+    /// A frame over the limit.
+    TooLarge,
+    /// Text that is not UTF-8.
+    NotText,
+}
+
+/// What goes to the client.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Outgoing {
+    /// A frame.
+    Frame(String),
+    /// The end of the connection.
+    Close(Closed),
+}
+
+/// Why a connection ended: a websocket close code.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Closed {
+    /// The policy is done.
+    Done,
+    /// The client said nothing more.
+    ByClient,
+    /// The server shuts down; the session is to be resumed.
+    GoingAway,
+    /// Not JSON, or not UTF-8.
+    NotText,
+    /// Not allowed now.
+    NotAllowed,
+    /// A frame over the limit.
+    TooLarge,
+    /// The server failed; the session is to be resumed.
+    Failed,
+    /// The server has too much to do, or the client is too slow; the session is to be resumed.
+    Overloaded,
+    /// A frame that cannot be understood.
+    BadFrame,
+    /// A model, learner or session that is unknown.
+    Unknown,
+}
+
+impl Closed {
+    /// The close code and reason of a websocket.
+    #[must_use]
+    pub fn code(self) -> (u16, &'static str) {
+        match self {
+            Self::Done | Self::ByClient => (1000, "done"),
+            Self::GoingAway => (1001, "the server shuts down; resume"),
+            Self::NotText => (1007, "not JSON"),
+            Self::NotAllowed => (1008, "not allowed"),
+            Self::TooLarge => (1009, "frame too large"),
+            Self::Failed => (1011, "the server failed; resume"),
+            Self::Overloaded => (1013, "overloaded or too slow a reader; resume"),
+            Self::BadFrame => (4400, "bad frame"),
+            Self::Unknown => (4404, "unknown model, learner or session"),
+        }
+    }
+}
+
+/// Speaks the protocol until the connection is over, and says why it is. Dropping the future at any time leaves a session
+/// that can be resumed.
+pub async fn run(
+    etude: &Etude,
+    limits: Limits,
+    incoming: &mut mpsc::Receiver<Incoming>,
+    outgoing: &mpsc::Sender<Outgoing>,
+    stopping: &CancellationToken,
+) -> Closed {
+    let mut connection = Connection { etude, limits, outgoing, session: None };
+    let ended = connection.speak(incoming, stopping).await;
+    let closed = match ended {
+        Ok(closed) => closed,
+        Err(Over { closed, problem }) => {
+            if let Some(problem) = problem {
+                // Where this does not get through, the close code says it too.
+                let _ = connection.send(&ServerFrame::Error { problem }).await;
+            }
+            closed
+        }
+    };
+    let (code, _) = closed.code();
+    tracing::info!(code, session = connection.session.as_ref().map(Session::id), "stream closed");
+    // A client that is gone or stuck does not hear this.
+    let _ = outgoing.send_timeout(Outgoing::Close(closed), limits.slow_after).await;
+    closed
+}
+
+/// Why the connection is over.
+struct Over {
+    closed: Closed,
+    problem: Option<StreamProblem>,
+}
+
+impl Over {
+    fn because(closed: Closed, problem: StreamProblem) -> Self {
+        Self { closed, problem: Some(problem) }
+    }
+}
+
+struct Connection<'c> {
+    etude: &'c Etude,
+    limits: Limits,
+    outgoing: &'c mpsc::Sender<Outgoing>,
+    session: Option<Session>,
+}
+
+impl Connection<'_> {
+    async fn speak(
+        &mut self,
+        incoming: &mut mpsc::Receiver<Incoming>,
+        stopping: &CancellationToken,
+    ) -> Result<Closed, Over> {
+        self.send(&ServerFrame::Hello {
+            protocol: PROTOCOL,
+            server: env!("CARGO_PKG_VERSION"),
+            limits: HelloLimits { frame_bytes: self.limits.frame_bytes, observations: Demonstration::MAX_OBSERVATIONS },
+        })
+        .await?;
+        loop {
+            let came = tokio::select! {
+                biased;
+                () = stopping.cancelled() => {
+                    let problem = StreamProblem::new("stopping", "the server shuts down; resume the session later");
+                    return Err(Over::because(Closed::GoingAway, problem));
+                }
+                () = taken_over(self.session.as_ref()) => {
+                    let problem = StreamProblem::new("taken-over", "the session was resumed on another connection");
+                    return Err(Over::because(Closed::NotAllowed, problem));
+                }
+                came = tokio::time::timeout(self.limits.idle_after, incoming.recv()) => came,
+            };
+            let Ok(came) = came else {
+                return Err(Over::because(Closed::NotAllowed, StreamProblem::new("idle", "nothing came for too long")));
+            };
+            let Some(came) = came else { return Ok(Closed::ByClient) };
+            let frame = read(came, self.limits)?;
+            if let Some(closed) = self.answer(frame).await? {
+                return Ok(closed);
+            }
+        }
+    }
+
+    /// Answers a frame. Gives how the connection ends, if it does.
+    async fn answer(&mut self, frame: ClientFrame) -> Result<Option<Closed>, Over> {
+        let now = Timestamp::now();
+        match (frame, &mut self.session) {
+            (ClientFrame::Open(_) | ClientFrame::Resume { .. }, Some(_)) => {
+                Err(not_allowed("a session is open already"))
+            }
+            (ClientFrame::Open(request), None) => {
+                let session = self.etude.open_session(&request, now).await.map_err(|error| ends(&error))?;
+                self.opened(session).await?;
+                Ok(None)
+            }
+            (ClientFrame::Resume { session, step }, None) => {
+                let Resumed { session, steps, policy } =
+                    self.etude.resume_session(&session).await.map_err(|error| ends(&error))?;
+                self.opened(session).await?;
+                self.send_steps(steps.get(step as usize..).unwrap_or_default()).await?;
+                let Some(policy) = policy else { return Ok(None) };
+                self.send(&ServerFrame::from(&policy)).await?;
+                Ok(self.done())
+            }
+            (ClientFrame::Observe { .. } | ClientFrame::End { .. }, None) => {
+                Err(not_allowed("open or resume a session first"))
+            }
+            (ClientFrame::Reward { reward }, Some(session)) if let Some(trial) = session.trial_id() => {
+                let has_ended = session.has_ended();
+                match self.etude.accept_reward(trial, reward, now).await {
+                    Ok(trial) => {
+                        let order = trial.row.reward.as_ref().map(|reward| reward.reward_order);
+                        self.send(&ServerFrame::Rewarded { trial: &trial.row.id, reward, reward_order: order }).await?;
+                        Ok(has_ended.then_some(Closed::Done))
+                    }
+                    Err(error) => self.go_on_or_end(&error.into()).await,
+                }
+            }
+            (ClientFrame::Reward { .. }, _) => Err(not_allowed("only an exploring session takes a reward")),
+            (ClientFrame::Observe { seq, frame }, Some(session)) => {
+                let root = Place::root(&frame);
+                let states = Place { value: &frame["states"], path: document::Path::Member(&root.path, "states") };
+                let observations = match session.receive(self.etude, seq, &states, now).await {
+                    Ok(observations) => observations,
+                    Err(error) => return self.go_on_or_end(&error).await,
+                };
+                let received = ServerFrame::Received { seq: session.n_received() };
+                send(self.outgoing, self.limits, &received).await?;
+                if !observations.is_empty() {
+                    let steps = session.advance(self.etude, observations).await.map_err(|error| ends(&error))?;
+                    self.send_steps(&steps).await?;
+                }
+                Ok(None)
+            }
+            (ClientFrame::End { seq }, Some(session)) => match session.end(self.etude, seq, now).await {
+                Ok(Ended { steps, policy }) => {
+                    self.send_steps(&steps).await?;
+                    self.send(&ServerFrame::from(&policy)).await?;
+                    Ok(self.done())
+                }
+                Err(error) => self.go_on_or_end(&error).await,
+            },
+        }
+    }
+
+    /// How the connection ends when the policy is done: an exploring session waits for its reward.
+    fn done(&self) -> Option<Closed> {
+        let explores = self.session.as_ref().is_some_and(|session| session.trial_id().is_some());
+        (!explores).then_some(Closed::Done)
+    }
+
+    async fn opened(&mut self, session: Session) -> Result<(), Over> {
+        tracing::info!(session = session.id(), received = session.n_received(), "stream opened");
+        let session = self.session.insert(session);
+        let frame = ServerFrame::Opened {
+            session: session.id(),
+            trial: session.trial_id(),
+            weights: session.weights(),
+            received: session.n_received(),
+            steps: session.n_steps(),
+        };
+        send(self.outgoing, self.limits, &frame).await
+    }
+
+    async fn send_steps(&self, steps: &[CommittedStep]) -> Result<(), Over> {
+        for step in steps {
+            self.send(&ServerFrame::Step(step.into())).await?;
+        }
+        Ok(())
+    }
+
+    /// Tells the client of an error after which the session goes on, or ends the connection.
+    async fn go_on_or_end(&self, error: &SessionError) -> Result<Option<Closed>, Over> {
+        let problem = match error {
+            SessionError::Gap { .. } => StreamProblem::new("gap", error.to_string()),
+            SessionError::TooMany => StreamProblem::new("too-many-observations", error.to_string()),
+            SessionError::Empty => StreamProblem::new("empty", error.to_string()),
+            SessionError::Ended => StreamProblem::new("ended", error.to_string()),
+            SessionError::Service(ServiceError::AlreadyRewarded { .. }) => {
+                StreamProblem::new("already-rewarded", error.to_string())
+            }
+            SessionError::Service(ServiceError::TrialFailed { .. }) => {
+                StreamProblem::new("trial-failed", error.to_string())
+            }
+            SessionError::Faults(faults) => {
+                let mut problem = StreamProblem::of("invalid", faults);
+                // Places are within the frame.
+                problem.detail = format!("none of the frame's states was taken: {}", problem.detail);
+                problem
+            }
+            SessionError::NotOpen | SessionError::Service(_) => return Err(ends(error)),
+        };
+        self.send(&ServerFrame::Error { problem }).await?;
+        Ok(None)
+    }
+
+    async fn send(&self, frame: &ServerFrame<'_>) -> Result<(), Over> {
+        send(self.outgoing, self.limits, frame).await
+    }
+}
+
+/// Puts a frame into the queue, which a client that does not read keeps full.
+async fn send(outgoing: &mpsc::Sender<Outgoing>, limits: Limits, frame: &ServerFrame<'_>) -> Result<(), Over> {
+    let failed = |error: serde_json::Error| ends(&SessionError::Service(ServiceError::Write(error)));
+    let text = serde_json::to_string(frame).map_err(failed)?;
+    outgoing.send_timeout(Outgoing::Frame(text), limits.slow_after).await.map_err(|error| match error {
+        mpsc::error::SendTimeoutError::Timeout(_) => Over { closed: Closed::Overloaded, problem: None },
+        mpsc::error::SendTimeoutError::Closed(_) => Over { closed: Closed::ByClient, problem: None },
+    })
+}
+
+async fn taken_over(session: Option<&Session>) {
+    match session {
+        Some(session) => session.taken_over().await,
+        None => std::future::pending().await,
+    }
+}
+
+fn not_allowed(detail: &str) -> Over {
+    Over::because(Closed::NotAllowed, StreamProblem::new("not-allowed", detail))
+}
+
+/// Reads what came.
+fn read(came: Incoming, limits: Limits) -> Result<ClientFrame, Over> {
+    let bad = |problem| Over::because(Closed::BadFrame, problem);
+    let text = match came {
+        Incoming::Frame(text) if text.len() <= limits.frame_bytes => text,
+        Incoming::Frame(_) | Incoming::TooLarge => {
+            let detail = format!("a frame has at most {} bytes", limits.frame_bytes);
+            return Err(Over::because(Closed::TooLarge, StreamProblem::new("too-large", detail)));
+        }
+        Incoming::Binary => return Err(bad(StreamProblem::new("bad-frame", "expected text, found a binary message"))),
+        Incoming::NotText => {
+            let problem = StreamProblem::new("malformed-json", "the frame is not UTF-8");
+            return Err(Over::because(Closed::NotText, problem));
+        }
+    };
+    let frame: Value = document::parse(&text).map_err(|error| match error {
+        ParseError::Syntax { .. } => {
+            Over::because(Closed::NotText, StreamProblem::new("malformed-json", error.to_string()))
+        }
+        ParseError::Faults(faults) => bad(StreamProblem::of("bad-frame", &faults)),
+    })?;
+    ClientFrame::read(frame).map_err(|faults| bad(StreamProblem::of("bad-frame", &faults)))
+}
+
+/// How an error ends the connection.
+fn ends(error: &SessionError) -> Over {
+    let detail = error.to_string();
+    match error {
+        SessionError::Faults(faults) => Over::because(Closed::BadFrame, StreamProblem::of("invalid", faults)),
+        SessionError::NotOpen => Over::because(Closed::Unknown, StreamProblem::new("expired", detail)),
+        SessionError::Gap { .. } | SessionError::TooMany | SessionError::Empty | SessionError::Ended => {
+            not_allowed(&detail)
+        }
+        SessionError::Service(ServiceError::Unknown { kind, .. }) => {
+            Over::because(Closed::Unknown, StreamProblem::new(&format!("unknown-{kind}"), detail))
+        }
+        SessionError::Service(ServiceError::Pool(PoolError::Stopped)) => {
+            Over::because(Closed::GoingAway, StreamProblem::new("stopping", detail))
+        }
+        SessionError::Service(ServiceError::Pool(PoolError::Busy)) => {
+            Over::because(Closed::Overloaded, StreamProblem::new("overloaded", detail))
+        }
+        SessionError::Service(_) => {
+            tracing::error!(error = error as &dyn Error, "a stream failed");
+            let problem = StreamProblem::new("internal", "an internal error was logged; resume the session");
+            Over::because(Closed::Failed, problem)
+        }
+    }
+}

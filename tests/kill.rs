@@ -1,0 +1,179 @@
+//! The real program is killed with SIGKILL, again and again, in the middle of streams.
+//!
+//! Nothing that it said was received may be lost, nothing may be doubled, and the steps must be those of a run that
+//! nobody disturbed.
+
+#![expect(clippy::unwrap_used, reason = "tests may panic")]
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use futures_util::{SinkExt, StreamExt};
+use serde_json::{Value, json};
+use tokio::net::TcpStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
+
+const N_KILLS: usize = 100;
+
+/// Longer than anything here takes.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Observations of a stream: the demonstration of figure 4, there and back.
+const N_OBSERVATIONS: usize = 48;
+
+/// A service in a process of its own.
+struct Process {
+    child: Child,
+    address: String,
+}
+
+impl Process {
+    fn start(database: &Path) -> Self {
+        let serve = ["serve", "--listen", "127.0.0.1:0", "--log-format", "text", "--database"];
+        let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
+        command.args(serve).arg(database).env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG");
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
+        let listening = lines.find(|line| line.contains("listening on http://")).expect("the service starts");
+        let address = listening.split("http://").nth(1).unwrap().split(['"', ' ']).next().unwrap().to_owned();
+        std::thread::spawn(move || lines.for_each(drop));
+        Self { child, address }
+    }
+
+    /// SIGKILL: no handler runs, nothing is flushed.
+    fn kill(mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+}
+
+type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
+
+/// What a client knows of its stream.
+#[derive(Default)]
+struct Watcher {
+    session: String,
+    /// How many observations were acknowledged.
+    n_received: usize,
+    /// Every step, by its number.
+    steps: Vec<Value>,
+    done: Option<Value>,
+}
+
+impl Watcher {
+    /// Connects, and opens or resumes the session.
+    async fn connect(&self, process: &Process) -> Socket {
+        let url = format!("ws://{}/v1/stream", process.address);
+        let (mut socket, _) = tokio_tungstenite::connect_async(url).await.unwrap();
+        let frame = if self.session.is_empty() {
+            json!({"type": "open", "model": "figure-4", "lookahead": 4})
+        } else {
+            json!({"type": "resume", "session": self.session, "step": self.steps.len()})
+        };
+        socket.send(Message::text(frame.to_string())).await.unwrap();
+        socket
+    }
+
+    /// Streams from where the service is, until the policy is done or `until` frames have come.
+    async fn watch(&mut self, socket: &mut Socket, observations: &[Value], until: usize) {
+        for _ in 0..until {
+            let message = tokio::time::timeout(PATIENCE, socket.next()).await.unwrap().unwrap().unwrap();
+            let Message::Text(text) = message else { panic!("{message:?}") };
+            let frame: Value = serde_json::from_str(&text).unwrap();
+            match frame["type"].as_str().unwrap() {
+                "hello" => {}
+                "opened" => {
+                    let durable = usize::try_from(frame["received"].as_u64().unwrap()).unwrap();
+                    assert!(durable >= self.n_received, "{} acknowledged, {frame}", self.n_received);
+                    frame["session"].as_str().unwrap().clone_into(&mut self.session);
+                    // All at once, some in twos, so that writes are under way when the end comes.
+                    for (n, states) in observations.chunks(2).enumerate().skip(durable / 2) {
+                        let seq = 2 * n;
+                        self.send(socket, &json!({"type": "observe", "seq": seq, "states": states})).await;
+                    }
+                    self.send(socket, &json!({"type": "end", "seq": observations.len()})).await;
+                }
+                "received" => self.n_received = usize::try_from(frame["seq"].as_u64().unwrap()).unwrap(),
+                "step" => {
+                    assert_eq!(frame["step"], self.steps.len(), "none is missing, none comes twice");
+                    self.steps.push(frame);
+                }
+                "done" => {
+                    self.done = Some(frame);
+                    return;
+                }
+                _ => panic!("{frame}"),
+            }
+        }
+    }
+
+    async fn send(&self, socket: &mut Socket, frame: &Value) {
+        socket.send(Message::text(frame.to_string())).await.unwrap();
+    }
+}
+
+/// A generator of numbers that are the same everywhere (Steele, Lea & Flood 2014).
+struct SplitMix(u64);
+
+impl SplitMix {
+    fn below(&mut self, bound: usize) -> usize {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        usize::try_from((z ^ (z >> 31)) >> 1).unwrap() % bound
+    }
+}
+
+#[tokio::test]
+async fn a_service_killed_a_hundred_times_loses_and_doubles_nothing() {
+    let there: Vec<Value> = serde_json::from_str(include_str!("../examples/figure-4/demonstration.json")).unwrap();
+    let observations: Vec<Value> =
+        there.iter().chain(there.iter().rev()).cycle().take(N_OBSERVATIONS).cloned().collect();
+    let directory = tempfile::tempdir().unwrap();
+    let database = directory.path().join("etude.db");
+    let mut process = Process::start(&database);
+    let model: Value = serde_json::from_str(include_str!("../examples/figure-4/model.json")).unwrap();
+    let client = reqwest::Client::builder().no_proxy().build().unwrap();
+    let registered = client.put(format!("http://{}/v1/models/figure-4", process.address)).json(&model).send().await;
+    assert!(registered.unwrap().status().is_success());
+
+    let mut undisturbed = Watcher::default();
+    let mut socket = undisturbed.connect(&process).await;
+    undisturbed.watch(&mut socket, &observations, usize::MAX).await;
+    let expected_done = undisturbed.done.unwrap();
+    assert!(undisturbed.steps.len() >= N_OBSERVATIONS);
+
+    let mut random = SplitMix(3);
+    let (mut n_kills, mut n_streams, mut n_resumed_midway) = (0, 0, 0);
+    while n_kills < N_KILLS {
+        let mut watcher = Watcher::default();
+        n_streams += 1;
+        loop {
+            let mut socket = watcher.connect(&process).await;
+            let was = (watcher.n_received, watcher.steps.len());
+            // The moment of death: after so many more frames, the first two of which are `hello` and `opened`.
+            let until = if n_kills < N_KILLS { 2 + random.below(16) } else { usize::MAX };
+            watcher.watch(&mut socket, &observations, until).await;
+            if watcher.done.is_some() {
+                break;
+            }
+            process.kill();
+            n_kills += 1;
+            n_resumed_midway += usize::from(was.1 > 0);
+            process = Process::start(&database);
+        }
+        assert_eq!(watcher.steps, undisturbed.steps);
+        let done = watcher.done.unwrap();
+        assert_eq!((&done["cost"], &done["actions"]), (&expected_done["cost"], &expected_done["actions"]));
+        let url = format!("http://{}/v1/sessions/{}", process.address, watcher.session);
+        let session: Value = client.get(url).send().await.unwrap().json().await.unwrap();
+        assert_eq!((&session["status"], &session["observations"]), (&json!("done"), &json!(N_OBSERVATIONS)));
+        assert_eq!(session["policy_id"], done["policy_id"]);
+    }
+    assert!(n_streams > 5 && n_resumed_midway > N_KILLS / 3, "{n_streams} streams, {n_resumed_midway} resumed midway");
+    process.kill();
+}

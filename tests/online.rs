@@ -1,0 +1,165 @@
+//! The mapping in the making, against its definition.
+
+#![expect(clippy::unwrap_used, clippy::cast_possible_truncation, clippy::too_many_lines, reason = "tests are small")]
+
+mod oracle;
+mod problems;
+
+use std::num::NonZeroU32;
+use std::sync::Arc;
+
+use etude::document::{Faults, Place};
+use etude::interrupt::Uninterrupted;
+use etude::mapping::{CommittedStep, Mapper, Mapping, OnlineMapping, Status};
+use problems::{close, example, mapper, problem};
+use proptest::prelude::*;
+use serde_json::{Value, json};
+
+/// Feeds a demonstration, and gives what was committed and the mapping.
+fn follow(
+    mapper: &Arc<Mapper>,
+    demonstration: &Value,
+    weights: &Value,
+    start: Option<usize>,
+    lookahead: Option<u32>,
+) -> (Vec<CommittedStep>, Mapping) {
+    let schema = mapper.model().schema();
+    let mut faults = Faults::default();
+    let weights = schema.read_weights(&Place::root(weights), &mut faults).unwrap();
+    let start = start.map(|state| state as u32);
+    let lookahead = lookahead.and_then(NonZeroU32::new);
+    let mut online = OnlineMapping::new(Arc::clone(mapper), weights, start, lookahead);
+    let mut committed = Vec::new();
+    for observation in demonstration.as_array().unwrap() {
+        let observation = schema.read_observation(&Place::root(observation), &mut faults).unwrap();
+        committed.extend(online.observe(&observation, &mut Uninterrupted).unwrap());
+    }
+    let (rest, mapping) = online.end().unwrap();
+    committed.extend(rest);
+    (committed, mapping)
+}
+
+/// The node that a step ends at.
+fn node(step: &CommittedStep) -> (usize, usize) {
+    (step.step.observation as usize, step.step.state_index as usize)
+}
+
+/// A demonstration that begins with the first `n` observations and goes on otherwise.
+fn another_end(demonstration: &Value, n: usize, turn: usize) -> Value {
+    let observations = demonstration.as_array().unwrap();
+    let mut other = observations[..n].to_vec();
+    other.extend(observations.iter().cycle().skip(turn).step_by(2).take(4).cloned());
+    other.into()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 1500, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn every_commit_is_what_the_definition_says(
+        (model, demonstration, weights, start) in problem(),
+        lookahead in prop::option::weighted(0.8, 1u32..6),
+        turn in 0usize..8,
+    ) {
+        let mapper = Arc::new(mapper(&model));
+        let (committed, mapping) = follow(&mapper, &demonstration, &weights, start, lookahead);
+        let n = demonstration.as_array().unwrap().len() - 1;
+        let to_go = |node, to| oracle::cost_to_go(&model, &demonstration, &weights, node, to);
+        let step_cost = |step: &CommittedStep| step.step.action_cost + step.step.distance;
+
+        // A run of forced steps, up to the one that advances, is decided at once.
+        let mut is_forced_once = false;
+        let mut index = 1;
+        while index < committed.len() {
+            let from = node(&committed[index - 1]);
+            let after = committed[index].after as usize;
+            let mut end = index;
+            let mut cost = step_cost(&committed[end]);
+            if committed[index].is_proven {
+                // Whatever is still to come: this end of the demonstration, and, unless it had ended, another.
+                let other = (after <= n).then(|| another_end(&demonstration, after, turn));
+                for demonstration in [Some(&demonstration), other.as_ref()].into_iter().flatten() {
+                    let last = demonstration.as_array().unwrap().len() - 1;
+                    let to_go = |node| oracle::cost_to_go(&model, demonstration, &weights, node, last);
+                    let (best, taken) = (to_go(from), cost + to_go(node(&committed[index])));
+                    prop_assert!(close(best, taken), "step {index}: {taken} where {best} was possible");
+                }
+            } else {
+                is_forced_once = true;
+                while committed[end].step.observation as usize == from.0 {
+                    end += 1;
+                    cost += step_cost(&committed[end]);
+                    prop_assert!(!committed[end].is_proven && committed[end].after as usize == after);
+                }
+                let window = from.0 + lookahead.unwrap() as usize;
+                prop_assert_eq!(after, window + 1, "decided when the lookahead was used up, not before and not after");
+                let (best, taken) = (to_go(from, window), cost + to_go(node(&committed[end]), window));
+                prop_assert!(close(best, taken), "steps {index}..={end}: {taken} where {best} was possible");
+            }
+            // Never later than the lookahead allows.
+            let latest = lookahead.map_or(n + 1, |lookahead| (from.0 + lookahead as usize + 1).min(n + 1));
+            prop_assert!(after <= latest, "step {index} was committed after {after}, not by {latest}");
+            index = end + 1;
+        }
+
+        prop_assert_eq!(mapping.status, if is_forced_once { Status::Local } else { Status::Optimal });
+        let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
+        if mapping.status == Status::Optimal {
+            prop_assert!(close(mapping.cost.total, optimum), "{} against {optimum}", mapping.cost.total);
+            prop_assert_eq!(mapping.lower_bound, Some(mapping.cost.total));
+        } else {
+            prop_assert!(mapping.cost.total >= optimum - 1e-9 && mapping.lower_bound.is_none());
+        }
+        let must_be_optimal = lookahead.is_none_or(|lookahead| lookahead as usize > n);
+        prop_assert!(!must_be_optimal || mapping.status == Status::Optimal);
+        let sum: f64 = committed.iter().map(step_cost).sum();
+        prop_assert!(close(sum, mapping.cost.total));
+        prop_assert_eq!(committed.len(), mapping.moves.len());
+    }
+}
+
+#[test]
+fn figure_4_reaches_its_optimum_with_a_lookahead_of_8_and_commits_early_without() {
+    let mapper = Arc::new(mapper(&example("figure-4/model.json")));
+    let demonstration = example("figure-4/demonstration.json");
+    let total = |lookahead| follow(&mapper, &demonstration, &json!({}), None, lookahead).1.cost.total;
+    assert_eq!(total(None), 48.0);
+    assert_eq!(total(Some(16)), 48.0);
+    assert!(total(Some(8)) <= 48.0 * 1.01, "{}", total(Some(8)));
+    assert!(total(Some(1)) > 48.0, "a short lookahead is short-sighted: {}", total(Some(1)));
+}
+
+/// A corridor of `n` cells, walked from end to end and back, again and again.
+fn corridor(n: u32) -> Value {
+    let states: Vec<Value> = (0..n).map(|x| json!([x])).collect();
+    let right = (0..n - 1).map(|x| json!([x, "right", x + 1]));
+    let left = (1..n).map(|x| json!([x, "left", x - 1]));
+    json!({
+        "attributes": [{"name": "x", "kind": "number"}],
+        "actions": [{"name": "right", "cost": 0.3}, {"name": "left", "cost": 0.3}],
+        "dynamics": {"kind": "table", "states": states, "transitions": right.chain(left).collect::<Vec<_>>(), "start": 0},
+    })
+}
+
+#[test]
+fn without_a_lookahead_proven_steps_come_early_and_memory_stays_flat() {
+    let n = 12;
+    let mapper = Arc::new(mapper(&corridor(n)));
+    let schema = mapper.model().schema().clone();
+    let mut online = OnlineMapping::new(Arc::clone(&mapper), schema.weights(), None, None);
+    let mut most_nodes = 0;
+    let mut longest_wait = 0;
+    for i in 0..5000_u32 {
+        let x = if i / (n - 1) % 2 == 0 { i % (n - 1) } else { n - 1 - i % (n - 1) };
+        let observation = schema.read_observation(&Place::root(&json!([x])), &mut Faults::default()).unwrap();
+        for committed in online.observe(&observation, &mut Uninterrupted).unwrap() {
+            assert!(committed.is_proven);
+            longest_wait = longest_wait.max(committed.after - committed.step.observation);
+        }
+        most_nodes = most_nodes.max(online.n_nodes());
+    }
+    assert!(longest_wait <= n + 1, "the survivors' ways meet within the corridor's length: {longest_wait}");
+    assert!(most_nodes <= (n * n) as usize, "{most_nodes} nodes");
+    let (_, mapping) = online.end().unwrap();
+    assert_eq!((mapping.status, mapping.cost.distance), (Status::Optimal, 0.0));
+}

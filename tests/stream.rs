@@ -1,0 +1,523 @@
+//! The stream protocol, from outside, over both transports.
+
+#![expect(clippy::unwrap_used, reason = "tests may panic")]
+
+mod service;
+
+use std::time::Duration;
+
+use futures_util::{SinkExt, StreamExt};
+use reqwest::Body;
+use serde_json::{Value, json};
+use service::{Service, example};
+use tokio::net::TcpStream;
+use tokio::sync::mpsc;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
+
+/// Longer than anything here takes; a test that waits for this fails.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// A websocket client.
+struct Client {
+    socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
+}
+
+impl Client {
+    /// Connects, and takes the server's hello.
+    async fn connect(service: &Service) -> Self {
+        let mut request = format!("ws://{}/v1/stream", service.address).into_client_request().unwrap();
+        request.headers_mut().insert("sec-websocket-protocol", "etude.v1+json".parse().unwrap());
+        let (socket, response) = tokio_tungstenite::connect_async(request).await.unwrap();
+        assert_eq!(response.headers()["sec-websocket-protocol"], "etude.v1+json");
+        let mut client = Self { socket };
+        let hello = client.receive().await;
+        assert_eq!((&hello["type"], &hello["protocol"]), (&json!("hello"), &json!("etude.v1+json")));
+        assert_eq!(hello["limits"], json!({"frame_bytes": 262_144, "observations": 100_000}));
+        client
+    }
+
+    async fn send(&mut self, frame: Value) {
+        self.socket.send(Message::text(frame.to_string())).await.unwrap();
+    }
+
+    async fn next(&mut self) -> Message {
+        tokio::time::timeout(PATIENCE, self.socket.next()).await.unwrap().unwrap().unwrap()
+    }
+
+    async fn receive(&mut self) -> Value {
+        let message = self.next().await;
+        serde_json::from_str(message.to_text().unwrap_or_else(|_| panic!("{message:?}"))).unwrap()
+    }
+
+    /// Receives frames up to one of type `kind`, which comes last.
+    async fn receive_until(&mut self, kind: &str) -> Vec<Value> {
+        let mut frames = Vec::new();
+        loop {
+            let frame = self.receive().await;
+            let is_last = frame["type"] == kind;
+            assert!(is_last || frame["type"] != "error", "{frame}");
+            frames.push(frame);
+            if is_last {
+                return frames;
+            }
+        }
+    }
+
+    /// Receives the close code.
+    async fn closed(&mut self) -> u16 {
+        loop {
+            match self.next().await {
+                Message::Close(frame) => return frame.unwrap().code.into(),
+                Message::Text(text) => assert!(!text.contains("\"error\""), "{text}"),
+                _ => {}
+            }
+        }
+    }
+
+    /// Opens a session and gives its id.
+    async fn open(&mut self, open: Value) -> String {
+        self.send(open).await;
+        let opened = self.receive().await;
+        assert_eq!((&opened["type"], &opened["received"]), (&json!("opened"), &json!(0)), "{opened}");
+        opened["session"].as_str().unwrap().to_owned()
+    }
+}
+
+async fn figure_4() -> (Service, Vec<Value>) {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    (service, example("figure-4/demonstration.json").as_array().unwrap().clone())
+}
+
+fn steps(frames: &[Value]) -> Vec<Value> {
+    frames.iter().filter(|frame| frame["type"] == "step").cloned().collect()
+}
+
+#[tokio::test]
+async fn a_demonstration_is_followed_while_it_runs() {
+    let (service, demonstration) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "figure-4"})).await;
+    let mut committed = Vec::new();
+    for (seq, state) in demonstration.iter().enumerate() {
+        client.send(json!({"type": "observe", "seq": seq, "states": [state]})).await;
+        committed.extend(steps(&client.receive_until("received").await));
+    }
+    let before_the_end = committed.len();
+    client.send(json!({"type": "end", "seq": 16})).await;
+    let frames = client.receive_until("done").await;
+    committed.extend(steps(&frames));
+    let done = frames.last().unwrap();
+    assert_eq!(client.closed().await, 1000);
+
+    assert!(before_the_end > 5, "{before_the_end} steps came before the end");
+    assert!(committed.iter().enumerate().all(|(n, step)| step["step"] == n), "in order, none doubled");
+    for step in &committed {
+        let (observation, after) = (step["observation"].as_u64().unwrap(), step["after"].as_u64().unwrap());
+        assert!(after <= (observation + 8 + 1).min(16), "{step}");
+    }
+    let policy = service.get(&format!("/v1/policies/{}", done["policy_id"].as_str().unwrap())).await.1;
+    assert_eq!((&policy["actions"], &policy["cost"]), (&done["actions"], &done["cost"]));
+    for (step, stored) in committed.iter().zip(policy["steps"].as_array().unwrap()) {
+        for field in ["step", "observation", "move", "action", "state", "action_cost", "distance", "cost"] {
+            assert_eq!(step[field], stored[field], "{field} of {step}");
+        }
+    }
+    assert_eq!(committed.len(), policy["steps"].as_array().unwrap().len());
+
+    let (_, stored) = service.get(&format!("/v1/sessions/{session}")).await;
+    assert_eq!((&stored["status"], &stored["observations"]), (&json!("done"), &json!(16)));
+    assert_eq!(stored["policy_id"], done["policy_id"]);
+    assert_eq!(service.get("/v1/sessions").await.1["items"], json!([stored]));
+    assert_eq!(service.get("/v1/sessions/nothing").await.1["type"], "/problems/unknown-session");
+
+    // What the same lookahead gives in one request.
+    let mut request = example("figure-4/request.json");
+    request["lookahead"] = json!(8);
+    let (_, at_once) = service.post("/v1/policies", &request).await;
+    assert_eq!((&at_once["actions"], &at_once["status"]), (&policy["actions"], &policy["status"]));
+}
+
+#[tokio::test]
+async fn a_local_policy_is_refined_after_the_stream() {
+    let (service, demonstration) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    client.open(json!({"type": "open", "model": "figure-4", "lookahead": 1, "weights": {"gold": 1.5}})).await;
+    client.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    client.send(json!({"type": "end", "seq": 16})).await;
+    let done = client.receive_until("done").await.pop().unwrap();
+    assert_eq!(done["status"], "local");
+    let path = format!("/v1/policies/{}", done["policy_id"].as_str().unwrap());
+    let refined_by = loop {
+        let (_, local) = service.get(&path).await;
+        if let Some(refined_by) = local["refined_by"].as_str() {
+            break refined_by.to_owned();
+        }
+        tokio::task::yield_now().await;
+    };
+    let (_, refined) = service.get(&format!("/v1/policies/{refined_by}")).await;
+    assert_eq!((&refined["refines"], &refined["status"]), (&done["policy_id"], &json!("optimal")));
+    assert_eq!(refined["weights"]["gold"], 1.5);
+    assert!(refined["cost"]["total"].as_f64() < done["cost"]["total"].as_f64());
+}
+
+#[tokio::test]
+async fn lines_go_both_ways_at_the_same_time() {
+    let (service, demonstration) = figure_4().await;
+    let (lines, body) = mpsc::channel::<Result<String, std::io::Error>>(1);
+    let body = Body::wrap_stream(tokio_stream::wrappers::ReceiverStream::new(body));
+    let request = service.client.post(service.url("/v1/stream")).body(body);
+    let response = tokio::time::timeout(PATIENCE, request.send()).await.unwrap().unwrap();
+    assert_eq!(response.headers()["content-type"], "application/x-ndjson");
+    let mut answer = response.bytes_stream();
+    let mut buffer = String::new();
+    let mut receive = async || {
+        loop {
+            if let Some((line, rest)) = buffer.split_once('\n') {
+                let frame: Value = serde_json::from_str(line).unwrap();
+                buffer = rest.to_owned();
+                return Some(frame);
+            }
+            let chunk = tokio::time::timeout(PATIENCE, answer.next()).await.unwrap()?;
+            buffer.push_str(std::str::from_utf8(&chunk.unwrap()).unwrap());
+        }
+    };
+    let send = async |frame: Value| lines.send(Ok(format!("{frame}\r\n\n"))).await.unwrap();
+    assert_eq!(receive().await.unwrap()["type"], "hello");
+    send(json!({"type": "open", "model": "figure-4", "lookahead": null})).await;
+    assert_eq!(receive().await.unwrap()["type"], "opened");
+    for (seq, state) in demonstration.iter().enumerate() {
+        send(json!({"type": "observe", "seq": seq, "states": [state]})).await;
+        // The answer comes while the request is still being sent.
+        while receive().await.unwrap()["type"] != "received" {}
+    }
+    send(json!({"type": "end", "seq": 16})).await;
+    let done = loop {
+        let frame = receive().await.unwrap();
+        if frame["type"] == "done" {
+            break frame;
+        }
+        assert_eq!(frame["proven"], true, "{frame}");
+    };
+    assert_eq!((&done["status"], &done["cost"]["total"]), (&json!("optimal"), &json!(48.0)));
+    assert_eq!(receive().await, None, "the answer ends by itself");
+}
+
+#[tokio::test]
+async fn what_was_received_is_ignored_and_what_is_missing_is_asked_for() {
+    let (service, demonstration) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    client.open(json!({"type": "open", "model": "figure-4"})).await;
+    let observe = |seq: usize, end: usize| json!({"type": "observe", "seq": seq, "states": demonstration[seq..end]});
+    client.send(observe(1, 2)).await;
+    let error = client.receive().await;
+    assert_eq!(error["problem"], json!({"type": "/problems/gap", "detail": "expected seq 0"}));
+    client.send(observe(0, 3)).await;
+    assert_eq!(client.receive().await, json!({"type": "received", "seq": 3}));
+    // Once more, and with something new.
+    client.send(observe(0, 3)).await;
+    client.send(observe(1, 5)).await;
+    assert_eq!(client.receive_until("received").await.last().unwrap()["seq"], 3);
+    assert_eq!(client.receive_until("received").await.last().unwrap()["seq"], 5);
+    client.send(observe(6, 7)).await;
+    loop {
+        let frame = client.receive().await;
+        if frame["type"] == "error" {
+            assert_eq!(frame["problem"]["detail"], "expected seq 5");
+            break;
+        }
+    }
+    // A frame with a fault is refused whole.
+    client.send(json!({"type": "observe", "seq": 5, "states": [demonstration[5], {"x": "far", "speed": 1}]})).await;
+    let problem = client.receive().await["problem"].clone();
+    assert_eq!(problem["type"], "/problems/invalid");
+    let pointers: Vec<_> = problem["errors"].as_array().unwrap().iter().map(|error| &error["pointer"]).collect();
+    assert_eq!(pointers, ["/states/1/speed", "/states/1/x"]);
+    client.send(json!({"type": "end", "seq": 16})).await;
+    assert_eq!(client.receive().await["problem"]["detail"], "expected seq 5");
+    client.send(observe(5, 16)).await;
+    client.send(json!({"type": "end", "seq": 16})).await;
+    // Frames after the end are not looked at.
+    client.send(observe(16, 16)).await;
+    client.send(json!({"type": "nonsense"})).await;
+    assert_eq!(client.receive_until("done").await.last().unwrap()["type"], "done");
+    assert_eq!(client.closed().await, 1000);
+}
+
+#[tokio::test]
+async fn whatever_cannot_be_understood_has_its_answer() {
+    let (service, _) = figure_4().await;
+    let text = |frame: Value| Message::text(frame.to_string());
+    let open = || text(json!({"type": "open", "model": "figure-4"}));
+    let nested = "[".repeat(10_000);
+    let cases = [
+        (vec![Message::text("{")], "malformed-json", 1007),
+        (vec![Message::text("{\"type\": NaN}")], "malformed-json", 1007),
+        (vec![Message::text(nested.as_str())], "malformed-json", 1007),
+        (vec![Message::text(" ".repeat(262_145))], "too-large", 1009),
+        (vec![Message::text(" ".repeat(2_000_000))], "too-large", 1009),
+        (vec![Message::binary(b"{}".to_vec())], "bad-frame", 4400),
+        (vec![Message::text("[]")], "bad-frame", 4400),
+        (vec![text(json!({"kind": "open"}))], "bad-frame", 4400),
+        (vec![text(json!({"type": "close"}))], "bad-frame", 4400),
+        (vec![open(), text(json!({"type": "observe", "seq": -1, "states": [], "hurry": 1}))], "bad-frame", 4400),
+        (vec![open(), text(json!({"type": "observe", "seq": 0, "states": {}}))], "bad-frame", 4400),
+        (vec![open(), text(json!({"type": "end"}))], "bad-frame", 4400),
+        (vec![Message::text("{\"type\": \"reward\", \"reward\": 1e999}")], "bad-frame", 4400),
+        (
+            vec![text(json!({"type": "open", "model": "figure-4", "lookahead": 0, "weights": {"z": -1}}))],
+            "invalid",
+            4400,
+        ),
+        (vec![text(json!({"type": "open", "model": "figure-4", "start": 9999, "explore": 1}))], "invalid", 4400),
+        (vec![text(json!({"type": "open", "model": "figure-4", "explore": true}))], "invalid", 4400),
+        (vec![text(json!({"type": "open", "model": "nothing"}))], "unknown-model", 4404),
+        (vec![text(json!({"type": "resume", "session": "nothing", "step": 0}))], "unknown-session", 4404),
+        (vec![text(json!({"type": "observe", "seq": 0, "states": []}))], "not-allowed", 1008),
+        (vec![text(json!({"type": "end", "seq": 0}))], "not-allowed", 1008),
+        (vec![open(), open()], "not-allowed", 1008),
+        (vec![open(), text(json!({"type": "reward", "reward": 1}))], "not-allowed", 1008),
+    ];
+    for (messages, slug, code) in cases {
+        let mut client = Client::connect(&service).await;
+        let shown = messages.last().map(|message| message.to_string().chars().take(80).collect::<String>());
+        let n_before = messages.len() - 1;
+        for message in messages {
+            client.socket.send(message).await.unwrap();
+        }
+        for _ in 0..n_before {
+            assert_eq!(client.receive().await["type"], "opened");
+        }
+        let error = client.receive().await;
+        assert_eq!(error["problem"]["type"], format!("/problems/{slug}"), "{shown:?}: {error}");
+        assert_eq!(client.closed().await, code, "{shown:?}: {error}");
+    }
+    // Text that is not UTF-8, byte by byte: a masked text frame of two bytes.
+    let mut client = Client::connect(&service).await;
+    {
+        use tokio::io::AsyncWriteExt;
+        let stream = client.socket.get_mut();
+        stream.write_all(&[0x81, 0x82, 0, 0, 0, 0, 0xff, 0xfe]).await.unwrap();
+        stream.flush().await.unwrap();
+    }
+    assert_eq!(client.receive().await["problem"]["detail"], "the frame is not UTF-8");
+    assert_eq!(client.closed().await, 1007);
+    // An end without a demonstration leaves the session open.
+    let mut client = Client::connect(&service).await;
+    client.open(json!({"type": "open", "model": "figure-4"})).await;
+    client.send(json!({"type": "end", "seq": 0})).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/empty");
+    client.send(json!({"type": "observe", "seq": 0, "states": [{}]})).await;
+    assert_eq!(client.receive().await, json!({"type": "received", "seq": 1}));
+}
+
+#[tokio::test]
+async fn a_cut_connection_and_a_restarted_server_lose_and_double_nothing() {
+    let (service, demonstration) = figure_4().await;
+    let mut undisturbed = Client::connect(&service).await;
+    undisturbed.open(json!({"type": "open", "model": "figure-4", "lookahead": 3})).await;
+    undisturbed.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    undisturbed.send(json!({"type": "end", "seq": 16})).await;
+    let expected = steps(&undisturbed.receive_until("done").await);
+
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "figure-4", "lookahead": 3})).await;
+    client.send(json!({"type": "observe", "seq": 0, "states": demonstration[..7]})).await;
+    client.receive_until("received").await;
+    let mut seen = vec![client.receive().await, client.receive().await];
+    // Cut, without a goodbye.
+    drop(client);
+
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": session, "step": 2})).await;
+    let opened = client.receive().await;
+    assert_eq!((&opened["session"], &opened["received"]), (&json!(session), &json!(7)));
+    let n_steps = opened["steps"].as_u64().unwrap();
+    for _ in 2..n_steps {
+        seen.push(client.receive().await);
+    }
+    client.send(json!({"type": "observe", "seq": 7, "states": demonstration[7..12]})).await;
+    assert_eq!(client.receive().await, json!({"type": "received", "seq": 12}));
+    drop(client);
+
+    let directory = service.stop().await;
+    let service = Service::start_in(directory, &[]).await;
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": session, "step": n_steps})).await;
+    assert_eq!(client.receive().await["received"], 12);
+    client.send(json!({"type": "observe", "seq": 12, "states": demonstration[12..]})).await;
+    client.send(json!({"type": "end", "seq": 16})).await;
+    let frames = client.receive_until("done").await;
+    seen.extend(steps(&frames));
+    assert_eq!(seen, expected);
+
+    // A session that is done tells it again.
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": session, "step": 0})).await;
+    let again = client.receive_until("done").await;
+    assert_eq!((steps(&again), again.last()), (expected, frames.last()));
+    assert_eq!(client.closed().await, 1000);
+}
+
+#[tokio::test]
+async fn a_session_that_is_resumed_elsewhere_is_taken_over() {
+    let (service, demonstration) = figure_4().await;
+    let mut first = Client::connect(&service).await;
+    let session = first.open(json!({"type": "open", "model": "figure-4"})).await;
+    let mut second = Client::connect(&service).await;
+    second.send(json!({"type": "resume", "session": session})).await;
+    assert_eq!(second.receive().await["type"], "opened");
+    assert_eq!(first.receive().await["problem"]["type"], "/problems/taken-over");
+    assert_eq!(first.closed().await, 1008);
+    second.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    second.send(json!({"type": "end", "seq": 16})).await;
+    assert_eq!(second.receive_until("done").await.last().unwrap()["type"], "done");
+}
+
+#[tokio::test]
+async fn a_thousand_observations_fit_into_a_frame() {
+    let (service, demonstration) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    client.open(json!({"type": "open", "model": "figure-4"})).await;
+    let thousand: Vec<Value> = demonstration.iter().cycle().take(1000).map(|state| json!({"x": state["x"]})).collect();
+    client.send(json!({"type": "observe", "seq": 0, "states": thousand})).await;
+    assert_eq!(client.receive().await, json!({"type": "received", "seq": 1000}));
+    client.send(json!({"type": "end", "seq": 1000})).await;
+    let frames = client.receive_until("done").await;
+    assert_eq!(steps(&frames).last().unwrap()["observation"], 999);
+}
+
+#[tokio::test]
+async fn pings_are_answered() {
+    let (service, _) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    client.socket.send(Message::Ping(b"there?".as_slice().into())).await.unwrap();
+    assert_eq!(client.next().await, Message::Pong(b"there?".as_slice().into()));
+}
+
+#[tokio::test]
+async fn a_client_that_never_reads_is_closed_and_holds_up_nobody() {
+    let service = Service::start(&["--slow-reader-timeout", "200ms"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let demonstration = example("figure-4/demonstration.json");
+    let mut stuck = Client::connect(&service).await;
+    let session = stuck.open(json!({"type": "open", "model": "figure-4", "lookahead": 1})).await;
+    // Steps by the thousand, which fill the buffers on the way.
+    let states: Vec<&Value> = demonstration.as_array().unwrap().iter().cycle().take(800).collect();
+    for n in 0..40 {
+        let frame = json!({"type": "observe", "seq": n * states.len(), "states": states});
+        let sent = stuck.socket.send(Message::text(frame.to_string()));
+        // Once the server waits for this client, it takes nothing more from it.
+        if !matches!(tokio::time::timeout(Duration::from_secs(2), sent).await, Ok(Ok(()))) {
+            break;
+        }
+        if n == 20 {
+            let mut other = Client::connect(&service).await;
+            other.open(json!({"type": "open", "model": "figure-4"})).await;
+            other.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+            other.send(json!({"type": "end", "seq": 16})).await;
+            other.receive_until("done").await;
+        }
+    }
+    // The session is free again: it can be resumed by one who reads.
+    let mut reader = Client::connect(&service).await;
+    reader.send(json!({"type": "resume", "session": session})).await;
+    let opened = reader.receive().await;
+    assert!(opened["received"].as_u64().unwrap() >= 800, "{opened}");
+    drop(stuck);
+}
+
+#[tokio::test]
+async fn a_shutdown_ends_streams_so_that_they_can_be_resumed() {
+    let (service, demonstration) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "figure-4"})).await;
+    client.send(json!({"type": "observe", "seq": 0, "states": demonstration[..5]})).await;
+    client.receive_until("received").await;
+    let stopping = tokio::spawn(service.stop());
+    loop {
+        let frame = client.receive().await;
+        if frame["type"] == "error" {
+            assert_eq!(frame["problem"]["type"], "/problems/stopping");
+            break;
+        }
+    }
+    assert_eq!(client.closed().await, 1001);
+    drop(client);
+    let service = Service::start_in(stopping.await.unwrap(), &[]).await;
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": session})).await;
+    assert_eq!(client.receive().await["received"], 5);
+}
+
+#[tokio::test]
+async fn idle_sessions_expire() {
+    let service = Service::start(&["--session-idle-timeout", "100ms"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "figure-4"})).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/idle");
+    assert_eq!(client.closed().await, 1008);
+    while service.get(&format!("/v1/sessions/{session}")).await.1["status"] != "expired" {
+        tokio::task::yield_now().await;
+    }
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": session})).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/expired");
+    assert_eq!(client.closed().await, 4404);
+}
+
+#[tokio::test]
+async fn no_more_streams_run_than_may() {
+    let service = Service::start(&["--max-streams", "1"]).await;
+    let first = Client::connect(&service).await;
+    let second = tokio_tungstenite::connect_async(format!("ws://{}/v1/stream", service.address)).await;
+    let error = second.unwrap_err().to_string();
+    assert!(error.contains("503"), "{error}");
+    drop(first);
+    let (status, problem) = service.get("/v1/stream").await;
+    assert_eq!((status, &problem["type"]), (422, &json!("/problems/invalid")), "not a websocket: {problem}");
+}
+
+#[tokio::test]
+async fn a_stream_follows_a_learners_weights_or_explores_and_is_rewarded() {
+    let (service, demonstration) = figure_4().await;
+    let learner = json!({"attributes": ["x", "gold"], "mean": {"x": 2, "gold": 3}, "sd": 0.5, "seed": 7});
+    assert_eq!(service.put("/v1/learners/gold", &learner).await.0, 201);
+
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "open", "model": "figure-4", "learner": "gold", "weights": {"y": 4}})).await;
+    let opened = client.receive().await;
+    let weights = &opened["weights"];
+    assert_eq!((&weights["x"], &weights["y"], &weights["gold"]), (&json!(2.0), &json!(4.0), &json!(3.0)));
+    assert_eq!(opened["trial"], Value::Null);
+
+    let mut client = Client::connect(&service).await;
+    let explore = json!({"type": "open", "model": "figure-4", "learner": "gold", "explore": true});
+    client.send(explore).await;
+    let opened = client.receive().await;
+    let trial = format!("/v1/trials/{}", opened["trial"].as_str().unwrap());
+    let (_, active) = service.get(&trial).await;
+    assert_eq!((&active["number"], &active["status"], &active["policy"]), (&json!(1), &json!("active"), &Value::Null));
+    assert_eq!(active["weights"]["gold"], opened["weights"]["gold"]);
+    assert_ne!(opened["weights"]["gold"], json!(3.0), "drawn, not the mean");
+    client.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    client.send(json!({"type": "end", "seq": 16})).await;
+    let done = client.receive_until("done").await.pop().unwrap();
+    client.send(json!({"type": "observe", "seq": 16, "states": [{}]})).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/ended");
+    client.send(json!({"type": "reward", "reward": 974})).await;
+    let rewarded = client.receive().await;
+    assert_eq!((&rewarded["type"], &rewarded["reward_order"]), (&json!("rewarded"), &json!(1)));
+    assert_eq!(client.closed().await, 1000);
+
+    let (_, rewarded) = service.get(&trial).await;
+    assert_eq!((&rewarded["reward"], &rewarded["policy_id"]), (&json!(974.0), &done["policy_id"]));
+    assert_eq!((&rewarded["policy"]["learner"], &rewarded["policy"]["weights_version"]), (&json!("gold"), &json!(0)));
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "open", "model": "figure-4", "learner": "nobody"})).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/unknown-learner");
+    assert_eq!(client.closed().await, 4404);
+}
