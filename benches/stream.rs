@@ -51,9 +51,10 @@ fn main() -> Result<(), Failure> {
 
 /// Feeds a demonstration that goes on for 10,000 observations, and looks at windows of it.
 fn observe(world: &World, lookahead: Option<NonZeroU32>) -> Result<(), Failure> {
-    let definition = Definition::read(&world.model, Limits::DEFAULT).map_err(|faults| faults.to_string())?;
+    let definition =
+        Definition::read(&world.model, Limits::DEFAULT, &mut Uninterrupted).map_err(|error| error.to_string())?;
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).map_err(|_| "too large")?;
-    let mapper = Arc::new(Mapper::new(model));
+    let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted).map_err(|_| "interrupted")?);
     let schema = mapper.model().schema();
     let states = world.demonstration.as_array().ok_or("a demonstration is an array")?;
     let read = |state| schema.read_observation(&Place::root(state), &mut Faults::default()).ok_or("faults");

@@ -202,12 +202,11 @@ async fn with_database<T>(
         return Err(CliError::Read { path: database.to_owned(), source });
     }
     let settings = Settings {
-        // Nothing here opens a session.
-        session_idle_timeout: Duration::MAX,
         database: database.to_owned(),
         limits: Limits::DEFAULT,
         model_cache_bytes: 0,
         pool: PoolSettings { n_threads: 1, max_waiting: 0 },
+        session_idle_timeout: Duration::MAX,
     };
     let tasks = TaskTracker::new();
     let etude = Etude::open(&settings, &tasks, CancellationToken::new()).await;
