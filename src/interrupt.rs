@@ -2,7 +2,7 @@
 //!
 //! The core has no clock and no cancellation token of its own: it asks its caller, again and again, whether to go on. How
 //! much work lies between two questions is each computation's to choose, so that it takes milliseconds at most; a
-//! [`Meter`] counts it. What the answer rests on (a deadline, a vanished client, a shutdown) is the caller's affair.
+//! `Meter` counts it. What the answer rests on (a deadline, a vanished client, a shutdown) is the caller's affair.
 
 /// What a long computation is told when it asks whether to go on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

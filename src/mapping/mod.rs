@@ -36,6 +36,7 @@ mod distances;
 mod heuristic;
 mod mapper;
 mod online;
+mod open_list;
 mod policy;
 mod problem;
 mod request;

@@ -13,7 +13,6 @@
 //! each projection, consistent (Holte, Felner, Newton, Meshulam & Furcy 2006, on additive pattern databases; Katz & Domshlak 2010,
 //! on cost partitioning).
 
-use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
 use rustc_hash::{FxHashMap, FxHashSet};
@@ -21,6 +20,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 use super::Heuristic;
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
+use crate::mapping::open_list::CheapestFirst;
 use crate::model::{ActionIdx, Model, StateIdx};
 
 /// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
@@ -342,8 +342,8 @@ impl<'m> Table<'m> {
                     *from = from.min(share + cost);
                 }
             }
-            open.extend(row.iter().zip(0..).map(|(cost, class)| Open { cost: *cost, class }));
-            while let Some(Open { cost, class }) = open.pop() {
+            open.extend(row.iter().zip(0..).map(|(cost, class)| CheapestFirst { cost: *cost, id: class }));
+            while let Some(CheapestFirst { cost, id: class }) = open.pop() {
                 match meter.spend(1) {
                     Signal::Continue => {}
                     Signal::Finish => return Ok(None),
@@ -356,7 +356,7 @@ impl<'m> Table<'m> {
                     let extra = share + here[class as usize] + cost;
                     if extra < row[*from as usize] {
                         row[*from as usize] = extra;
-                        open.push(Open { cost: extra, class: *from });
+                        open.push(CheapestFirst { cost: extra, id: *from });
                     }
                 }
             }
@@ -391,33 +391,6 @@ impl Predecessors {
         &self.edges[self.offsets[class]..self.offsets[class + 1]]
     }
 }
-
-/// An entry of the open list; the greatest is the cheapest.
-#[derive(Clone, Copy)]
-struct Open {
-    cost: f64,
-    class: ClassIdx,
-}
-
-impl Ord for Open {
-    fn cmp(&self, other: &Self) -> Ordering {
-        other.cost.total_cmp(&self.cost).then_with(|| other.class.cmp(&self.class))
-    }
-}
-
-impl PartialOrd for Open {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for Open {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other).is_eq()
-    }
-}
-
-impl Eq for Open {}
 
 #[cfg(test)]
 mod tests {
