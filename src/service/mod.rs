@@ -13,6 +13,7 @@ mod learner_task;
 mod learners;
 mod models;
 mod name;
+mod owners;
 mod policies;
 mod pool;
 mod refiner;
@@ -36,8 +37,8 @@ use crate::document::{Faults, ParseError, Quoted};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
 use cache::MapperCache;
+use owners::Owners;
 use refiner::Refiner;
-use sessions::Owners;
 use trials::TrialNumbers;
 
 /// How the service is set up.

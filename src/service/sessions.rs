@@ -3,18 +3,17 @@
 //! Of a session only what it was opened with and its observations are stored. Whoever resumes it gets the same steps
 //! again, because they follow from those. A session belongs to one connection at a time; resuming takes it over.
 
-use std::collections::HashMap;
 use std::num::NonZeroU32;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Instant;
 
 use jiff::Timestamp;
 use serde_json::Value;
-use tokio::sync::OwnedMutexGuard;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::learners::Ready;
+use super::owners::Ownership;
 use super::policies::{PolicyText, as_micros, report};
 use super::{Etude, PoolError, ServiceError};
 use crate::attribute::{ByAttribute, Weights};
@@ -596,61 +595,5 @@ impl Opening {
             None => Some(None),
         };
         Some(Self { weights: weights?, lookahead: lookahead?, start: start? })
-    }
-}
-
-/// Which connection drives which session.
-#[derive(Debug, Default)]
-pub(super) struct Owners {
-    owners: Arc<Mutex<HashMap<String, Owner>>>,
-}
-
-#[derive(Debug)]
-struct Owner {
-    /// Held while a session is driven.
-    driving: Arc<tokio::sync::Mutex<()>>,
-    /// Cancelled when the newest owner is to give way.
-    taken_over: CancellationToken,
-    /// How many owners there were, to tell the newest.
-    generation: u64,
-}
-
-/// The right to drive a session, until it is dropped.
-#[derive(Debug)]
-struct Ownership {
-    id: String,
-    generation: u64,
-    taken_over: CancellationToken,
-    owners: Arc<Mutex<HashMap<String, Owner>>>,
-    _driving: OwnedMutexGuard<()>,
-}
-
-impl Owners {
-    /// Waits until whoever drives the session has given way.
-    async fn take(&self, id: &str) -> Ownership {
-        let taken_over = CancellationToken::new();
-        let (driving, generation) = {
-            let mut owners = self.owners.lock().unwrap_or_else(PoisonError::into_inner);
-            let owner = owners.entry(id.to_owned()).or_insert_with(|| Owner {
-                driving: Arc::default(),
-                taken_over: CancellationToken::new(),
-                generation: 0,
-            });
-            owner.taken_over.cancel();
-            owner.taken_over = taken_over.clone();
-            owner.generation += 1;
-            (Arc::clone(&owner.driving), owner.generation)
-        };
-        let driving = driving.lock_owned().await;
-        Ownership { id: id.to_owned(), generation, taken_over, owners: Arc::clone(&self.owners), _driving: driving }
-    }
-}
-
-impl Drop for Ownership {
-    fn drop(&mut self) {
-        let mut owners = self.owners.lock().unwrap_or_else(PoisonError::into_inner);
-        if owners.get(&self.id).is_some_and(|owner| owner.generation == self.generation) {
-            owners.remove(&self.id);
-        }
     }
 }
