@@ -143,14 +143,14 @@ impl Mapper {
         // Sums in another order may be a little larger; a little room costs nothing.
         let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
         match settings.heuristic {
-            HeuristicName::Default => match Projected::solve(&self.projections, problem, interrupt)? {
-                Some(projected) => self.best_first(problem, &projected, budget, most_f, interrupt),
-                // No time for the estimate, so none for a search either.
-                None => {
-                    let budget = Budget { max_expansions: 0, ..budget };
-                    self.best_first(problem, &Projected::blind(problem), budget, most_f, interrupt)
+            HeuristicName::Default => {
+                if let Some(projected) = Projected::solve(&self.projections, problem, interrupt)? {
+                    return self.best_first(problem, &projected, budget, most_f, interrupt);
                 }
-            },
+                // No time for the estimate, so none for a search either.
+                let budget = Budget { max_expansions: 0, ..budget };
+                self.best_first(problem, &Projected::blind(problem), budget, most_f, interrupt)
+            }
             HeuristicName::None => {
                 let found = astar::search(problem, &Blind, budget, most_f, interrupt)?;
                 conclude(problem, &Blind, found, interrupt)

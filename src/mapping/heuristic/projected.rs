@@ -62,6 +62,8 @@ impl<'p> Projected<'p> {
         problem: &'p Problem<'p>,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
+        /// How many classes are looked at between two looks at the interrupt: about a millisecond.
+        const POLL_EVERY: u64 = 1 << 14;
         let used = used_groups(projections, problem, MAX_ENTRIES);
         let mut projected = Self::blind(problem);
         for (group, _) in projections.groups().iter().zip(&used).filter(|(_, is_used)| **is_used) {
@@ -81,8 +83,6 @@ impl<'p> Projected<'p> {
         });
         let n_sharing: Vec<f64> = n_sharing.collect();
         let share = |edge: &ProjectedEdge| problem.model.action(edge.action).cost / n_sharing[edge.change_set as usize];
-        /// How many classes are looked at between two looks at the interrupt: about a millisecond.
-        const POLL_EVERY: u64 = 1 << 14;
         let mut meter = Meter::new(interrupt, POLL_EVERY);
         for number in 0..projected.columns.len() {
             match projected.solve_column(number, share, &mut meter) {

@@ -18,9 +18,10 @@ use super::buckets::Buckets;
 use super::nodes::{Arrival, NO_NODE, Node, NodeId, Nodes};
 use super::{Found, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
-use crate::mapping::heuristic::projected::{EstimatesAt, Projected};
+use crate::mapping::heuristic::projected::Projected;
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::{Budget, Problem};
+use crate::model::Transition;
 
 /// How many times as wide each probe is as the one before.
 const PROBE_WIDENING: u64 = 8;
@@ -59,7 +60,7 @@ pub(in crate::mapping) fn search(
     buffers: &mut Buffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
-    buffers.nodes.clear();
+    buffers.nodes.clear(problem.demonstration.len().saturating_mul(problem.model.graph().n_states()));
     let start = Arrival { observation: 0, state: problem.start, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
     // The start is kept whatever it costs: it is what is left to complete if there is no budget at all.
     let first = buffers.nodes.offer(start, &projected.at(0), f64::INFINITY).unwrap_or(NO_NODE);
@@ -218,32 +219,30 @@ impl Search<'_> {
         let (problem, projected) = (self.problem, self.projected);
         let actions = problem.model.actions();
         let node = self.buffers.nodes.get(id);
-        let (g, state, observation) = (node.g(), node.state, node.observation);
+        let (g, observation) = (node.g(), node.observation);
         self.buffers.nodes.close(id);
-        let next = observation + 1;
-        let (estimates, next_estimates) = (projected.at(observation as usize), projected.at(next as usize));
-        let successors = problem.model.graph().successors(state);
+        let layers = [observation + 1, observation].map(|i| (i, projected.at(i as usize)));
+        let successors = problem.model.graph().successors(node.state);
         self.n_expanded += 1;
         self.n_generated += 1 + 2 * successors.len() as u64;
-        let skip = Arrival { observation: next, state, cost: g, parent: id, action: NO_ACTION };
-        self.arrive(skip, &next_estimates, &mut found);
-        for transition in successors {
-            let (state, action) = (transition.to, transition.action);
-            let cost = g + actions[usize::from(action)].cost;
-            let matched = Arrival { observation: next, state, cost, parent: id, action };
-            self.arrive(matched, &next_estimates, &mut found);
-            self.arrive(Arrival { observation, ..matched }, &estimates, &mut found);
-        }
-    }
-
-    #[inline]
-    fn arrive(&mut self, arrival: Arrival, estimates: &EstimatesAt<'_>, found: &mut impl FnMut(&mut Buffers, NodeId)) {
-        let Some(id) = self.buffers.nodes.offer(arrival, estimates, self.limit) else { return };
-        if arrival.observation as usize == self.problem.last() {
-            self.limit = self.buffers.nodes.get(id).g() * (1.0 - ROUNDING);
-            self.incumbent = Some(id);
-        } else {
-            found(self.buffers, id);
+        let skip = Transition { action: NO_ACTION, to: node.state };
+        for transition in std::iter::once(&skip).chain(successors) {
+            let Transition { action, to: state } = *transition;
+            // A skip only advances.
+            let (action_cost, layers) = match actions.get(usize::from(action)) {
+                Some(action) => (action.cost, &layers[..]),
+                None => (0.0, &layers[..1]),
+            };
+            for (observation, estimates) in layers {
+                let arrival = Arrival { observation: *observation, state, cost: g + action_cost, parent: id, action };
+                let Some(id) = self.buffers.nodes.offer(arrival, estimates, self.limit) else { continue };
+                if *observation as usize == problem.last() {
+                    self.limit = self.buffers.nodes.get(id).g() * (1.0 - ROUNDING);
+                    self.incumbent = Some(id);
+                } else {
+                    found(self.buffers, id);
+                }
+            }
         }
     }
 
@@ -253,15 +252,14 @@ impl Search<'_> {
         let open = || nodes.iter().filter(|(_, node)| self.is_open(node));
         let least_f =
             if is_complete { f64::INFINITY } else { open().map(|(_, node)| node.f()).fold(self.limit, f64::min) };
-        let ends = match self.incumbent {
-            Some(incumbent) => vec![incumbent],
+        let ends = if let Some(incumbent) = self.incumbent {
+            vec![incumbent]
+        } else {
             // The farthest nodes, and among those the most promising: where it is best to go on greedily.
-            None => {
-                let farthest = open().max_by(|(_, node), (_, other)| {
-                    node.observation.cmp(&other.observation).then(other.f().total_cmp(&node.f()))
-                });
-                farthest.map(|(id, _)| id).into_iter().chain([first]).collect()
-            }
+            let farthest = open().max_by(|(_, node), (_, other)| {
+                node.observation.cmp(&other.observation).then(other.f().total_cmp(&node.f()))
+            });
+            farthest.map(|(id, _)| id).into_iter().chain([first]).collect()
         };
         let paths = ends.into_iter().map(|id| nodes.path(id)).collect();
         Found { paths, is_complete, least_f, n_expanded: self.n_expanded, n_generated: self.n_generated }

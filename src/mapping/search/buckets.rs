@@ -3,7 +3,7 @@
 use super::nodes::NodeId;
 
 /// An open list for nodes of `f` below a known limit. A bucket holds the nodes whose `f` agree in their first
-/// [`MANTISSA_BITS`] binary digits, so its width is a ten-thousandth of `f`; of the nodes in one bucket, the one that came last is
+/// [`MANTISSA_BITS`] binary digits, so its width is about a thousandth of `f`; of the nodes in one bucket, the one that came last is
 /// taken first. Adding and taking are constant work.
 #[derive(Debug, Default)]
 pub(super) struct Buckets {
@@ -26,7 +26,7 @@ struct Entry {
 }
 
 /// Binary digits of `f` that matter, after the first.
-const MANTISSA_BITS: u32 = 12;
+const MANTISSA_BITS: u32 = 10;
 
 /// How far below the limit costs are told apart as well as near it, as a power of two; which bounds how many buckets there are.
 const MAX_OCTAVES: i32 = 16;
@@ -46,9 +46,7 @@ impl Buckets {
     #[inline]
     fn bucket_of(&self, f: f64) -> usize {
         let leading = (f + self.offset).to_bits() >> (f64::MANTISSA_DIGITS - 1 - MANTISSA_BITS);
-        #[expect(clippy::cast_possible_truncation, reason = "at most 2^24, with sign and exponent")]
-        let bucket = leading.saturating_sub(self.first) as usize;
-        bucket
+        leading.saturating_sub(self.first) as usize
     }
 
     /// Adds a node.
@@ -91,7 +89,7 @@ mod tests {
             (0..1000).for_each(|n| open.push(n, f(n)));
             let order: Vec<f64> = std::iter::from_fn(|| open.pop()).map(f).collect();
             assert_eq!(order.len(), 1000);
-            let width = |f: f64| (f + limit / 65536.0) / 4096.0;
+            let width = |f: f64| (f + limit / 65536.0) / 1024.0;
             assert!(order.windows(2).all(|pair| pair[1] > pair[0] - width(pair[0])), "{least} to {limit}");
         }
     }
