@@ -23,19 +23,36 @@ use worlds::World;
 const N_ROUNDS: usize = 7;
 
 fn main() {
-    for world in [worlds::example("figure-4"), worlds::cave(20, 5, 50, 1)] {
-        measure(&world);
+    let only = std::env::var("ONLY").unwrap_or_default();
+    for world in [
+        worlds::example("figure-4"),
+        worlds::cave(20, 5, 50, 1),
+        worlds::example("taxi"),
+        worlds::cave(40, 8, 100, 1),
+        worlds::table(100_000, 50, 1),
+    ] {
+        if world.name.contains(&only) {
+            measure(&world);
+        }
     }
 }
 
 fn measure(world: &World) {
-    let definition = Definition::read(&world.model, Limits::DEFAULT, &mut Uninterrupted).expect("worlds are models");
+    let definition = Definition::read(&world.model, Limits { max_states: 20_000_000 }, &mut Uninterrupted)
+        .expect("worlds are models");
     let started = Instant::now();
-    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).expect("worlds are small enough");
+    let model = Model::compile(&definition, Limits { max_states: 20_000_000 }, &mut Uninterrupted)
+        .expect("worlds are small enough");
     let mapper = &Mapper::new(model, &mut Uninterrupted).expect("nothing interrupts");
     let compiled = started.elapsed();
-    let peer = Peer::new(mapper, world);
     let graph = mapper.model().graph();
+    let start = {
+        let request = json!({"model": "m", "demonstration": world.demonstration});
+        let mut faults = Faults::default();
+        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).expect("a request is an object");
+        Request::read(mapper.model(), &object, &mut faults).expect("worlds have their demonstrations").problem.start()
+    };
+    let peer = Peer::new(mapper, world, start);
     println!(
         "\n{}: {} states, {} transitions (compiled in {}), {} observations",
         world.name,
@@ -104,38 +121,34 @@ type Node = (u32, u32);
 /// The same problem for a general A*.
 struct Peer<'m> {
     mapper: &'m Mapper,
-    /// Terms of the distance by attribute. Shape `[n_observations][n_states][n_attributes]`.
+    start: u32,
+    /// Terms of the distance by the state's value. Shape `[n_observations][n_attributes][domain size]`.
     terms: Vec<Vec<Vec<MicroCost>>>,
-    /// Their sums. Shape `[n_observations][n_states]`.
-    distances: Vec<Vec<MicroCost>>,
     action_costs: Vec<MicroCost>,
     n_expanded: Cell<u64>,
 }
 
 impl<'m> Peer<'m> {
-    fn new(mapper: &'m Mapper, world: &World) -> Self {
+    fn new(mapper: &'m Mapper, world: &World, start: u32) -> Self {
         let model = mapper.model();
         let observations = world.demonstration.as_array().expect("a demonstration is an array");
-        let terms: Vec<Vec<Vec<MicroCost>>> = observations
-            .iter()
-            .map(|observation| {
-                let observed = observe(model.schema(), observation);
-                let states = 0..model.states().len();
-                states.map(|state| terms(model, &observed, state)).collect()
-            })
-            .collect();
-        let sum = |terms: &Vec<MicroCost>| terms.iter().sum();
-        let distances = terms.iter().map(|states| states.iter().map(sum).collect()).collect();
+        let terms = observations.iter().map(|observation| terms(model, &observe(model.schema(), observation)));
         let action_costs = model.actions().iter().map(|action| micro(action.cost)).collect();
-        Self { mapper, terms, distances, action_costs, n_expanded: Cell::new(0) }
+        Self { mapper, start, terms: terms.collect(), action_costs, n_expanded: Cell::new(0) }
     }
 
     fn n_observations(&self) -> usize {
-        self.distances.len()
+        self.terms.len()
     }
 
     fn distance(&self, (i, state): Node) -> MicroCost {
-        self.distances[i as usize][state as usize]
+        self.terms_of(i as usize, state).sum()
+    }
+
+    /// The terms of a distance, by attribute.
+    fn terms_of(&self, i: usize, state: u32) -> impl Iterator<Item = MicroCost> {
+        let values = self.mapper.model().states().row(state);
+        self.terms[i].iter().zip(values).map(|(terms, value)| terms[*value as usize])
     }
 
     fn solve(&self, heuristic: impl Fn(&Node) -> MicroCost) -> Solved {
@@ -153,7 +166,7 @@ impl<'m> Peer<'m> {
             });
             skip.into_iter().chain(moves).collect::<Vec<_>>()
         };
-        let start = (0, 0);
+        let start = (0, self.start);
         let (_, cost) = astar(&start, successors, heuristic, |&(i, _)| i == last).expect("there is always a mapping");
         #[expect(clippy::cast_precision_loss, reason = "far below 2^52")]
         let cost = (self.distance(start) + cost) as f64 / 1e6;
@@ -164,10 +177,9 @@ impl<'m> Peer<'m> {
     fn paper(&self, (i, state): Node) -> MicroCost {
         let last = self.n_observations() - 1;
         let ahead = i as usize + 1..=last;
-        let Some(j) = ahead.min_by_key(|j| self.distances[*j][state as usize]) else { return 0 };
+        let Some(j) = ahead.min_by_key(|j| self.terms_of(*j, state).sum::<MicroCost>()) else { return 0 };
         let least = self.action_costs.iter().copied().min().unwrap_or(0);
-        let mut terms: Vec<MicroCost> =
-            self.terms[j][state as usize].iter().copied().filter(|term| *term > 0).collect();
+        let mut terms: Vec<MicroCost> = self.terms_of(j, state).filter(|term| *term > 0).collect();
         terms.sort_unstable_by(|a, b| b.cmp(a));
         let mut remaining: MicroCost = terms.iter().sum();
         let mut estimate = 0;
@@ -185,13 +197,14 @@ fn observe(schema: &Schema, observation: &serde_json::Value) -> Vec<Option<etude
         .expect("worlds have their demonstrations")
 }
 
-fn terms(model: &Model, observed: &[Option<etude::attribute::Value>], state: u32) -> Vec<MicroCost> {
-    let values = model.states().values(state).zip(observed);
-    let attributes = model.schema().attributes().iter().zip(values);
-    let term = |(attribute, (own, observed)): (&etude::attribute::Attribute, (_, &Option<_>))| {
-        observed.as_ref().map_or(0, |observed| micro(attribute.term(attribute.weight, observed, own)))
-    };
-    attributes.map(term).collect()
+/// Shape `[n_attributes][domain size]`.
+fn terms(model: &Model, observed: &[Option<etude::attribute::Value>]) -> Vec<Vec<MicroCost>> {
+    let attributes = model.schema().attributes().iter().zip(observed).enumerate();
+    let terms = attributes.map(|(position, (attribute, observed))| {
+        let term = |own| observed.as_ref().map_or(0, |observed| micro(attribute.term(attribute.weight, observed, own)));
+        model.states().domain(position).iter().map(term).collect()
+    });
+    terms.collect()
 }
 
 #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "costs here are small and positive")]

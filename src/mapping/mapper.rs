@@ -1,5 +1,7 @@
 //! A model prepared for mapping.
 
+use std::sync::{Mutex, PoisonError};
+
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -7,9 +9,11 @@ use super::Problem;
 use super::completion::{Allowance, Extras, complete};
 use super::cost::{Cost, cost_of};
 use super::heuristic::paper::Paper;
-use super::heuristic::projection::{Projected, Projections};
+use super::heuristic::projected::Projected;
+use super::heuristic::projection::Projections;
 use super::heuristic::{Blind, Heuristic, HeuristicName};
-use super::search::{Found, Move, search};
+use super::search::best_first::{self, Buffers};
+use super::search::{Found, Move, astar};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::model::Model;
 
@@ -91,6 +95,8 @@ pub struct Mapping {
 pub struct Mapper {
     model: Model,
     projections: Projections,
+    /// Of searches that have ended, for those that come: at most as many as ran at the same time.
+    buffers: Mutex<Vec<Buffers>>,
 }
 
 impl Mapper {
@@ -101,7 +107,7 @@ impl Mapper {
     /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
     pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
         let projections = Projections::new(&model, interrupt)?;
-        Ok(Self { model, projections })
+        Ok(Self { model, projections, buffers: Mutex::default() })
     }
 
     /// The model.
@@ -134,55 +140,68 @@ impl Mapper {
     ) -> Result<Mapping, Cancelled> {
         assert!(std::ptr::eq(problem.model, &raw const self.model), "the problem must be of this mapper's model");
         let Settings { budget, upper_bound, .. } = settings;
-        // Sums in another order may be a little larger.
-        let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + ROUNDING));
+        // Sums in another order may be a little larger; a little room costs nothing.
+        let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
         match settings.heuristic {
-            HeuristicName::Default => match Projected::solve(&self.projections, problem, interrupt)? {
-                Some(projected) => admissible(problem, &projected, budget, most_f, interrupt),
+            HeuristicName::Default => {
+                if let Some(projected) = Projected::solve(&self.projections, problem, interrupt)? {
+                    return self.best_first(problem, &projected, budget, most_f, interrupt);
+                }
                 // No time for the estimate, so none for a search either.
-                None => admissible(problem, &Blind, Budget { max_expansions: 0, ..budget }, most_f, interrupt),
-            },
-            HeuristicName::None => admissible(problem, &Blind, budget, most_f, interrupt),
+                let budget = Budget { max_expansions: 0, ..budget };
+                self.best_first(problem, &Projected::blind(problem), budget, most_f, interrupt)
+            }
+            HeuristicName::None => {
+                let found = astar::search(problem, &Blind, budget, most_f, interrupt)?;
+                conclude(problem, &Blind, found, interrupt)
+            }
             HeuristicName::Paper => {
-                let found = search(problem, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
+                let found = astar::search(problem, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, problem.start);
                 match Projected::solve(&self.projections, problem, interrupt)? {
                     Some(projected) => {
-                        let lower_bound = first + projected.cost_to_go(0, problem.start);
-                        conclude(problem, &projected, found, lower_bound, interrupt)
+                        let least_f = first + projected.cost_to_go(0, problem.start);
+                        conclude(problem, &projected, Found { least_f, ..found }, interrupt)
                     }
-                    None => conclude(problem, &Blind, found, first, interrupt),
+                    None => conclude(problem, &Blind, Found { least_f: first, ..found }, interrupt),
                 }
             }
         }
     }
+
+    fn best_first(
+        &self,
+        problem: &Problem<'_>,
+        projected: &Projected<'_>,
+        budget: Budget,
+        most_f: f64,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        let kept = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let mut buffers = kept.unwrap_or_default();
+        let found = best_first::search(problem, projected, budget, most_f, &mut buffers, interrupt)?;
+        if buffers.are_small() {
+            self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
+        }
+        conclude(problem, projected, found, interrupt)
+    }
 }
+
+/// How much more than an upper bound a mapping may cost, relatively: more than sums of 100,000 terms differ by rounding.
+const SLACK: f64 = 1e-9;
 
 /// Sums in different orders may differ by rounding; what is closer than this, relatively, is the same.
 const ROUNDING: f64 = 1e-12;
 
-fn admissible<H: Heuristic>(
-    problem: &Problem<'_>,
-    heuristic: &H,
-    budget: Budget,
-    most_f: f64,
-    interrupt: &mut dyn Interrupt,
-) -> Result<Mapping, Cancelled> {
-    let found = search(problem, heuristic, budget, most_f, interrupt)?;
-    let lower_bound = if found.is_complete { f64::INFINITY } else { found.least_f };
-    conclude(problem, heuristic, found, lower_bound, interrupt)
-}
-
-/// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than `lower_bound`.
+/// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than its `least_f`.
 fn conclude<H: Heuristic>(
     problem: &Problem<'_>,
     heuristic: &H,
     found: Found,
-    lower_bound: f64,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Mapping, Cancelled> {
-    let Found { paths, is_complete, n_expanded, n_generated, .. } = found;
+    let Found { paths, is_complete, least_f: lower_bound, n_expanded, n_generated } = found;
     let mut allowance = Allowance::new(interrupt);
     let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };
     let mut costed = Vec::new();

@@ -14,20 +14,20 @@
 //!
 //! ```text
 //! Problem (model, demonstration, weights, start)
-//!    |                     Projections (per model) --> heuristic
+//!    |                     Projections (per model) --> Projected (per problem: distances, costs-to-go)
 //!    v                                                     |
-//! Mapper::map ---- search (A*) <---------------------------+
-//!    |                |  budget over: completion (greedy)
+//! Mapper::map ---- search (best first) <-------------------+
+//!    |                |  budget over: the incumbent, or completion (greedy)
 //!    v                v
 //! Mapping (moves, status, lower bound, counts) --> Policy (what a client gets)
 //! ```
 //!
 //! [`OnlineMapping`] does the same while the demonstration is still running.
 //!
-//! **Ties.** Among mappings of equal cost the search returns the one that it reaches first, which is determined: it
-//! expands nodes in the order of `f`, then the later observation, then the most recently found; keeps the first way found
-//! to a node at its least cost; and finds successors in the order `skip`, then by action `match` before `extra`.
-//! Costs are compared as the sums of floats along the path.
+//! **Ties.** Among mappings of equal cost the search returns the one that it comes to first, which is determined: what was
+//! found is given up only for what costs less. Nodes are expanded in the order of `f` to a thousandth, the most recently found of
+//! equals first; the first way found to a node at its least cost is kept; successors are found in the order `skip`, then
+//! by action `match` before `extra`. Costs are compared as the sums of floats along the path.
 
 mod completion;
 mod cost;

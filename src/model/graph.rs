@@ -40,6 +40,7 @@ impl Graph {
     }
 
     /// The ways out of `state`, in the order of their actions.
+    #[inline]
     #[must_use]
     pub fn successors(&self, state: StateIdx) -> &[Transition] {
         let state = state as usize;

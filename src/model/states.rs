@@ -45,6 +45,7 @@ impl States {
     }
 
     /// The row of `state`: per attribute, the index of its value in the domain. Shape `[n_attributes]`.
+    #[inline]
     #[must_use]
     pub fn row(&self, state: StateIdx) -> &[u32] {
         let n_attributes = self.domains.len();

@@ -7,6 +7,7 @@
 //! | `paper` | no | no | differences and least action cost ([`paper`]) |
 
 pub(super) mod paper;
+pub(super) mod projected;
 pub(super) mod projection;
 
 use serde::{Deserialize, Serialize};

@@ -13,15 +13,12 @@
 //! each projection, consistent (Holte, Felner, Newton, Meshulam & Furcy 2006, on additive pattern databases; Katz & Domshlak 2010,
 //! on cost partitioning).
 
-use std::collections::BinaryHeap;
-
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use super::Heuristic;
-use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
+use super::projected::Estimate;
+use crate::interrupt::{Cancelled, Interrupt, Meter};
 use crate::mapping::Problem;
-use crate::mapping::open_list::CheapestFirst;
-use crate::model::{ActionIdx, Model, StateIdx};
+use crate::model::{ActionIdx, Model};
 
 /// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
 #[derive(Debug)]
@@ -32,29 +29,39 @@ pub(crate) struct Projections {
 }
 
 /// A model, projected on some of its attributes.
+///
+/// The class of a state is a number in mixed radix, with the domain indices of the attributes' values as digits; some
+/// classes may have no states.
 #[derive(Debug)]
-struct Group {
-    /// Positions of the attributes, ascending.
-    attributes: Vec<usize>,
-    /// The class of each state. Shape `[n_states]`.
-    class_of: Vec<ClassIdx>,
-    /// The domain indices of each class's values. Shape `[n_classes, attributes.len()]`.
-    class_rows: Vec<u32>,
+pub(super) struct Group {
+    /// The attributes, ascending.
+    digits: Vec<Digit>,
+    n_classes: usize,
     /// Distinct ways to change the class.
     edges: Vec<ProjectedEdge>,
     /// Whether its edges fit.
     is_kept: bool,
 }
 
-type ClassIdx = u32;
+/// An attribute of a group.
+#[derive(Clone, Copy, Debug)]
+struct Digit {
+    /// The attribute's position.
+    position: usize,
+    /// What the attribute's domain index is multiplied with.
+    stride: usize,
+}
+
+/// A class of a group.
+pub(super) type ClassIdx = u32;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-struct ProjectedEdge {
-    from: ClassIdx,
-    to: ClassIdx,
-    action: ActionIdx,
+pub(super) struct ProjectedEdge {
+    pub(super) from: ClassIdx,
+    pub(super) to: ClassIdx,
+    pub(super) action: ActionIdx,
     /// Which groups change together with this one: an index into the change sets.
-    change_set: u32,
+    pub(super) change_set: u32,
 }
 
 /// Most edges of all groups together, and most entries of all change sets: 256 and 32 MB. Groups whose edges do not fit are
@@ -77,9 +84,8 @@ impl Projections {
         let mut meter = Meter::new(interrupt, POLL_EVERY);
         let states = model.states();
         let varies = |attribute: &usize| states.domain(*attribute).len() > 1;
-        let groups =
-            (0..model.schema().len()).filter(varies).map(|attribute| Group::new(model, &[attribute], &mut meter));
-        let mut groups: Vec<Group> = groups.collect::<Result<_, _>>()?;
+        let alone = (0..model.schema().len()).filter(varies).map(|attribute| Group::new(model, &[attribute]));
+        let mut groups: Vec<Group> = alone.collect();
 
         let mut change_sets = ChangeSets::default();
         // `None` for a group that is left out.
@@ -88,14 +94,16 @@ impl Projections {
         let mut changed = Vec::new();
         for (from, transition) in model.graph().iter() {
             meter.spend_or_cancel(groups.len() as u64)?;
-            let is_changed = |group: &Group| group.class(from) != group.class(transition.to);
+            let (row, row_after) = (states.row(from), states.row(transition.to));
+            let is_changed = |group: &Group| group.positions().any(|at| row[at] != row_after[at]);
             let kept = groups.iter().zip(&edges).zip(0u16..).filter(|((_, edges), _)| edges.is_some());
             changed.clear();
             changed.extend(kept.filter(|((group, _), _)| is_changed(group)).map(|(_, number)| number));
             let change_set = change_sets.number_of(&changed);
             for number in &changed {
                 let group = &groups[usize::from(*number)];
-                let (from, to) = (group.class(from), group.class(transition.to));
+                #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+                let [from, to] = [row, row_after].map(|row| group.class_of(row) as ClassIdx);
                 let edge = ProjectedEdge { from, to, action: transition.action, change_set };
                 let is_new = edges[usize::from(*number)].as_mut().is_some_and(|edges| edges.insert(edge));
                 n_edges += usize::from(is_new);
@@ -113,6 +121,15 @@ impl Projections {
             group.edges.sort_unstable();
         }
         Ok(Self { groups, change_sets: change_sets.sets })
+    }
+
+    pub(super) fn groups(&self) -> &[Group] {
+        &self.groups
+    }
+
+    /// Distinct sets of groups that some transition changes.
+    pub(super) fn change_sets(&self) -> &[Vec<u16>] {
+        &self.change_sets
     }
 
     /// Approximate size in memory, in bytes.
@@ -173,222 +190,70 @@ impl ChangeSets {
 }
 
 impl Group {
-    fn new(model: &Model, attributes: &[usize], meter: &mut Meter<'_>) -> Result<Self, Cancelled> {
-        let states = model.states();
-        let mut classes: FxHashMap<Vec<u32>, ClassIdx> = FxHashMap::default();
-        let mut class_rows = Vec::new();
-        let mut key = Vec::with_capacity(attributes.len());
-        let class_of = (0..states.len()).map(|state| {
-            meter.spend_or_cancel(1)?;
-            let row = states.row(state);
-            key.clear();
-            key.extend(attributes.iter().map(|attribute| row[*attribute]));
-            Ok(classes.get(&key).copied().unwrap_or_else(|| {
-                #[expect(clippy::cast_possible_truncation, reason = "at most one per state")]
-                let class = classes.len() as ClassIdx;
-                classes.insert(key.clone(), class);
-                class_rows.extend_from_slice(&key);
-                class
-            }))
+    fn new(model: &Model, positions: &[usize]) -> Self {
+        let mut n_classes = 1;
+        let digits = positions.iter().map(|position| {
+            let digit = Digit { position: *position, stride: n_classes };
+            n_classes *= model.states().domain(*position).len();
+            digit
         });
-        let class_of = class_of.collect::<Result<_, _>>()?;
-        Ok(Self { attributes: attributes.to_vec(), class_of, class_rows, edges: Vec::new(), is_kept: true })
+        Self { digits: digits.collect(), n_classes, edges: Vec::new(), is_kept: true }
     }
 
-    fn class(&self, state: StateIdx) -> ClassIdx {
-        self.class_of[state as usize]
-    }
-
-    fn n_classes(&self) -> usize {
-        self.class_rows.len() / self.attributes.len()
-    }
-
-    /// What the group's attributes add to the distance of the observation `i` and the class `class`.
-    fn term(&self, problem: &Problem<'_>, i: usize, class: usize) -> f64 {
-        let row = &self.class_rows[class * self.attributes.len()..];
-        let values = self.attributes.iter().zip(row);
-        values.map(|(attribute, value)| problem.distances.term(*attribute, i, *value)).sum()
-    }
-
-    fn size_bytes(&self) -> usize {
-        size_of_val(self.class_of.as_slice())
-            + size_of_val(self.class_rows.as_slice())
-            + size_of_val(self.edges.as_slice())
-    }
-}
-
-/// The sum of exact costs-to-go in the projections, for one problem.
-#[derive(Debug)]
-pub(crate) struct Projected<'m> {
-    tables: Vec<Table<'m>>,
-}
-
-#[derive(Debug)]
-struct Table<'m> {
-    group: &'m Group,
-    /// Shape `[n_observations, n_classes]`.
-    cost_to_go: Vec<f64>,
-}
-
-/// Most entries of all tables together: 128 MB. Groups that do not fit, the largest, are left out, which keeps the bound a
-/// bound.
-const MAX_TABLE_ENTRIES: usize = 1 << 24;
-
-impl<'m> Projected<'m> {
-    /// Solves the projected problems, backwards over the demonstration. `None` if `interrupt` said to finish first.
-    ///
-    /// # Errors
-    ///
-    /// [`Cancelled`] if `interrupt` said so.
-    pub(crate) fn solve(
-        projections: &'m Projections,
-        problem: &Problem<'_>,
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<Option<Self>, Cancelled> {
-        let used = used_groups(projections, problem, MAX_TABLE_ENTRIES);
-        let n_sharing: Vec<f64> = projections
-            .change_sets
-            .iter()
-            .map(|groups| f64::from(groups.iter().map(|group| u32::from(used[usize::from(*group)])).sum::<u32>()))
-            .collect();
-        let mut tables = Vec::new();
-        for (group, _) in projections.groups.iter().zip(used).filter(|(_, is_used)| *is_used) {
-            let share =
-                |edge: &ProjectedEdge| problem.model.action(edge.action).cost / n_sharing[edge.change_set as usize];
-            match Table::solve(group, problem, share, interrupt)? {
-                Some(table) => tables.push(table),
-                None => return Ok(None),
-            }
-        }
-        Ok(Some(Self { tables }))
-    }
-}
-
-/// Which groups have tables, the smallest first as far as `max_entries` go.
-fn used_groups(projections: &Projections, problem: &Problem<'_>, max_entries: usize) -> Vec<bool> {
-    let groups = &projections.groups;
-    // A group whose attributes weigh nothing would take its share of the actions' costs to no purpose.
-    let is_wanted = |group: &Group| {
-        group.is_kept && group.attributes.iter().any(|attribute| problem.distances.is_active(*attribute))
-    };
-    let mut wanted: Vec<usize> = (0..groups.len()).filter(|number| is_wanted(&groups[*number])).collect();
-    wanted.sort_by_key(|number| groups[*number].n_classes());
-    let mut used = vec![false; groups.len()];
-    let mut n_left = max_entries;
-    for number in wanted {
-        let n_entries = problem.demonstration.len().saturating_mul(groups[number].n_classes());
-        let Some(left) = n_left.checked_sub(n_entries) else { break };
-        n_left = left;
-        used[number] = true;
-    }
-    used
-}
-
-impl Heuristic for Projected<'_> {
+    /// The class of a state with these domain indices, shape `[n_attributes]`.
     #[inline]
-    fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64 {
-        self.tables.iter().map(|table| table.cost_to_go(observation, state)).sum()
-    }
-}
-
-impl<'m> Table<'m> {
-    #[inline]
-    fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64 {
-        self.cost_to_go[observation * self.group.n_classes() + self.group.class(state) as usize]
+    pub(super) fn class_of(&self, values: &[u32]) -> usize {
+        self.digits.iter().map(|digit| values[digit.position] as usize * digit.stride).sum()
     }
 
-    /// With `N_i(v) = term(i+1, v) + H_{i+1}(v)`, what it costs to be next at class `v`:
-    ///
-    /// ```text
-    /// H_n(v) = 0
-    /// H_i(v) = min( N_i(v),                              skip
-    ///               share(v, v') + N_i(v'),              match
-    ///               share(v, v') + term(i, v') + H_i(v') extra )
-    /// ```
-    ///
-    /// The last row refers to the same observation, so each observation is one pass of Dijkstra's algorithm.
-    fn solve(
-        group: &'m Group,
-        problem: &Problem<'_>,
-        share: impl Fn(&ProjectedEdge) -> f64,
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<Option<Self>, Cancelled> {
-        /// How many classes are looked at between two looks at the interrupt: about a millisecond.
-        const POLL_EVERY: u64 = 1 << 14;
-        let mut meter = Meter::new(interrupt, POLL_EVERY);
-        let (n_observations, n_classes) = (problem.demonstration.len(), group.n_classes());
-        let predecessors = Predecessors::new(n_classes, &group.edges, share);
-        let mut cost_to_go = vec![0.0; n_observations * n_classes];
-        let terms = |i: usize| (0..n_classes).map(move |class| group.term(problem, i, class));
-        let mut next: Vec<f64> = vec![0.0; n_classes];
-        let mut here: Vec<f64> = terms(problem.last()).collect();
-        let mut open = BinaryHeap::new();
-        for i in (0..problem.last()).rev() {
-            match meter.spend(n_classes as u64) {
-                Signal::Continue => {}
-                Signal::Finish => return Ok(None),
-                Signal::Cancel => return Err(Cancelled),
+    /// The position of its attribute, if it has but one.
+    pub(super) fn single(&self) -> Option<usize> {
+        if let [digit] = self.digits.as_slice() { Some(digit.position) } else { None }
+    }
+
+    pub(super) fn n_classes(&self) -> usize {
+        self.n_classes
+    }
+
+    pub(super) fn edges(&self) -> &[ProjectedEdge] {
+        &self.edges
+    }
+
+    pub(super) fn is_kept(&self) -> bool {
+        self.is_kept
+    }
+
+    /// Positions of its attributes.
+    pub(super) fn positions(&self) -> impl Iterator<Item = usize> {
+        self.digits.iter().map(|digit| digit.position)
+    }
+
+    pub(super) fn has(&self, position: usize) -> bool {
+        self.positions().any(|at| at == position)
+    }
+
+    /// Writes what its attributes add to the distance of the observation `i`, by class.
+    pub(super) fn write_terms(&self, problem: &Problem<'_>, i: usize, row: &mut [Estimate]) {
+        let states = problem.model.states();
+        for digit in &self.digits {
+            if !problem.distances.is_active(digit.position) {
+                continue;
             }
-            let (row, row_after) = cost_to_go[i * n_classes..(i + 2) * n_classes].split_at_mut(n_classes);
-            for class in 0..n_classes {
-                next[class] = here[class] + row_after[class];
-            }
-            here.clear();
-            here.extend(terms(i));
-            row.copy_from_slice(&next);
-            for (class, cost) in next.iter().enumerate() {
-                for (from, share) in predecessors.of(class) {
-                    let from = &mut row[*from as usize];
-                    *from = from.min(share + cost);
-                }
-            }
-            open.extend(row.iter().zip(0..).map(|(cost, class)| CheapestFirst { cost: *cost, id: class }));
-            while let Some(CheapestFirst { cost, id: class }) = open.pop() {
-                match meter.spend(1) {
-                    Signal::Continue => {}
-                    Signal::Finish => return Ok(None),
-                    Signal::Cancel => return Err(Cancelled),
-                }
-                if cost > row[class as usize] {
-                    continue;
-                }
-                for (from, share) in predecessors.of(class as usize) {
-                    let extra = share + here[class as usize] + cost;
-                    if extra < row[*from as usize] {
-                        row[*from as usize] = extra;
-                        open.push(CheapestFirst { cost: extra, id: *from });
+            let n_values = states.domain(digit.position).len();
+            // Classes with equal digits come in runs, and the runs of all values follow each other again and again.
+            for runs in row.chunks_exact_mut(digit.stride * n_values) {
+                for (run, value) in runs.chunks_exact_mut(digit.stride).zip(0..) {
+                    let term = problem.distances.term(digit.position, i, value);
+                    for entry in run {
+                        entry.distance += term;
                     }
                 }
             }
         }
-        Ok(Some(Self { group, cost_to_go }))
-    }
-}
-
-/// The ways into each class, cheapest of each origin.
-struct Predecessors {
-    /// `offsets[v]..offsets[v + 1]` are the edges into `v`. Shape `[n_classes + 1]`.
-    offsets: Vec<usize>,
-    edges: Vec<(ClassIdx, f64)>,
-}
-
-impl Predecessors {
-    fn new(n_classes: usize, edges: &[ProjectedEdge], share: impl Fn(&ProjectedEdge) -> f64) -> Self {
-        let mut into: Vec<_> = edges.iter().map(|edge| (edge.to, edge.from, share(edge))).collect();
-        into.sort_unstable_by(|a, b| (a.0, a.1).cmp(&(b.0, b.1)).then(a.2.total_cmp(&b.2)));
-        into.dedup_by_key(|(to, from, _)| (*to, *from));
-        let mut offsets = vec![0; n_classes + 1];
-        for (to, _, _) in &into {
-            offsets[*to as usize + 1] += 1;
-        }
-        for class in 0..n_classes {
-            offsets[class + 1] += offsets[class];
-        }
-        Self { offsets, edges: into.into_iter().map(|(_, from, share)| (from, share)).collect() }
     }
 
-    fn of(&self, class: usize) -> &[(ClassIdx, f64)] {
-        &self.edges[self.offsets[class]..self.offsets[class + 1]]
+    fn size_bytes(&self) -> usize {
+        size_of_val(self.edges.as_slice())
     }
 }
 

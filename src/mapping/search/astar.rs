@@ -4,59 +4,12 @@ use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
 use rustc_hash::FxHashMap;
-use serde::{Deserialize, Serialize};
-use utoipa::ToSchema;
 
-use super::heuristic::Heuristic;
-use super::{Budget, Problem};
+use super::{Found, Move, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
+use crate::mapping::heuristic::Heuristic;
+use crate::mapping::{Budget, Problem};
 use crate::model::{ActionIdx, StateIdx};
-
-/// How a step advances.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
-#[serde(rename_all = "lowercase")]
-pub enum MoveKind {
-    /// The first step: `s_0` against `o_0`.
-    Start,
-    /// An action, to the next observation.
-    Match,
-    /// An action, under the same observation.
-    Extra,
-    /// No action, to the next observation.
-    Skip,
-}
-
-/// A step of a mapping.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Move {
-    /// How it advances.
-    pub kind: MoveKind,
-    /// The action, unless `kind` is `Start` or `Skip`.
-    pub action: Option<ActionIdx>,
-    /// The observation after the step.
-    pub observation: u32,
-    /// The imitator's state after the step.
-    pub state: StateIdx,
-}
-
-/// What a search found.
-#[derive(Debug)]
-pub(super) struct Found {
-    /// The way from `(0, s_0)` to each of these nodes: one that ends at the last observation if `is_complete`, else the
-    /// most promising ones, all to be completed.
-    pub(super) paths: Vec<Vec<Move>>,
-    /// Whether the search came to its end.
-    pub(super) is_complete: bool,
-    /// Least `f` of what was not yet expanded: no mapping costs less if the heuristic is admissible.
-    pub(super) least_f: f64,
-    /// Nodes expanded, again counted if they were reached more cheaply later.
-    pub(super) n_expanded: u64,
-    /// Successors looked at.
-    pub(super) n_generated: u64,
-}
-
-/// How many distances are looked at between two looks at the interrupt: less than a millisecond with a few attributes.
-pub(super) const POLL_EVERY: u64 = 2048;
 
 /// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows, among those of at most `most_f`, of which
 /// there must be one. A node is expanded again if a cheaper
@@ -65,7 +18,7 @@ pub(super) const POLL_EVERY: u64 = 2048;
 /// # Errors
 ///
 /// [`Cancelled`] if `interrupt` said so.
-pub(super) fn search<H: Heuristic>(
+pub(in crate::mapping) fn search<H: Heuristic>(
     problem: &Problem<'_>,
     heuristic: &H,
     budget: Budget,
@@ -93,7 +46,7 @@ pub(super) fn search<H: Heuristic>(
         let (i, state) = (node.observation as usize, node.state);
         if i == last {
             let paths = vec![nodes.path(entry.id)];
-            return Ok(Found { paths, is_complete: true, least_f: entry.f, n_expanded, n_generated });
+            return Ok(Found { paths, is_complete: true, least_f: f64::INFINITY, n_expanded, n_generated });
         }
         // Whatever is left of an expansion that is broken off costs at least the `f` of its node.
         let unfinished = |nodes: &Nodes, farthest: Open, n_expanded, n_generated| {
@@ -136,9 +89,6 @@ pub(super) fn search<H: Heuristic>(
     }
     unreachable!("every node before the last observation can be left by a skip")
 }
-
-/// Stands for "no action" in a node.
-const NO_ACTION: ActionIdx = ActionIdx::MAX;
 
 /// The cheapest way found so far to a node.
 #[derive(Clone, Copy, Debug)]

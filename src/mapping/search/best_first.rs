@@ -1,0 +1,267 @@
+//! A* for consistent estimates, with an incumbent.
+//!
+//! 1. A *probe* goes through the observations from the first to the last, and expands the most promising node of each. It comes
+//!    to a mapping, the first *incumbent*: from then on, what cannot cost less is not kept.
+//! 2. The nodes that are left are expanded in the order of `f = g + h`. Whatever comes to the last observation more cheaply
+//!    is the new incumbent. When no node is left whose `f` is below the incumbent's cost, that is the optimum.
+//! 3. Should that take long, wider probes look for better incumbents in between: they keep the memory small, and a search
+//!    that runs out of budget has something to show.
+//!
+//! So the nodes are expanded whose `f` is below the optimum, as A* must (Dechter & Pearl 1985), and those of the probes; but
+//! none of the many whose `f` equals it. As incumbents bound `f`, the open list needs no heap: costs are
+//! divided into [`Buckets`]. The order within a bucket is not that of `f`, so a node may be expanded before the cheapest way to it is
+//! known; it is then expanded again.
+
+use std::collections::BinaryHeap;
+
+use super::buckets::Buckets;
+use super::nodes::{Arrival, NO_NODE, Node, NodeId, Nodes};
+use super::{Found, NO_ACTION, POLL_EVERY};
+use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
+use crate::mapping::heuristic::projected::Projected;
+use crate::mapping::open_list::CheapestFirst;
+use crate::mapping::{Budget, Problem};
+use crate::model::Transition;
+
+/// How many times as wide each probe is as the one before.
+const PROBE_WIDENING: u64 = 8;
+
+/// A probe may take this part of the work that was done before it.
+const PROBE_SHARE: u64 = 16;
+
+/// Sums in different orders may differ by rounding; what is closer than this, relatively, is the same.
+const ROUNDING: f64 = 1e-12;
+
+/// Buffers of a search, kept to be used again.
+#[derive(Debug, Default)]
+pub(in crate::mapping) struct Buffers {
+    nodes: Nodes,
+    open: Buckets,
+    probed: BinaryHeap<CheapestFirst>,
+}
+
+impl Buffers {
+    /// Whether they are small enough to be kept: 12 MB of nodes.
+    pub(in crate::mapping) fn are_small(&self) -> bool {
+        self.nodes.capacity() <= 1 << 18
+    }
+}
+
+/// Finds the cheapest mapping, as far as `budget` allows, among those of at most `most`, of which there must be one.
+///
+/// # Errors
+///
+/// [`Cancelled`] if `interrupt` said so.
+pub(in crate::mapping) fn search(
+    problem: &Problem<'_>,
+    projected: &Projected<'_>,
+    budget: Budget,
+    most: f64,
+    buffers: &mut Buffers,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Found, Cancelled> {
+    buffers.nodes.clear(problem.demonstration.len().saturating_mul(problem.model.graph().n_states()));
+    let start = Arrival { observation: 0, state: problem.start, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
+    // The start is kept whatever it costs: it is what is left to complete if there is no budget at all.
+    let first = buffers.nodes.offer(start, &projected.at(0), f64::INFINITY).unwrap_or(NO_NODE);
+    let mut search = Search {
+        problem,
+        projected,
+        budget,
+        buffers,
+        limit: most.next_up(),
+        incumbent: (problem.last() == 0).then_some(first),
+        n_expanded: 0,
+        n_generated: 0,
+        meter: Meter::new(interrupt, POLL_EVERY),
+    };
+    let mut end = End::Done;
+    if search.incumbent.is_none() {
+        end = search.probe(1)?;
+        if end == End::Done {
+            end = search.expand_best_first()?;
+        }
+    }
+    Ok(search.found(first, end))
+}
+
+/// How a part of a search ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum End {
+    /// All is done that was to be done.
+    Done,
+    /// The budget was used up, or the interrupt said to finish.
+    CutShort,
+}
+
+struct Search<'s> {
+    problem: &'s Problem<'s>,
+    projected: &'s Projected<'s>,
+    budget: Budget,
+    buffers: &'s mut Buffers,
+    /// Mappings of this cost or more are of no interest.
+    limit: f64,
+    /// The end of the cheapest mapping that was found.
+    incumbent: Option<NodeId>,
+    n_expanded: u64,
+    n_generated: u64,
+    meter: Meter<'s>,
+}
+
+impl Search<'_> {
+    /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
+    /// advance counts among those of the observation.
+    fn probe(&mut self, width: u64) -> Result<End, Cancelled> {
+        let mut layers = vec![Vec::new(); self.problem.last()];
+        for (id, node) in self.buffers.nodes.iter().filter(|(_, node)| self.is_open(node)) {
+            if let Some(layer) = layers.get_mut(node.observation as usize) {
+                layer.push(id);
+            }
+        }
+        let mut ahead = Vec::new();
+        for (observation, mut layer) in layers.into_iter().enumerate() {
+            layer.append(&mut ahead);
+            self.buffers.probed.clear();
+            for id in layer {
+                let cost = self.buffers.nodes.get(id).f();
+                self.buffers.probed.push(CheapestFirst { cost, id });
+            }
+            let mut n_left = width;
+            while let Some(CheapestFirst { id, .. }) = self.buffers.probed.pop() {
+                if !self.is_open(&self.buffers.nodes.get(id)) {
+                    continue;
+                }
+                if n_left == 0 {
+                    break;
+                }
+                n_left -= 1;
+                if self.spend(id)? == End::CutShort {
+                    return Ok(End::CutShort);
+                }
+                self.expand(id, |buffers, id| {
+                    let node = buffers.nodes.get(id);
+                    if node.observation as usize == observation {
+                        buffers.probed.push(CheapestFirst { cost: node.f(), id });
+                    } else {
+                        ahead.push(id);
+                    }
+                });
+            }
+        }
+        Ok(End::Done)
+    }
+
+    /// Expands the nodes that may lead to a cheaper mapping than the incumbent, the most promising first.
+    fn expand_best_first(&mut self) -> Result<End, Cancelled> {
+        let n_layers = self.problem.last() as u64;
+        let mut probe_width = PROBE_WIDENING;
+        let mut bucketed_limit = self.fill_buckets();
+        while let Some(id) = self.buffers.open.pop() {
+            if !self.is_open(&self.buffers.nodes.get(id)) {
+                continue;
+            }
+            if self.spend(id)? == End::CutShort {
+                return Ok(End::CutShort);
+            }
+            self.expand(id, |buffers, id| {
+                let f = buffers.nodes.get(id).f();
+                buffers.open.push(id, f);
+            });
+            let is_probe_due = self.n_expanded / PROBE_SHARE >= probe_width.saturating_mul(n_layers);
+            if is_probe_due {
+                probe_width *= PROBE_WIDENING;
+                if self.probe(probe_width / PROBE_WIDENING)? == End::CutShort {
+                    return Ok(End::CutShort);
+                }
+            }
+            // What a probe found is not in the buckets; and those for a much higher limit are too wide.
+            if is_probe_due || self.limit < bucketed_limit / 4.0 {
+                bucketed_limit = self.fill_buckets();
+            }
+        }
+        Ok(End::Done)
+    }
+
+    /// Puts all open nodes into the buckets, and gives the limit that these are for.
+    fn fill_buckets(&mut self) -> f64 {
+        let limit = self.limit;
+        let Buffers { nodes, open, .. } = &mut *self.buffers;
+        let is_open = |node: &Node| !node.is_closed && node.f() < limit;
+        let least = nodes.iter().filter(|(_, node)| is_open(node)).map(|(_, node)| node.f()).fold(limit, f64::min);
+        open.reset(least, limit);
+        for (id, node) in nodes.iter().filter(|(_, node)| is_open(node)) {
+            open.push(id, node.f());
+        }
+        limit
+    }
+
+    fn is_open(&self, node: &Node) -> bool {
+        !node.is_closed && node.f() < self.limit
+    }
+
+    /// Counts the expansion of a node that is about to be done. Says whether it may be.
+    #[inline]
+    fn spend(&mut self, id: NodeId) -> Result<End, Cancelled> {
+        let n_successors = self.problem.model.graph().successors(self.buffers.nodes.get(id).state).len();
+        let is_spent =
+            self.n_expanded >= self.budget.max_expansions || self.buffers.nodes.len() >= self.budget.max_nodes;
+        match self.meter.spend(1 + 2 * n_successors as u64) {
+            Signal::Cancel => Err(Cancelled),
+            Signal::Continue if !is_spent => Ok(End::Done),
+            Signal::Continue | Signal::Finish => Ok(End::CutShort),
+        }
+    }
+
+    /// Follows all moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper
+    /// way.
+    #[inline]
+    fn expand(&mut self, id: NodeId, mut found: impl FnMut(&mut Buffers, NodeId)) {
+        let (problem, projected) = (self.problem, self.projected);
+        let actions = problem.model.actions();
+        let node = self.buffers.nodes.get(id);
+        let (g, observation) = (node.g(), node.observation);
+        self.buffers.nodes.close(id);
+        let layers = [observation + 1, observation].map(|i| (i, projected.at(i as usize)));
+        let successors = problem.model.graph().successors(node.state);
+        self.n_expanded += 1;
+        self.n_generated += 1 + 2 * successors.len() as u64;
+        let skip = Transition { action: NO_ACTION, to: node.state };
+        for transition in std::iter::once(&skip).chain(successors) {
+            let Transition { action, to: state } = *transition;
+            // A skip only advances.
+            let (action_cost, layers) = match actions.get(usize::from(action)) {
+                Some(action) => (action.cost, &layers[..]),
+                None => (0.0, &layers[..1]),
+            };
+            for (observation, estimates) in layers {
+                let arrival = Arrival { observation: *observation, state, cost: g + action_cost, parent: id, action };
+                let Some(id) = self.buffers.nodes.offer(arrival, estimates, self.limit) else { continue };
+                if *observation as usize == problem.last() {
+                    self.limit = self.buffers.nodes.get(id).g() * (1.0 - ROUNDING);
+                    self.incumbent = Some(id);
+                } else {
+                    found(self.buffers, id);
+                }
+            }
+        }
+    }
+
+    fn found(self, first: NodeId, end: End) -> Found {
+        let nodes = &self.buffers.nodes;
+        let is_complete = end == End::Done;
+        let open = || nodes.iter().filter(|(_, node)| self.is_open(node));
+        let least_f =
+            if is_complete { f64::INFINITY } else { open().map(|(_, node)| node.f()).fold(self.limit, f64::min) };
+        let ends = if let Some(incumbent) = self.incumbent {
+            vec![incumbent]
+        } else {
+            // The farthest nodes, and among those the most promising: where it is best to go on greedily.
+            let farthest = open().max_by(|(_, node), (_, other)| {
+                node.observation.cmp(&other.observation).then(other.f().total_cmp(&node.f()))
+            });
+            farthest.map(|(id, _)| id).into_iter().chain([first]).collect()
+        };
+        let paths = ends.into_iter().map(|id| nodes.path(id)).collect();
+        Found { paths, is_complete, least_f, n_expanded: self.n_expanded, n_generated: self.n_generated }
+    }
+}

@@ -1,0 +1,104 @@
+//! An open list of buckets: nodes in the order of `f`, but for differences that do not matter.
+
+use super::nodes::NodeId;
+
+/// An open list for nodes of `f` below a known limit. A bucket holds the nodes whose `f` agree in their first
+/// [`MANTISSA_BITS`] binary digits, so its width is about a thousandth of `f`; of the nodes in one bucket, the one that came last is
+/// taken first. Adding and taking are constant work.
+#[derive(Debug, Default)]
+pub(super) struct Buckets {
+    /// The entry that came last to each bucket, plus 1; 0 for none.
+    heads: Vec<u32>,
+    entries: Vec<Entry>,
+    /// Added to every `f`, so that no range of costs has too many binary orders of magnitude.
+    offset: f64,
+    /// The leading bits of what is in the first bucket.
+    first: u64,
+    /// Nothing is in the buckets before this one.
+    current: usize,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Entry {
+    node: NodeId,
+    /// The entry before it in its bucket, as in the heads.
+    next: u32,
+}
+
+/// Binary digits of `f` that matter, after the first.
+const MANTISSA_BITS: u32 = 10;
+
+/// How far below the limit costs are told apart as well as near it, as a power of two; which bounds how many buckets there are.
+const MAX_OCTAVES: i32 = 16;
+
+impl Buckets {
+    /// Empties the list, which is then for nodes of `least <= f < limit`.
+    pub(super) fn reset(&mut self, least: f64, limit: f64) {
+        self.offset = limit * 0.5_f64.powi(MAX_OCTAVES);
+        self.first = 0;
+        self.first = self.bucket_of(least) as u64;
+        self.heads.clear();
+        self.heads.resize(self.bucket_of(limit) + 1, 0);
+        self.entries.clear();
+        self.current = 0;
+    }
+
+    #[inline]
+    fn bucket_of(&self, f: f64) -> usize {
+        let leading = (f + self.offset).to_bits() >> (f64::MANTISSA_DIGITS - 1 - MANTISSA_BITS);
+        leading.saturating_sub(self.first) as usize
+    }
+
+    /// Adds a node.
+    #[inline]
+    pub(super) fn push(&mut self, node: NodeId, f: f64) {
+        // By rounding, what comes later may be a little less.
+        let bucket = self.bucket_of(f).max(self.current);
+        let Some(head) = self.heads.get_mut(bucket) else { return };
+        self.entries.push(Entry { node, next: *head });
+        #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
+        let entry = self.entries.len() as u32;
+        *head = entry;
+    }
+
+    /// Takes a node of the first bucket that has one.
+    #[inline]
+    pub(super) fn pop(&mut self) -> Option<NodeId> {
+        while let Some(head) = self.heads.get_mut(self.current) {
+            if let Some(entry) = (*head as usize).checked_sub(1) {
+                let Entry { node, next } = self.entries[entry];
+                *head = next;
+                return Some(node);
+            }
+            self.current += 1;
+        }
+        None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nodes_come_in_the_order_of_f_to_within_a_bucket() {
+        let mut open = Buckets::default();
+        for (least, limit) in [(0.0, 100.0), (63.4, 138.8), (0.0, 1e150), (5.4, 5.400_000_1), (1e-9, 1e9)] {
+            open.reset(least, limit);
+            let f = |n: u32| least + (limit - least) * f64::from(n * 7919 % 1000) / 1000.0;
+            (0..1000).for_each(|n| open.push(n, f(n)));
+            let order: Vec<f64> = std::iter::from_fn(|| open.pop()).map(f).collect();
+            assert_eq!(order.len(), 1000);
+            let width = |f: f64| (f + limit / 65536.0) / 1024.0;
+            assert!(order.windows(2).all(|pair| pair[1] > pair[0] - width(pair[0])), "{least} to {limit}");
+        }
+    }
+
+    #[test]
+    fn of_equals_the_last_comes_first() {
+        let mut open = Buckets::default();
+        open.reset(1.0, 2.0);
+        (0..3).for_each(|n| open.push(n, 1.5));
+        assert_eq!(std::iter::from_fn(|| open.pop()).collect::<Vec<_>>(), [2, 1, 0]);
+    }
+}

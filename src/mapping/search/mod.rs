@@ -1,0 +1,66 @@
+//! Searches for the cheapest mapping.
+//!
+//! | module | is | used with |
+//! |---|---|---|
+//! | [`best_first`] | A* for consistent estimates, with an incumbent and buckets | the default heuristic |
+//! | [`astar`] | A* as in the textbook | the paper's heuristic, which is not consistent, and none |
+//! | [`nodes`], [`buckets`] | the closed and the open list of [`best_first`] | |
+
+pub(super) mod astar;
+pub(super) mod best_first;
+mod buckets;
+mod nodes;
+
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use crate::model::{ActionIdx, StateIdx};
+
+/// How a step advances.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum MoveKind {
+    /// The first step: `s_0` against `o_0`.
+    Start,
+    /// An action, to the next observation.
+    Match,
+    /// An action, under the same observation.
+    Extra,
+    /// No action, to the next observation.
+    Skip,
+}
+
+/// A step of a mapping.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Move {
+    /// How it advances.
+    pub kind: MoveKind,
+    /// The action, unless `kind` is `Start` or `Skip`.
+    pub action: Option<ActionIdx>,
+    /// The observation after the step.
+    pub observation: u32,
+    /// The imitator's state after the step.
+    pub state: StateIdx,
+}
+
+/// What a search found.
+#[derive(Debug)]
+pub(in crate::mapping) struct Found {
+    /// The way from `(0, s_0)` to each of these nodes: one that ends at the last observation if `is_complete`, else the
+    /// most promising ones, all to be completed.
+    pub(in crate::mapping) paths: Vec<Vec<Move>>,
+    /// Whether the search came to its end.
+    pub(in crate::mapping) is_complete: bool,
+    /// No mapping costs less than this, or than the cheapest of the paths, if the heuristic is admissible.
+    pub(in crate::mapping) least_f: f64,
+    /// Nodes expanded, again counted if they were reached more cheaply later.
+    pub(in crate::mapping) n_expanded: u64,
+    /// Successors looked at.
+    pub(in crate::mapping) n_generated: u64,
+}
+
+/// How many distances are looked at between two looks at the interrupt: less than a millisecond with a few attributes.
+pub(in crate::mapping) const POLL_EVERY: u64 = 2048;
+
+/// Stands for "no action" in a node.
+const NO_ACTION: ActionIdx = ActionIdx::MAX;
