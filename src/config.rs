@@ -32,6 +32,11 @@ pub struct ServeConfig {
     /// Most states of a model.
     #[arg(long, env = "ETUDE_MAX_STATES", default_value_t = model::Limits::DEFAULT.max_states, value_name = "N")]
     pub max_states: usize,
+    /// Most transitions of a model.
+    #[arg(
+        long, env = "ETUDE_MAX_TRANSITIONS", default_value_t = model::Limits::DEFAULT.max_transitions, value_name = "N"
+    )]
+    pub max_transitions: usize,
     /// Memory for models that are kept ready to be searched.
     #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", default_value_t = 1024 * 1024 * 1024, value_name = "BYTES")]
     pub model_cache_bytes: u64,
@@ -63,7 +68,7 @@ impl ServeConfig {
         let n_cores = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
         Settings {
             database: self.database.clone(),
-            limits: model::Limits { max_states: self.max_states },
+            limits: model::Limits { max_states: self.max_states, max_transitions: self.max_transitions },
             model_cache_bytes: self.model_cache_bytes,
             session_idle_timeout: self.session_idle_timeout,
             pool: PoolSettings {

@@ -165,7 +165,8 @@ impl From<ServiceError> for Problem {
                     "trial" => ProblemKind::UnknownTrial,
                     _ => ProblemKind::UnknownModel,
                 };
-                let fault = pointer.map(|pointer| Fault { pointer: pointer.to_owned(), detail: detail.clone() });
+                let fault =
+                    pointer.map(|pointer| Fault { line: None, pointer: pointer.to_owned(), detail: detail.clone() });
                 Self { errors: fault.into_iter().collect(), ..Self::new(problem, detail) }
             }
             ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),

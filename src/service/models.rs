@@ -115,7 +115,7 @@ impl Etude {
         let compile = async {
             // Deleted and registered anew in between, it has another hash; then the next request finds that.
             let row = self.store.model(name).await?.filter(|row| row.summary.hash == hash).ok_or_else(unknown)?;
-            let limits = Limits { max_states: usize::MAX };
+            let limits = Limits::NONE;
             let text = row.definition;
             let job = move |interrupt: &mut dyn Interrupt| prepare(text.as_bytes(), limits, interrupt);
             let prepared = match place {
@@ -171,7 +171,7 @@ fn prepare(
     let attributes = model.schema().attributes().iter().map(AttributeDocument::from).collect();
     let actions = model.actions().iter().map(ActionDocument::from).collect();
     let mapper = Mapper::new(model, interrupt)?;
-    let definition = definition.document().text();
+    let definition = definition.text();
     let hash = hash_of(&definition);
     Ok(Ok(Prepared { definition, hash, mapper, attributes, actions }))
 }
