@@ -264,3 +264,6 @@ fn read_line(reader: &mut impl BufRead, line: &mut Vec<u8>, number: u64) -> Resu
         }
     }
 }
+
+#[cfg(test)]
+mod tests;
