@@ -75,7 +75,7 @@ impl Map {
         let stamp = Stamp {
             id: None,
             model: request["model"].as_str().unwrap_or_default().to_owned(),
-            model_hash: hash_of(&definition.document().text()),
+            model_hash: hash_of(&definition.text()),
             lookahead: asked.lookahead.map(NonZeroU32::get),
             elapsed_us: as_micros(started.elapsed()),
             ..Stamp::default()
@@ -133,7 +133,7 @@ pub(super) fn read_model(path: &Path) -> Result<(Definition, Model), CliError> {
         CompileError::Faults(faults) => CliError::Faults { what: path.display().to_string(), faults },
         CompileError::Cancelled(cancelled) => cancelled.into(),
     };
-    let limits = Limits { max_states: usize::MAX };
+    let limits = Limits::NONE;
     let definition = Definition::read(&read_json(path)?, limits, &mut Uninterrupted).map_err(model_error)?;
     let model = Model::compile(&definition, limits, &mut Uninterrupted).map_err(model_error)?;
     Ok((definition, model))

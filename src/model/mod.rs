@@ -5,9 +5,9 @@
 //! run on.
 //!
 //! ```text
-//! JSON --Definition::read--> Definition { Table | Cave } --Model::compile--> Model { schema, actions, states, graph, start }
-//!                                  |
-//!                                  +--canonical JSON--> hash, store
+//! JSON --Definition::parse--> Definition { Table | Cave } --Model::compile--> Model { schema, actions, states, graph, start }
+//!                                   |
+//!                                   +--Definition::write--> canonical JSON: hash, store
 //! ```
 //!
 //! Nothing here knows of demonstrations.
@@ -15,6 +15,7 @@
 mod action;
 mod definition;
 mod graph;
+mod reading;
 mod states;
 mod table;
 mod wumpus;
@@ -22,8 +23,10 @@ mod wumpus;
 use std::sync::Arc;
 
 pub use action::{Action, ActionDocument, ActionIdx};
+pub(crate) use definition::hex;
 pub use definition::{Definition, DefinitionDocument, DynamicsDocument, hash_of};
 pub use graph::{Graph, Transition};
+pub use reading::{Format, MAX_LINE_BYTES, ReadError};
 pub use states::{StateIdx, States};
 pub use table::{ActionReference, StartDocument, Table, TableDocument, TransitionDocument};
 pub use wumpus::{Act, Cave, CaveState, Cell, CellDocument, Heading, PoseDocument, WumpusDocument};
@@ -37,11 +40,15 @@ use crate::interrupt::{Cancelled, Interrupt};
 pub struct Limits {
     /// Most states; those of a wumpus world are counted as they are reached.
     pub max_states: usize,
+    /// Most transitions of a table.
+    pub max_transitions: usize,
 }
 
 impl Limits {
-    /// One million states: a few hundred MB with their transitions.
-    pub const DEFAULT: Self = Self { max_states: 1_000_000 };
+    /// One million states and ten million transitions: a few hundred MB.
+    pub const DEFAULT: Self = Self { max_states: 1_000_000, max_transitions: 10_000_000 };
+    /// As much as can be told apart by indices.
+    pub const NONE: Self = Self { max_states: usize::MAX, max_transitions: usize::MAX };
 }
 
 /// Why a definition gives no model.
@@ -71,7 +78,7 @@ pub enum Start {
 pub struct Model {
     schema: Schema,
     actions: Vec<Action>,
-    states: States,
+    states: Arc<States>,
     graph: Graph,
     start: Start,
     n_transitions: usize,
@@ -157,7 +164,8 @@ impl Model {
     /// Approximate size in memory, in bytes.
     #[must_use]
     pub fn size_bytes(&self) -> usize {
-        self.states.size_bytes() + self.graph.size_bytes() + self.is_unsafe.len()
+        let start = if let Start::Candidates(states) = &self.start { size_of_val(states.as_slice()) } else { 0 };
+        start + self.states.size_bytes() + self.graph.size_bytes() + self.is_unsafe.len()
     }
 
     /// Reads the start of a request: a state's index, or an object of attribute values that exactly one state has.

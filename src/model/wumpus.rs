@@ -7,6 +7,8 @@
 //! [`Cave`] holds the rules ([`Cave::after`]), free of any body; [`Cave::compile`] explores what a body can reach by them. An
 //! action without effect is not a transition, and neither is one into death.
 
+use std::sync::Arc;
+
 use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -303,8 +305,8 @@ impl Cave {
             schema: self.schema(),
             actions: self.actions.clone(),
             n_transitions: edges.len(),
-            graph: Graph::new(found.len(), edges),
-            states: States::new(self.domains(), rows),
+            graph: Graph::new(found.len(), edges.iter().copied()),
+            states: Arc::new(States::new(self.domains(), rows)),
             start: Start::State(0),
             is_unsafe: Vec::new(),
             n_unsafe: 0,

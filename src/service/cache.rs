@@ -1,17 +1,21 @@
 //! Models that are ready to be searched, as many as fit.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
-use quick_cache::Weighter;
-use quick_cache::sync::Cache;
+use quick_cache::sync::{Cache, DefaultLifecycle};
+use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
 
 use crate::mapping::Mapper;
 
 /// Compiled models by the hash of their content, the least useful evicted. Concurrent requests for a model that is not
 /// there compile it once.
+///
+/// A model that is larger than the whole cache is kept all the same until the next such one comes: compiling it takes longer than
+/// most searches, and these need it in memory anyway.
 #[derive(Debug)]
 pub(super) struct MapperCache {
     cache: Cache<String, Arc<Mapper>, SizeBytes>,
+    oversized: Mutex<Option<(String, Arc<Mapper>)>>,
 }
 
 #[derive(Clone, Debug)]
@@ -28,12 +32,18 @@ impl MapperCache {
     const EXPECTED_ITEMS: usize = 64;
 
     pub(super) fn new(max_bytes: u64) -> Self {
-        Self { cache: Cache::with_weighter(Self::EXPECTED_ITEMS, max_bytes, SizeBytes) }
+        let mut options = OptionsBuilder::new();
+        // Of several shards, each would have a part of the capacity, and large models would fit into none.
+        options.estimated_items_capacity(Self::EXPECTED_ITEMS).weight_capacity(max_bytes).shards(1);
+        let options = options.build().expect("the sizes are given");
+        let cache = Cache::with_options(options, SizeBytes, DefaultHashBuilder::default(), DefaultLifecycle::default());
+        Self { cache, oversized: Mutex::default() }
     }
 
     /// Puts in a model that has just been compiled.
-    pub(super) fn insert(&self, hash: String, mapper: Arc<Mapper>) {
-        self.cache.insert(hash, mapper);
+    pub(super) fn insert(&self, hash: &str, mapper: &Arc<Mapper>) {
+        self.cache.insert(hash.to_owned(), Arc::clone(mapper));
+        self.keep_if_oversized(hash, mapper);
     }
 
     /// The model with this hash; `compile` makes it if it is not there.
@@ -42,6 +52,80 @@ impl MapperCache {
         hash: &str,
         compile: impl Future<Output = Result<Arc<Mapper>, E>>,
     ) -> Result<Arc<Mapper>, E> {
-        self.cache.get_or_insert_async(hash, compile).await
+        let get_or_compile = async {
+            match self.oversized(hash) {
+                Some(mapper) => Ok(mapper),
+                None => compile.await,
+            }
+        };
+        let mapper = self.cache.get_or_insert_async(hash, get_or_compile).await?;
+        self.keep_if_oversized(hash, &mapper);
+        Ok(mapper)
+    }
+
+    fn oversized(&self, hash: &str) -> Option<Arc<Mapper>> {
+        let oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner);
+        oversized.as_ref().filter(|(kept, _)| kept == hash).map(|(_, mapper)| Arc::clone(mapper))
+    }
+
+    fn keep_if_oversized(&self, hash: &str, mapper: &Arc<Mapper>) {
+        // The cache keeps nothing that exceeds its hot part, most of it.
+        if self.cache.peek(hash).is_none() && SizeBytes.weight(&String::new(), mapper) > self.cache.capacity() / 2 {
+            let kept = (hash.to_owned(), Arc::clone(mapper));
+            // What it replaces may take long to free, which nobody should wait for with the lock in hand.
+            let _replaced = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).replace(kept);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use serde_json::json;
+
+    use super::*;
+    use crate::interrupt::Uninterrupted;
+    use crate::model::{Definition, Limits, Model};
+
+    fn mapper(side: u32) -> Arc<Mapper> {
+        let model = json!({"dynamics": {"kind": "wumpus", "width": side, "height": side}});
+        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap())
+    }
+
+    /// Whether the model had to be compiled.
+    async fn is_compiled(cache: &MapperCache, hash: &str, mapper: &Arc<Mapper>) -> bool {
+        let mut is_compiled = false;
+        let compile = async {
+            is_compiled = true;
+            Ok::<_, Infallible>(Arc::clone(mapper))
+        };
+        cache.get_or_compile(hash, compile).await.unwrap();
+        is_compiled
+    }
+
+    #[tokio::test]
+    async fn a_model_larger_than_the_cache_is_kept_until_the_next_such_one() {
+        let (small, large) = (mapper(2), mapper(9));
+        let cache = MapperCache::new(2 * small.size_bytes() as u64);
+        assert!(large.size_bytes() > 2 * small.size_bytes());
+        cache.insert("small", &small);
+        cache.insert("large", &large);
+        assert!(!is_compiled(&cache, "large", &large).await);
+        assert!(!is_compiled(&cache, "small", &small).await, "it was not driven out");
+        assert!(is_compiled(&cache, "other", &large).await);
+        assert!(!is_compiled(&cache, "other", &large).await);
+        assert!(is_compiled(&cache, "large", &large).await);
+    }
+
+    #[tokio::test]
+    async fn a_model_that_fills_most_of_the_cache_is_kept_in_it() {
+        let large = mapper(9);
+        let cache = MapperCache::new(large.size_bytes() as u64 * 5 / 4);
+        assert!(is_compiled(&cache, "large", &large).await);
+        assert!(!is_compiled(&cache, "large", &large).await);
+        assert!(cache.oversized("large").is_none());
     }
 }

@@ -1,7 +1,7 @@
 //! The application: what the service does, whatever it is asked through.
 //!
 //! ```text
-//! http, cli --> Etude --> SearchPool  (parsing of large bodies, compiling, searching: bounded, cancellable, off the async threads)
+//! http, cli --> Etude --> SearchPool  (reading of large bodies, compiling, searching: bounded, cancellable, off the async threads)
 //!                 |-----> MapperCache (models that are ready to be searched)
 //!                 +-----> Store       (what is durable)
 //! ```
@@ -14,6 +14,7 @@ mod learners;
 mod models;
 mod name;
 mod owners;
+mod pipe;
 mod policies;
 mod pool;
 mod refiner;
@@ -24,8 +25,9 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
-pub use models::{ModelAnswer, Registered};
+pub use models::{ModelAnswer, ModelDefinition, ModelText, OpenText, Registered};
 pub use name::{InvalidName, Name};
+pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
 pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
 pub use sessions::{Ended, Observation, Resumed, Session, SessionError};
@@ -37,6 +39,7 @@ use crate::document::{Faults, ParseError, Quoted};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
 use cache::MapperCache;
+use models::Uploads;
 use owners::Owners;
 use refiner::Refiner;
 use trials::TrialNumbers;
@@ -65,6 +68,12 @@ pub enum ServiceError {
     /// The body is JSON, but not what was asked for.
     #[error("{0}")]
     Faults(#[from] Faults),
+    /// What must be kept of the body while it is read is too large.
+    #[error("{0}")]
+    TooLarge(String),
+    /// The body could not be read to its end.
+    #[error("the body could not be read")]
+    Body(#[source] std::io::Error),
     /// There is nothing of this kind with this name or id.
     #[error("there is no {kind} {}", Quoted(name))]
     Unknown {
@@ -128,6 +137,7 @@ pub struct Etude {
     owners: Owners,
     session_idle_timeout: Duration,
     limits: Limits,
+    uploads: Uploads,
     trial_numbers: TrialNumbers,
     /// Held while rewards are folded.
     learning: tokio::sync::Mutex<()>,
@@ -149,6 +159,7 @@ impl Etude {
             owners: Owners::default(),
             session_idle_timeout: settings.session_idle_timeout,
             limits: settings.limits,
+            uploads: Uploads::default(),
             trial_numbers: TrialNumbers::default(),
             learning: tokio::sync::Mutex::new(()),
         })

@@ -88,6 +88,20 @@ impl SearchPool {
         self.run_admitted(None, None, job).await
     }
 
+    /// Runs `job` beside the threads of the pool, which it must not keep: it waits for others. For callers that are bounded in
+    /// number themselves.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the job was told to stop.
+    pub async fn run_aside<T, F>(&self, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
+        self.run_holding((), None, self.abort.child_token(), job).await
+    }
+
     async fn run_admitted<T, F>(
         &self,
         admitted: Option<Arc<OwnedSemaphorePermit>>,
@@ -99,16 +113,30 @@ impl SearchPool {
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
         let cancel = self.abort.child_token();
-        // Dropped with this future: whoever waited is gone.
-        let _gone: DropGuard = cancel.clone().drop_guard();
         let thread = tokio::select! {
             thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped)?,
             () = cancel.cancelled() => return Err(PoolError::Stopped),
         };
+        self.run_holding((admitted, thread), deadline, cancel, job).await
+    }
+
+    /// Runs `job`, and keeps `held` until it has really ended, even if nobody waits for it any more.
+    async fn run_holding<T, F>(
+        &self,
+        held: impl Send + 'static,
+        deadline: Option<Instant>,
+        cancel: CancellationToken,
+        job: F,
+    ) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
+        // Dropped with this future: whoever waited is gone.
+        let _gone: DropGuard = cancel.clone().drop_guard();
         let span = tracing::Span::current();
         let running = self.tasks.spawn_blocking(move || {
-            // Held until the job has really ended, even if nobody waits for it any more.
-            let _held = (admitted, thread);
+            let _held = held;
             let mut interrupt = Watch { cancel, deadline };
             span.in_scope(|| job(&mut interrupt))
         });

@@ -7,8 +7,9 @@
 //! ```
 //!
 //! A write that was answered is on disk. Rows become domain types here and nowhere else; times are milliseconds since 1970,
-//! documents are JSON text.
+//! documents are JSON text, in compressed pieces where it is long.
 
+mod definitions;
 mod learners;
 mod models;
 mod policies;
@@ -20,8 +21,10 @@ mod writer;
 use std::path::Path;
 use std::time::Duration;
 
+use definitions::Sweeper;
+pub use definitions::{NewPieces, PIECE_BYTES};
 pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
-pub use models::{ModelRow, ModelSummary, NewModel, PutModel};
+pub use models::{ModelRow, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
 pub use policies::{NewPolicy, PolicySummaryRow};
 pub use refinements::{NewRefinement, RefinementEnd};
 pub use sessions::{NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus};
@@ -72,6 +75,9 @@ pub enum StoreError {
         #[source]
         source: Box<dyn std::error::Error + Send + Sync>,
     },
+    /// What is read was removed while it was.
+    #[error("it was removed while it was read")]
+    Removed,
     /// The store is shutting down.
     #[error("the store takes no more writes")]
     Closed,
@@ -91,6 +97,8 @@ impl From<sqlx::Error> for StoreError {
 pub struct Store {
     readers: SqlitePool,
     writer: Writer,
+    sweeper: Sweeper,
+    tasks: TaskTracker,
 }
 
 impl Store {
@@ -117,7 +125,10 @@ impl Store {
             .max_connections(N_READERS)
             .connect_with(options.create_if_missing(false).pragma("query_only", "ON"))
             .await?;
-        Ok(Self { readers, writer: Writer::start(connection, tasks) })
+        let left = definitions::left_behind(&readers).await?;
+        let writer = Writer::start(connection, tasks);
+        let sweeper = Sweeper::start(writer.clone(), left, tasks);
+        Ok(Self { readers, writer, sweeper, tasks: tasks.clone() })
     }
 
     /// Takes no more reads or writes. Once the writer has ended, all that was written stands in a single file.
@@ -148,6 +159,7 @@ fn migrator() -> Migrator {
             migration(1, "models and policies", include_str!("../../migrations/0001_models_and_policies.sql")),
             migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
             migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
+            migration(4, "large definitions", include_str!("../../migrations/0004_large_definitions.sql")),
         ]
         .into(),
         ..Migrator::DEFAULT

@@ -12,10 +12,11 @@ use tokio_util::task::TaskTracker;
 
 use jiff::Timestamp;
 
+use super::models::DeleteModel;
 use super::{
     FailTrial, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement, NewReward, NewSession, NewTrial,
-    PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, WeightsRow, learners, models, policies,
-    refinements, sessions, trials,
+    PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, WeightsRow, definitions, learners, models,
+    policies, refinements, sessions, trials,
 };
 
 /// Most writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
@@ -29,6 +30,13 @@ const MAX_WAITING: usize = 1024;
 pub(super) enum Write {
     PutModel(NewModel),
     DeleteModel(String),
+    BeginDefinition,
+    AddPiece {
+        definition_id: i64,
+        seq: i64,
+        piece: Vec<u8>,
+    },
+    SweepDefinition(i64),
     AddPolicy(NewPolicy, Option<NewRefinement>),
     EndRefinement(Box<RefinementEnd>),
     OpenSession(Box<NewSession>),
@@ -54,8 +62,9 @@ pub(super) enum Write {
 #[derive(Debug)]
 pub(super) enum Written {
     PutModel(PutModel),
-    /// Whether there was one.
-    DeleteModel(bool),
+    DeleteModel(DeleteModel),
+    /// Its id.
+    BeginDefinition(i64),
     /// Whether things were as expected, so that it was done.
     Done(bool),
     PutLearner(PutLearner),
@@ -76,7 +85,7 @@ struct Job {
 }
 
 /// The way to the writer.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Writer {
     queue: mpsc::Sender<Job>,
     closing: CancellationToken,
@@ -94,6 +103,11 @@ impl Writer {
     /// Takes no more writes, and ends once everything waiting has been written.
     pub(super) fn close(&self) {
         self.closing.cancel();
+    }
+
+    /// Completes when no more writes are taken.
+    pub(super) async fn closed(&self) {
+        self.closing.cancelled().await;
     }
 
     /// Writes, and returns once it is on disk. A caller that goes away does not undo its write.
@@ -185,6 +199,12 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
     Ok(match write {
         Write::PutModel(model) => Written::PutModel(models::put(connection, model).await?),
         Write::DeleteModel(name) => Written::DeleteModel(models::delete(connection, name).await?),
+        Write::BeginDefinition => Written::BeginDefinition(definitions::begin(connection).await?),
+        Write::AddPiece { definition_id, seq, piece } => {
+            definitions::add_piece(connection, *definition_id, *seq, piece).await?;
+            Written::Done(true)
+        }
+        Write::SweepDefinition(id) => Written::Done(definitions::sweep_some(connection, *id).await?),
         Write::AddPolicy(policy, refinement) => {
             policies::add(connection, policy).await?;
             if let Some(refinement) = refinement {
