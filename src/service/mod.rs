@@ -8,6 +8,7 @@
 //!
 //! Everything that is spawned is tracked, and ends with [`Etude::close`].
 
+mod batch;
 mod cache;
 mod learner_task;
 mod learners;
@@ -23,6 +24,7 @@ mod trials;
 use std::path::PathBuf;
 use std::time::Duration;
 
+pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, Registered};
 pub use name::{InvalidName, Name};

@@ -59,10 +59,16 @@ impl SearchPool {
         }
     }
 
+    /// How many jobs run at the same time, at most.
+    #[must_use]
+    pub fn n_threads(&self) -> usize {
+        self.settings.n_threads.max(1)
+    }
+
     /// How many jobs are in the pool, waiting or running.
     #[must_use]
     pub fn n_jobs(&self) -> usize {
-        self.settings.n_threads.max(1) + self.settings.max_waiting - self.admitted.available_permits()
+        self.n_threads() + self.settings.max_waiting - self.admitted.available_permits()
     }
 
     /// A place in the pool, for all that a request needs.

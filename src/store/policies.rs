@@ -30,13 +30,17 @@ pub struct PolicySummaryRow {
 }
 
 impl Store {
-    /// Stores a policy, and notes that it is to be refined if `refinement` says so.
+    /// Stores policies in this order, all of them or none, and notes which of them are to be refined.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn add_policy(&self, policy: NewPolicy, refinement: Option<NewRefinement>) -> Result<(), StoreError> {
-        self.writer.write(Write::AddPolicy(policy, refinement)).await.map(drop)
+    pub async fn add_policies(
+        &self,
+        policies: Vec<NewPolicy>,
+        refinements: Vec<NewRefinement>,
+    ) -> Result<(), StoreError> {
+        self.writer.write(Write::AddPolicies(policies, refinements)).await.map(drop)
     }
 
     /// The policy with this id: JSON.

@@ -29,7 +29,7 @@ const MAX_WAITING: usize = 1024;
 pub(super) enum Write {
     PutModel(NewModel),
     DeleteModel(String),
-    AddPolicy(NewPolicy, Option<NewRefinement>),
+    AddPolicies(Vec<NewPolicy>, Vec<NewRefinement>),
     EndRefinement(Box<RefinementEnd>),
     OpenSession(Box<NewSession>),
     AddObservations(NewObservations),
@@ -185,9 +185,11 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
     Ok(match write {
         Write::PutModel(model) => Written::PutModel(models::put(connection, model).await?),
         Write::DeleteModel(name) => Written::DeleteModel(models::delete(connection, name).await?),
-        Write::AddPolicy(policy, refinement) => {
-            policies::add(connection, policy).await?;
-            if let Some(refinement) = refinement {
+        Write::AddPolicies(added, to_refine) => {
+            for policy in added {
+                policies::add(connection, policy).await?;
+            }
+            for refinement in to_refine {
                 refinements::add(connection, refinement).await?;
             }
             Written::Done(true)
