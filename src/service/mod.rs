@@ -38,7 +38,7 @@ pub use trials::TrialAnswer;
 use crate::document::{Faults, ParseError, Quoted};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
-use cache::MapperCache;
+use cache::{MapperCache, ModelNames};
 use owners::Owners;
 use refiner::Refiner;
 use trials::TrialNumbers;
@@ -126,6 +126,7 @@ pub struct Etude {
     store: Store,
     pool: SearchPool,
     mappers: MapperCache,
+    model_names: ModelNames,
     refiner: Refiner,
     owners: Owners,
     session_idle_timeout: Duration,
@@ -147,6 +148,7 @@ impl Etude {
             store: Store::open(&settings.database, tasks).await?,
             pool: SearchPool::new(settings.pool, tasks.clone(), abort),
             mappers: MapperCache::new(settings.model_cache_bytes),
+            model_names: ModelNames::new(),
             refiner: Refiner::default(),
             owners: Owners::default(),
             session_idle_timeout: settings.session_idle_timeout,

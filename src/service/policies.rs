@@ -88,7 +88,7 @@ impl Etude {
                 Some(learner) => Some(self.ready(learner, Some("/learner")).await?),
                 None => None,
             };
-            let (model_hash, mapper) = self.mapper(&envelope.model, "/model", Some(place)).await?;
+            let (model_hash, mapper) = self.known_mapper(&envelope.model, "/model", place).await?;
             Ok(Named { learner, model_hash, mapper })
         };
         match found.await {

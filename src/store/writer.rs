@@ -4,6 +4,8 @@
 //! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves.
 
 use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use sqlx::{Connection, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
@@ -80,6 +82,7 @@ struct Job {
 pub(super) struct Writer {
     queue: mpsc::Sender<Job>,
     closing: CancellationToken,
+    models_generation: Arc<AtomicU64>,
 }
 
 impl Writer {
@@ -87,8 +90,14 @@ impl Writer {
     pub(super) fn start(connection: SqliteConnection, tasks: &TaskTracker) -> Self {
         let (queue, jobs) = mpsc::channel(MAX_WAITING);
         let closing = CancellationToken::new();
-        tasks.spawn(run(connection, jobs, closing.clone()));
-        Self { queue, closing }
+        let models_generation = Arc::new(AtomicU64::new(0));
+        tasks.spawn(run(connection, jobs, closing.clone(), Arc::clone(&models_generation)));
+        Self { queue, closing, models_generation }
+    }
+
+    /// Counts up whenever a model was registered or deleted, before whoever did so is told.
+    pub(super) fn models_generation(&self) -> u64 {
+        self.models_generation.load(Ordering::Acquire)
     }
 
     /// Takes no more writes, and ends once everything waiting has been written.
@@ -108,7 +117,12 @@ impl Writer {
     }
 }
 
-async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, closing: CancellationToken) {
+async fn run(
+    mut connection: SqliteConnection,
+    mut jobs: mpsc::Receiver<Job>,
+    closing: CancellationToken,
+    models_generation: Arc<AtomicU64>,
+) {
     let mut group = Vec::with_capacity(MAX_GROUP);
     loop {
         tokio::select! {
@@ -119,7 +133,13 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
                 continue;
             }
         }
-        match commit(&mut connection, &group).await {
+        let is_of_models = |job: &Job| matches!(job.write, Write::PutModel(_) | Write::DeleteModel(_));
+        let are_models_changed = group.iter().any(is_of_models);
+        let committed = commit(&mut connection, &group).await;
+        if are_models_changed {
+            models_generation.fetch_add(1, Ordering::AcqRel);
+        }
+        match committed {
             Ok(written) => {
                 for (job, written) in group.drain(..).zip(written) {
                     // Whoever waited may be gone.
@@ -136,6 +156,9 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
                 // One write must not spoil the others: each gets a transaction and an error of its own.
                 for job in group.drain(..) {
                     let written = commit(&mut connection, std::slice::from_ref(&job)).await;
+                    if is_of_models(&job) {
+                        models_generation.fetch_add(1, Ordering::AcqRel);
+                    }
                     let _ = job.answer.send(written.and_then(|mut written| written.pop().ok_or(StoreError::Closed)));
                 }
             }
