@@ -97,14 +97,10 @@ impl SearchPool {
 
     /// Waits for a thread.
     async fn turn(&self) -> Result<OwnedSemaphorePermit, PoolError> {
-        if let Ok(thread) = Arc::clone(&self.threads).try_acquire_owned()
-            && !self.abort.is_cancelled()
-        {
-            return Ok(thread);
-        }
         tokio::select! {
-            thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped),
+            biased;
             () = self.abort.cancelled() => Err(PoolError::Stopped),
+            thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped),
         }
     }
 
