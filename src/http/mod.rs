@@ -104,6 +104,7 @@ fn routes() -> OpenApiRouter<Context> {
         .routes(routes!(models::list_models))
         .routes(routes!(policies::make_policy, policies::list_policies))
         .routes(routes!(policies::get_policy))
+        .routes(routes!(policies::make_policies))
         .routes(routes!(stream::websocket, stream::ndjson))
         .routes(routes!(stream::list_sessions))
         .routes(routes!(stream::get_session))

@@ -9,6 +9,7 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::encoding::Encoding;
+use super::observe::RequestId;
 use crate::document::{Fault, Faults, ParseError};
 use crate::service::{self, PoolError, ServiceError};
 use crate::store::StoreError;
@@ -126,6 +127,11 @@ impl Problem {
             _ => format!("{count} faults"),
         };
         Self { errors: faults.listed().to_vec(), ..Self::new(ProblemKind::Invalid, detail) }
+    }
+
+    /// The same, as part of the answer to a request.
+    pub(super) fn of_request(self, id: &RequestId) -> Self {
+        Self { request_id: id.0.to_string(), ..self }
     }
 
     /// The document, with the id of the request it answers.

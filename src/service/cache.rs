@@ -5,6 +5,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use quick_cache::sync::{Cache, DefaultLifecycle};
 use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
 
+use super::pool::Admission;
+use super::{Etude, ServiceError};
 use crate::mapping::Mapper;
 
 /// Compiled models by the hash of their content, the least useful evicted. Concurrent requests for a model that is not
@@ -44,6 +46,11 @@ impl MapperCache {
     pub(super) fn insert(&self, hash: &str, mapper: &Arc<Mapper>) {
         self.cache.insert(hash.to_owned(), Arc::clone(mapper));
         self.keep_if_oversized(hash, mapper);
+    }
+
+    /// The model with this hash, if it is there.
+    pub(super) fn get(&self, hash: &str) -> Option<Arc<Mapper>> {
+        self.cache.get(hash)
     }
 
     /// The model with this hash; `compile` makes it if it is not there.
@@ -127,5 +134,44 @@ mod tests {
         assert!(is_compiled(&cache, "large", &large).await);
         assert!(!is_compiled(&cache, "large", &large).await);
         assert!(cache.oversized("large").is_none());
+    }
+}
+
+/// Hashes of models by name, each with the generation of the table of models that it was read from: known for as long as no
+/// model is registered or deleted.
+#[derive(Debug)]
+pub(super) struct ModelNames {
+    hashes: Cache<String, (u64, Arc<str>)>,
+}
+
+impl ModelNames {
+    /// Most names that are kept.
+    const MAX_NAMES: usize = 1024;
+
+    pub(super) fn new() -> Self {
+        Self { hashes: Cache::new(Self::MAX_NAMES) }
+    }
+}
+
+impl Etude {
+    /// As [`Self::mapper`], without a look at the database if no model was registered or deleted since the last one. The
+    /// database is this process's alone, as far as models go.
+    pub(super) async fn known_mapper(
+        &self,
+        name: &str,
+        pointer: &'static str,
+        place: &Admission,
+    ) -> Result<(String, Arc<Mapper>), ServiceError> {
+        // Before anything is read: what changes meanwhile makes what was read outdated.
+        let generation = self.store.models_generation();
+        if let Some((known, hash)) = self.model_names.hashes.get(name)
+            && known == generation
+            && let Some(mapper) = self.mappers.get(&hash)
+        {
+            return Ok((hash.to_string(), mapper));
+        }
+        let (hash, mapper) = self.mapper(name, pointer, Some(place)).await?;
+        self.model_names.hashes.insert(name.to_owned(), (generation, hash.as_str().into()));
+        Ok((hash, mapper))
     }
 }

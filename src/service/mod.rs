@@ -8,6 +8,7 @@
 //!
 //! Everything that is spawned is tracked, and ends with [`Etude::close`].
 
+mod batch;
 mod cache;
 mod learner_task;
 mod learners;
@@ -24,6 +25,7 @@ mod trials;
 use std::path::PathBuf;
 use std::time::Duration;
 
+pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, ModelText, OpenText, Registered};
 pub use name::{InvalidName, Name};
@@ -38,7 +40,7 @@ pub use trials::TrialAnswer;
 use crate::document::{Faults, ParseError, Quoted};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
-use cache::MapperCache;
+use cache::{MapperCache, ModelNames};
 use models::Uploads;
 use owners::Owners;
 use refiner::Refiner;
@@ -133,6 +135,7 @@ pub struct Etude {
     store: Store,
     pool: SearchPool,
     mappers: MapperCache,
+    model_names: ModelNames,
     refiner: Refiner,
     owners: Owners,
     session_idle_timeout: Duration,
@@ -155,6 +158,7 @@ impl Etude {
             store: Store::open(&settings.database, tasks).await?,
             pool: SearchPool::new(settings.pool, tasks.clone(), abort),
             mappers: MapperCache::new(settings.model_cache_bytes),
+            model_names: ModelNames::new(),
             refiner: Refiner::default(),
             owners: Owners::default(),
             session_idle_timeout: settings.session_idle_timeout,

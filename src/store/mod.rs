@@ -138,6 +138,11 @@ impl Store {
         self.writer.close();
     }
 
+    /// Counts up whenever a model was registered or deleted, before whoever did so is told.
+    pub(crate) fn models_generation(&self) -> u64 {
+        self.writer.models_generation()
+    }
+
     /// Whether the database answers.
     ///
     /// # Errors

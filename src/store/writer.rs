@@ -4,8 +4,11 @@
 //! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves.
 
 use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use sqlx::{Connection, SqliteConnection};
+use tokio::runtime::Handle;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -37,7 +40,7 @@ pub(super) enum Write {
         piece: Vec<u8>,
     },
     SweepDefinition(i64),
-    AddPolicy(NewPolicy, Option<NewRefinement>),
+    AddPolicies(Vec<NewPolicy>, Vec<NewRefinement>),
     EndRefinement(Box<RefinementEnd>),
     OpenSession(Box<NewSession>),
     AddObservations(NewObservations),
@@ -89,6 +92,7 @@ struct Job {
 pub(super) struct Writer {
     queue: mpsc::Sender<Job>,
     closing: CancellationToken,
+    models_generation: Arc<AtomicU64>,
 }
 
 impl Writer {
@@ -96,8 +100,17 @@ impl Writer {
     pub(super) fn start(connection: SqliteConnection, tasks: &TaskTracker) -> Self {
         let (queue, jobs) = mpsc::channel(MAX_WAITING);
         let closing = CancellationToken::new();
-        tasks.spawn(run(connection, jobs, closing.clone()));
-        Self { queue, closing }
+        let models_generation = Arc::new(AtomicU64::new(0));
+        let running = run(connection, jobs, closing.clone(), Arc::clone(&models_generation));
+        // A thread of its own: whatever keeps the others busy, no commit waits for it between two statements.
+        let runtime = Handle::current();
+        tasks.spawn_blocking(move || runtime.block_on(running));
+        Self { queue, closing, models_generation }
+    }
+
+    /// Counts up whenever a model was registered or deleted, before whoever did so is told.
+    pub(super) fn models_generation(&self) -> u64 {
+        self.models_generation.load(Ordering::Acquire)
     }
 
     /// Takes no more writes, and ends once everything waiting has been written.
@@ -122,7 +135,12 @@ impl Writer {
     }
 }
 
-async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, closing: CancellationToken) {
+async fn run(
+    mut connection: SqliteConnection,
+    mut jobs: mpsc::Receiver<Job>,
+    closing: CancellationToken,
+    models_generation: Arc<AtomicU64>,
+) {
     let mut group = Vec::with_capacity(MAX_GROUP);
     loop {
         tokio::select! {
@@ -133,7 +151,13 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
                 continue;
             }
         }
-        match commit(&mut connection, &group).await {
+        let is_of_models = |job: &Job| matches!(job.write, Write::PutModel(_) | Write::DeleteModel(_));
+        let are_models_changed = group.iter().any(is_of_models);
+        let committed = commit(&mut connection, &group).await;
+        if are_models_changed {
+            models_generation.fetch_add(1, Ordering::AcqRel);
+        }
+        match committed {
             Ok(written) => {
                 for (job, written) in group.drain(..).zip(written) {
                     // Whoever waited may be gone.
@@ -150,6 +174,9 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
                 // One write must not spoil the others: each gets a transaction and an error of its own.
                 for job in group.drain(..) {
                     let written = commit(&mut connection, std::slice::from_ref(&job)).await;
+                    if is_of_models(&job) {
+                        models_generation.fetch_add(1, Ordering::AcqRel);
+                    }
                     let _ = job.answer.send(written.and_then(|mut written| written.pop().ok_or(StoreError::Closed)));
                 }
             }
@@ -166,19 +193,25 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
     }
 }
 
-/// Applies `group` in one transaction: rewards last, all together. Nobody was answered yet, so that any order is one in which
-/// they may have come.
+/// Applies `group` in one transaction: policies first and rewards last, all together. Nobody was answered yet, so that any order
+/// is one in which they may have come.
 async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<Written>, StoreError> {
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     let mut written = Vec::with_capacity(group.len());
     let mut rewards = Vec::new();
     let mut added = add_observations(&mut transaction, group).await?;
+    let added_policies = group.iter().filter_map(|job| match &job.write {
+        Write::AddPolicies(added, to_refine) if to_refine.is_empty() => Some(added),
+        _ => None,
+    });
+    policies::add_all(&mut transaction, &added_policies.flatten().collect::<Vec<_>>()).await?;
     for (n, job) in group.iter().enumerate() {
         written.push(match &job.write {
             Write::PutReward(reward) => {
                 rewards.push(reward);
                 None
             }
+            Write::AddPolicies(_, to_refine) if to_refine.is_empty() => Some(Written::Done(true)),
             Write::AddObservations(_) if let Some(was_next) = added.remove(&n) => Some(Written::Done(was_next)),
             write => Some(apply(&mut transaction, write).await?),
         });
@@ -205,9 +238,9 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
             Written::Done(true)
         }
         Write::SweepDefinition(id) => Written::Done(definitions::sweep_some(connection, *id).await?),
-        Write::AddPolicy(policy, refinement) => {
-            policies::add(connection, policy).await?;
-            if let Some(refinement) = refinement {
+        Write::AddPolicies(added, to_refine) => {
+            policies::add_all(connection, &added.iter().collect::<Vec<_>>()).await?;
+            for refinement in to_refine {
                 refinements::add(connection, refinement).await?;
             }
             Written::Done(true)
