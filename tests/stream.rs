@@ -16,6 +16,8 @@ use tokio::net::TcpStream;
 use tokio::sync::mpsc;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::protocol::frame::Frame;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -38,7 +40,10 @@ impl Client {
         let mut client = Self { socket };
         let hello = client.receive().await;
         assert_eq!((&hello["type"], &hello["protocol"]), (&json!("hello"), &json!("etude.v1+json")));
-        assert_eq!(hello["limits"], json!({"frame_bytes": 262_144, "observations": 100_000}));
+        assert_eq!(
+            (&hello["limits"]["frame_bytes"], &hello["limits"]["observations"]),
+            (&json!(262_144), &json!(100_000))
+        );
         client
     }
 
@@ -471,6 +476,35 @@ async fn idle_sessions_expire() {
     client.send(json!({"type": "resume", "session": session})).await;
     assert_eq!(client.receive().await["problem"]["type"], "/problems/expired");
     assert_eq!(client.closed().await, 4404);
+}
+
+#[tokio::test]
+async fn the_limits_in_hello_are_those_that_are_kept() {
+    let flags = ["--max-streams", "2", "--session-idle-timeout", "20s", "--slow-reader-timeout", "1500ms"];
+    let service = Service::start(&flags).await;
+    let (socket, _) = tokio_tungstenite::connect_async(format!("ws://{}/v1/stream", service.address)).await.unwrap();
+    let mut client = Client { socket };
+    let limits = client.receive().await["limits"].take();
+    let expected = json!({
+        "frame_bytes": 262_144, "message_bytes": 262_144, "observations": 100_000,
+        "streams": 2, "idle_timeout_ms": 20_000, "slow_reader_timeout_ms": 1500,
+    });
+    assert_eq!(limits, expected);
+
+    // Fragments count as the message that they are parts of, up to the last byte.
+    let end = json!({"type": "end", "seq": 0}).to_string();
+    for (n_bytes, problem) in [(262_144, "not-allowed"), (262_145, "too-large")] {
+        let mut client = Client::connect(&service).await;
+        let padding = " ".repeat(n_bytes - end.len());
+        let (first, second) = padding.split_at(padding.len() / 2);
+        for (fragment, opcode, is_final) in
+            [(end.as_str(), Data::Text, false), (first, Data::Continue, false), (second, Data::Continue, true)]
+        {
+            let frame = Frame::message(fragment.as_bytes().to_vec(), OpCode::Data(opcode), is_final);
+            client.socket.send(Message::Frame(frame)).await.unwrap();
+        }
+        assert_eq!(client.receive().await["problem"]["type"], format!("/problems/{problem}"), "{n_bytes} bytes");
+    }
 }
 
 #[tokio::test]

@@ -21,10 +21,26 @@ pub const PROTOCOL: &str = "etude.v1+json";
 pub struct Limits {
     /// Largest frame, in bytes.
     pub frame_bytes: usize,
+    /// How many streams may run at the same time.
+    pub streams: usize,
     /// How long a client may take to read what waits for it.
     pub slow_after: Duration,
     /// How long a connection may stay silent.
     pub idle_after: Duration,
+}
+
+impl From<Limits> for HelloLimits {
+    fn from(Limits { frame_bytes, streams, slow_after, idle_after }: Limits) -> Self {
+        let ms = |time: Duration| u64::try_from(time.as_millis()).unwrap_or(u64::MAX);
+        Self {
+            frame_bytes,
+            message_bytes: frame_bytes,
+            observations: Demonstration::MAX_OBSERVATIONS,
+            streams,
+            idle_timeout_ms: ms(idle_after),
+            slow_reader_timeout_ms: ms(slow_after),
+        }
+    }
 }
 
 /// What came from the client.
@@ -148,7 +164,7 @@ impl Connection<'_> {
         self.send(&ServerFrame::Hello {
             protocol: PROTOCOL,
             server: env!("CARGO_PKG_VERSION"),
-            limits: HelloLimits { frame_bytes: self.limits.frame_bytes, observations: Demonstration::MAX_OBSERVATIONS },
+            limits: HelloLimits::from(self.limits),
         })
         .await?;
         loop {
