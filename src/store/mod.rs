@@ -9,6 +9,7 @@
 //! A write that was answered is on disk. Rows become domain types here and nowhere else; times are milliseconds since 1970,
 //! documents are JSON text.
 
+mod arrivals;
 mod learners;
 mod models;
 mod policies;
@@ -148,6 +149,7 @@ fn migrator() -> Migrator {
             migration(1, "models and policies", include_str!("../../migrations/0001_models_and_policies.sql")),
             migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
             migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
+            migration(4, "arrivals", include_str!("../../migrations/0004_arrivals.sql")),
         ]
         .into(),
         ..Migrator::DEFAULT

@@ -1,9 +1,8 @@
 //! The one writer, which groups commits.
 //!
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies
-//! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves.
-
-use std::collections::{HashMap, HashSet};
+//! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves. Observations,
+//! which are most of it, only arrive with a commit, and are settled in their table later (`arrivals`).
 
 use sqlx::{Connection, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
@@ -12,6 +11,7 @@ use tokio_util::task::TaskTracker;
 
 use jiff::Timestamp;
 
+use super::arrivals::Arrivals;
 use super::{
     FailTrial, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement, NewReward, NewSession, NewTrial,
     PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, WeightsRow, learners, models, policies,
@@ -34,6 +34,8 @@ pub(super) enum Write {
     OpenSession(Box<NewSession>),
     AddObservations(NewObservations),
     EndSession(Box<SessionEnd>),
+    /// Brings observations that have arrived to their table.
+    Settle,
     /// Those last active before this time.
     ExpireSessions(Timestamp),
     PutLearner(NewLearner),
@@ -110,6 +112,7 @@ impl Writer {
 
 async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, closing: CancellationToken) {
     let mut group = Vec::with_capacity(MAX_GROUP);
+    let mut arrivals = Arrivals::default();
     loop {
         tokio::select! {
             n_jobs = jobs.recv_many(&mut group, MAX_GROUP) => if n_jobs == 0 { break },
@@ -119,7 +122,7 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
                 continue;
             }
         }
-        match commit(&mut connection, &group).await {
+        match commit(&mut connection, &mut arrivals, &group).await {
             Ok(written) => {
                 for (job, written) in group.drain(..).zip(written) {
                     // Whoever waited may be gone.
@@ -135,7 +138,7 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
             Err(_) if group.len() > 1 => {
                 // One write must not spoil the others: each gets a transaction and an error of its own.
                 for job in group.drain(..) {
-                    let written = commit(&mut connection, std::slice::from_ref(&job)).await;
+                    let written = commit(&mut connection, &mut arrivals, std::slice::from_ref(&job)).await;
                     let _ = job.answer.send(written.and_then(|mut written| written.pop().ok_or(StoreError::Closed)));
                 }
             }
@@ -146,27 +149,93 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
             }
         }
     }
+    if !arrivals.is_empty()
+        && let Err(error) = settle(&mut connection, &mut arrivals).await
+    {
+        // They are durable where they are.
+        tracing::warn!(error = &error as &dyn std::error::Error, "observations were left for the next start to settle");
+    }
     // Checkpoints the log, so that what is left behind is a single file.
     if let Err(error) = connection.close().await {
         tracing::warn!(error = &error as &dyn std::error::Error, "the database was not closed cleanly");
     }
 }
 
-/// Applies `group` in one transaction: rewards last, all together. Nobody was answered yet, so that any order is one in which
-/// they may have come.
-async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<Written>, StoreError> {
+/// Applies `group`; what was known is forgotten if it cannot be.
+async fn commit(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &[Job],
+) -> Result<Vec<Written>, StoreError> {
+    let observations = group.iter().map(|job| match &job.write {
+        Write::AddObservations(new) => Some(new),
+        _ => None,
+    });
+    let committed = match observations.collect::<Option<Vec<_>>>() {
+        Some(news) if arrivals.is_known() && !arrivals.is_full() => {
+            match add_observations(connection, arrivals, &news).await {
+                Ok(None) => transact(connection, arrivals, group).await,
+                Ok(Some(written)) => Ok(written),
+                Err(error) => Err(error),
+            }
+        }
+        _ => transact(connection, arrivals, group).await,
+    };
+    if committed.is_err() {
+        arrivals.forget();
+    }
+    committed
+}
+
+/// Adds observations in one statement. Gives nothing, and has done nothing, if one of them does not come next as far as is
+/// known, or others have written meanwhile: that takes a closer look.
+async fn add_observations(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    news: &[&NewObservations],
+) -> Result<Option<Vec<Written>>, StoreError> {
+    let accepted = arrivals.accept(connection, news).await?;
+    if accepted.is_next.contains(&false) || !arrivals.add_at_once(connection, &accepted).await? {
+        arrivals.forget();
+        return Ok(None);
+    }
+    Ok(Some(accepted.is_next.into_iter().map(Written::Done).collect()))
+}
+
+/// Applies `group` in one transaction: observations first, rewards last, each all together. Nobody was answered yet, so that
+/// any order is one in which they may have come.
+async fn transact(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &[Job],
+) -> Result<Vec<Written>, StoreError> {
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    arrivals.check(&mut transaction).await?;
+    if !arrivals.is_known() {
+        arrivals.settle(&mut transaction).await?;
+    }
+    let observations = group.iter().filter_map(|job| match &job.write {
+        Write::AddObservations(new) => Some(new),
+        _ => None,
+    });
+    let accepted = arrivals.accept(&mut transaction, &observations.collect::<Vec<_>>()).await?;
+    arrivals.add(&mut transaction, &accepted).await?;
+    let is_read = |job: &Job| matches!(job.write, Write::EndSession(_) | Write::ExpireSessions(_) | Write::Settle);
+    if arrivals.is_full() || group.iter().any(is_read) {
+        arrivals.settle(&mut transaction).await?;
+    }
+
+    let mut are_next = accepted.is_next.into_iter();
     let mut written = Vec::with_capacity(group.len());
     let mut rewards = Vec::new();
-    let mut added = add_observations(&mut transaction, group).await?;
-    for (n, job) in group.iter().enumerate() {
+    for job in group {
         written.push(match &job.write {
+            Write::AddObservations(_) => are_next.next().map(Written::Done),
             Write::PutReward(reward) => {
                 rewards.push(reward);
                 None
             }
-            Write::AddObservations(_) if let Some(was_next) = added.remove(&n) => Some(Written::Done(was_next)),
-            write => Some(apply(&mut transaction, write).await?),
+            write => Some(apply(&mut transaction, arrivals, write).await?),
         });
     }
     if !rewards.is_empty() {
@@ -180,8 +249,19 @@ async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<
     Ok(written.into_iter().flatten().collect())
 }
 
-/// Applies a single write.
-async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Written, StoreError> {
+/// Brings what has arrived to its table.
+async fn settle(connection: &mut SqliteConnection, arrivals: &mut Arrivals) -> Result<(), StoreError> {
+    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    arrivals.settle(&mut transaction).await?;
+    Ok(transaction.commit().await?)
+}
+
+/// Applies a single write, which is neither of observations nor of a reward.
+async fn apply(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    write: &Write,
+) -> Result<Written, StoreError> {
     Ok(match write {
         Write::PutModel(model) => Written::PutModel(models::put(connection, model).await?),
         Write::DeleteModel(name) => Written::DeleteModel(models::delete(connection, name).await?),
@@ -196,15 +276,24 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
             refinements::end(connection, end).await?;
             Written::Done(true)
         }
-        Write::OpenSession(session) => Written::Done(sessions::open(connection, session).await?),
-        Write::AddObservations(observations) => {
-            Written::Done(sessions::add(connection, &[observations]).await? == [true])
+        Write::OpenSession(session) => {
+            let was_opened = sessions::open(connection, session).await?;
+            if was_opened {
+                arrivals.opened(&session.id);
+            }
+            Written::Done(was_opened)
         }
-        Write::EndSession(end) => Written::Done(sessions::end(connection, end).await?),
+        Write::EndSession(end) => {
+            arrivals.ended(&end.session_id);
+            Written::Done(sessions::end(connection, end).await?)
+        }
         Write::ExpireSessions(before) => {
+            arrivals.expired();
             sessions::expire(connection, *before).await?;
             Written::Done(true)
         }
+        // Was done before.
+        Write::Settle => Written::Done(true),
         Write::PutLearner(learner) => Written::PutLearner(learners::put(connection, learner).await?),
         Write::DeleteLearner(name) => Written::DeleteLearner(learners::delete(connection, name).await?),
         Write::AddWeights { learner, weights } => {
@@ -214,31 +303,6 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
         Write::FailTrial { id, reason } => {
             Written::FailTrial(Box::new(trials::fail(connection, id, reason.as_deref()).await?))
         }
-        Write::PutReward(reward) => {
-            let mut put = trials::reward_all(connection, &[reward]).await?;
-            Written::PutReward(Box::new(put.pop().ok_or(StoreError::Closed)?))
-        }
+        Write::AddObservations(_) | Write::PutReward(_) => unreachable!("applied together with their like"),
     })
-}
-
-/// Adds the observations of a group at once, but for those to a session that the group has already added to: a session was
-/// resumed meanwhile. Gives by index in the group whether they came next. What else a group does to these
-/// sessions was not waited for by their owner, so any order will do.
-async fn add_observations(
-    connection: &mut SqliteConnection,
-    group: &[Job],
-) -> Result<HashMap<usize, bool>, StoreError> {
-    let mut sessions_added = HashSet::new();
-    let (indices, news): (Vec<usize>, Vec<&NewObservations>) = group
-        .iter()
-        .enumerate()
-        .filter_map(|(n, job)| match &job.write {
-            Write::AddObservations(new) => sessions_added.insert(&new.session_id).then_some((n, new)),
-            _ => None,
-        })
-        .unzip();
-    if news.is_empty() {
-        return Ok(HashMap::new());
-    }
-    Ok(indices.into_iter().zip(sessions::add(connection, &news).await?).collect())
 }
