@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem};
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
-use crate::service::{Ended, Etude, PoolError, Resumed, ServiceError, Session, SessionError};
+use crate::service::{Ended, Etude, PoolError, Received, Resumed, ServiceError, Session, SessionError};
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
@@ -230,16 +230,19 @@ impl Connection<'_> {
             (ClientFrame::Observe { seq, frame }, Some(session)) => {
                 let root = Place::root(&frame);
                 let states = Place { value: &frame["states"], path: document::Path::Member(&root.path, "states") };
-                let observations = match session.receive(self.etude, seq, &states, now).await {
-                    Ok(observations) => observations,
+                let received = match session.receive(self.etude, seq, &states, now).await {
+                    Ok(received) => received,
                     Err(error) => return self.go_on_or_end(&error).await,
                 };
-                let received = ServerFrame::Received { seq: session.n_received() };
-                send(self.outgoing, self.limits, &received).await?;
-                if !observations.is_empty() {
-                    let steps = session.advance(self.etude, observations).await.map_err(|error| ends(&error))?;
-                    self.send_steps(&steps).await?;
-                }
+                let frame = ServerFrame::Received { seq: session.n_received() };
+                send(self.outgoing, self.limits, &frame).await?;
+                let steps = match received {
+                    Received::Mapped(steps) => steps,
+                    Received::Waiting(observations) => {
+                        session.advance(self.etude, observations).await.map_err(|error| ends(&error))?
+                    }
+                };
+                self.send_steps(&steps).await?;
                 Ok(None)
             }
             (ClientFrame::End { seq }, Some(session)) => match session.end(self.etude, seq, now).await {
