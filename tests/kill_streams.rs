@@ -5,12 +5,14 @@
 
 #![expect(clippy::unwrap_used, reason = "tests may panic")]
 
+mod process;
+
 use std::io::{BufRead, BufReader, Read, Write};
-use std::path::Path;
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
+use process::Process;
 use serde_json::{Value, json};
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::Message;
@@ -23,36 +25,6 @@ const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Observations of a stream: the demonstration of figure 4, there and back.
 const N_OBSERVATIONS: usize = 48;
-
-/// A service in a process of its own.
-struct Process {
-    child: Child,
-    address: String,
-}
-
-impl Process {
-    fn start(database: &Path) -> Self {
-        Self::start_at("127.0.0.1:0", database)
-    }
-
-    fn start_at(listen: &str, database: &Path) -> Self {
-        let serve = ["serve", "--listen", listen, "--log-format", "text", "--database"];
-        let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
-        command.args(serve).arg(database).env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG");
-        let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
-        let listening = lines.find(|line| line.contains("listening on http://")).expect("the service starts");
-        let address = listening.split("http://").nth(1).unwrap().split(['"', ' ']).next().unwrap().to_owned();
-        std::thread::spawn(move || lines.for_each(drop));
-        Self { child, address }
-    }
-
-    /// SIGKILL: no handler runs, nothing is flushed.
-    fn kill(mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
-    }
-}
 
 type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 
@@ -242,7 +214,7 @@ async fn the_command_goes_on_by_itself_when_its_service_is_killed_and_restarted(
         let n_steps = 1 + random.below(8);
         (0..n_steps).for_each(|_| read(&mut printed));
         process.kill();
-        process = Process::start_at(&address, &database);
+        process = Process::start_with(&["--listen", &address], &database);
     }
     drop(program.input.take());
     while printed.len() < expected.len() {
