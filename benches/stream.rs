@@ -138,15 +138,15 @@ impl Service {
         Ok(Self { child, address, _directory: directory })
     }
 
-    /// User and system time it has taken so far.
-    fn cpu_time(&self) -> Result<Duration, Failure> {
+    /// User and system time it has taken so far, in seconds.
+    fn cpu_s(&self) -> Result<f64, Failure> {
         /// Of the clock that Linux shows these times by.
-        const TICKS_PER_SECOND: u64 = 100;
+        const TICKS_PER_SECOND: f64 = 100.0;
         let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id()))?;
         // The name of the program, in parentheses, may have blanks.
         let (_, fields) = stat.rsplit_once(") ").ok_or("no name")?;
-        let ticks: Result<Vec<u64>, _> = fields.split(' ').skip(11).take(2).map(str::parse).collect();
-        Ok(Duration::from_millis(ticks?.iter().sum::<u64>() * 1000 / TICKS_PER_SECOND))
+        let ticks: Result<Vec<f64>, _> = fields.split(' ').skip(11).take(2).map(str::parse).collect();
+        Ok(ticks?.iter().sum::<f64>() / TICKS_PER_SECOND)
     }
 
     /// Resident memory, in KiB.
@@ -279,7 +279,7 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
     let mut rates: [Vec<f64>; 5] = Default::default();
     let mut cpu_us = Vec::new();
     for _ in 0..N_ROUNDS {
-        let cpu_before = service.cpu_time()?;
+        let cpu_before_s = service.cpu_s()?;
         let round = async |mut stream: Stream| -> Result<_, Failure> {
             stream.round_trip().await?;
             Ok(stream)
@@ -287,7 +287,7 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
         let (rate, back) = per_second(streams, round).await?;
         streams = back;
         rates[0].push(rate);
-        cpu_us.push((service.cpu_time()? - cpu_before).as_secs_f64() / ROUND.as_secs_f64() / rate * 1e6);
+        cpu_us.push((service.cpu_s()? - cpu_before_s) / ROUND.as_secs_f64() / rate * 1e6);
         let round = async |mut socket: Socket| -> Result<_, Failure> {
             socket.send(Message::text("e".repeat(128))).await?;
             socket.next().await.ok_or("closed")??;
@@ -455,7 +455,7 @@ async fn memory(n_sessions: u32, n_observations: usize, load: Load) -> Result<()
             stream.round_trip().await?;
             Ok(stream)
         };
-        let mut n_before = 0;
+        let mut n_reads = 0;
         let busy = tokio::spawn(async move {
             let mut n_rounds = 0.0;
             for _ in 0..N_ROUNDS {
@@ -467,11 +467,11 @@ async fn memory(n_sessions: u32, n_observations: usize, load: Load) -> Result<()
         });
         while !busy.is_finished() {
             most = most.max(service.resident_kib()?);
-            n_before += 1;
+            n_reads += 1;
             tokio::time::sleep(ROUND / 20).await;
         }
         let (n_rounds, _streams) = busy.await??;
-        println!("\n{n_rounds:.0} observations by {n_sessions} sessions while memory was read {n_before} times");
+        println!("\n{n_rounds:.0} observations by {n_sessions} sessions while memory was read {n_reads} times");
     }
     let each = f64::from(u32::try_from(most.saturating_sub(before))?) / f64::from(n_sessions);
     println!(

@@ -109,7 +109,9 @@ fn a_terminal_has_a_progress_line_below_the_steps_and_a_pipe_has_the_same_steps_
     let observations: Vec<Value> = serde_json::from_str(demonstration).unwrap();
 
     let (child, mut input) = stream(Stdio::piped(), Stdio::piped());
-    observations.iter().for_each(|observation| writeln!(input, "{observation}").unwrap());
+    for observation in &observations {
+        writeln!(input, "{observation}").unwrap();
+    }
     drop(input);
     let piped = child.wait_with_output().unwrap();
     let (output, errors) = (std::str::from_utf8(&piped.stdout).unwrap(), std::str::from_utf8(&piped.stderr).unwrap());

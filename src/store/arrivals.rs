@@ -161,7 +161,9 @@ impl Arrivals {
 
     /// A session was opened.
     pub(super) fn opened(&mut self, session_id: &str) {
-        self.n_observations.insert(session_id.to_owned(), 0);
+        if self.is_known() {
+            self.n_observations.insert(session_id.to_owned(), 0);
+        }
     }
 
     /// A session was ended, once everything was settled.
@@ -220,8 +222,6 @@ fn refused(session_id: &str, seq: u32) {
 
 #[cfg(test)]
 mod tests {
-    #![expect(clippy::unwrap_used, reason = "tests may panic")]
-
     use jiff::Timestamp;
     use proptest::prelude::*;
     use tokio_util::task::TaskTracker;

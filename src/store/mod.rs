@@ -3,6 +3,7 @@
 //! ```text
 //! service --Write--> queue --> writer (one task, one connection): groups what is waiting into one transaction
 //!    |                            BEGIN IMMEDIATE .. COMMIT (WAL, synchronous = FULL), then answers every waiter
+//!    |                            observations: one row a group in `arrivals`, settled in their table later
 //!    +------ reads ------------> pool of readers (query_only)
 //! ```
 //!

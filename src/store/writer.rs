@@ -210,22 +210,29 @@ async fn transact(
     group: &[Job],
 ) -> Result<Vec<Written>, StoreError> {
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
-    arrivals.check(&mut transaction).await?;
-    if !arrivals.is_known() {
-        arrivals.settle(&mut transaction).await?;
-    }
     let observations = group.iter().filter_map(|job| match &job.write {
         Write::AddObservations(new) => Some(new),
         _ => None,
     });
-    let accepted = arrivals.accept(&mut transaction, &observations.collect::<Vec<_>>()).await?;
-    arrivals.add(&mut transaction, &accepted).await?;
+    let observations: Vec<_> = observations.collect();
     let is_read = |job: &Job| matches!(job.write, Write::EndSession(_) | Write::ExpireSessions(_) | Write::Settle);
-    if arrivals.is_full() || group.iter().any(is_read) {
-        arrivals.settle(&mut transaction).await?;
+    let are_read = group.iter().any(is_read);
+    let mut are_next = Vec::new();
+    // Whoever has nothing to do with observations does not wait for them.
+    if are_read || !observations.is_empty() {
+        arrivals.check(&mut transaction).await?;
+        if !arrivals.is_known() {
+            arrivals.settle(&mut transaction).await?;
+        }
+        let accepted = arrivals.accept(&mut transaction, &observations).await?;
+        arrivals.add(&mut transaction, &accepted).await?;
+        if are_read || arrivals.is_full() {
+            arrivals.settle(&mut transaction).await?;
+        }
+        are_next = accepted.is_next;
     }
 
-    let mut are_next = accepted.is_next.into_iter();
+    let mut are_next = are_next.into_iter();
     let mut written = Vec::with_capacity(group.len());
     let mut rewards = Vec::new();
     for job in group {
