@@ -38,8 +38,9 @@ fn main() {
 }
 
 fn measure(world: &World) {
-    let definition = Definition::read(&world.model, Limits { max_states: 20_000_000, ..Limits::DEFAULT }, &mut Uninterrupted)
-        .expect("worlds are models");
+    let definition =
+        Definition::read(&world.model, Limits { max_states: 20_000_000, ..Limits::DEFAULT }, &mut Uninterrupted)
+            .expect("worlds are models");
     let started = Instant::now();
     let model = Model::compile(&definition, Limits { max_states: 20_000_000, ..Limits::DEFAULT }, &mut Uninterrupted)
         .expect("worlds are small enough");

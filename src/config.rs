@@ -91,6 +91,7 @@ impl ServeConfig {
     pub fn stream_limits(&self) -> Limits {
         Limits {
             frame_bytes: STREAM_FRAME_BYTES,
+            streams: self.max_streams,
             slow_after: self.slow_reader_timeout,
             idle_after: self.session_idle_timeout,
         }

@@ -3,12 +3,14 @@
 //! ```text
 //! service --Write--> queue --> writer (one task, one connection): groups what is waiting into one transaction
 //!    |                            BEGIN IMMEDIATE .. COMMIT (WAL, synchronous = FULL), then answers every waiter
+//!    |                            observations: one row a group in `arrivals`, settled in their table later
 //!    +------ reads ------------> pool of readers (query_only)
 //! ```
 //!
 //! A write that was answered is on disk. Rows become domain types here and nowhere else; times are milliseconds since 1970,
 //! documents are JSON text, in compressed pieces where it is long.
 
+mod arrivals;
 mod definitions;
 mod learners;
 mod models;
@@ -165,6 +167,7 @@ fn migrator() -> Migrator {
             migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
             migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
             migration(4, "large definitions", include_str!("../../migrations/0004_large_definitions.sql")),
+            migration(5, "arrivals", include_str!("../../migrations/0005_arrivals.sql")),
         ]
         .into(),
         ..Migrator::DEFAULT

@@ -1,9 +1,9 @@
 //! The one writer, which groups commits.
 //!
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies
-//! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves.
+//! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves. Observations,
+//! which are most of it, only arrive with a commit, and are settled in their table later (`arrivals`).
 
-use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -15,6 +15,7 @@ use tokio_util::task::TaskTracker;
 
 use jiff::Timestamp;
 
+use super::arrivals::Arrivals;
 use super::models::DeleteModel;
 use super::{
     FailTrial, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement, NewReward, NewSession, NewTrial,
@@ -45,6 +46,8 @@ pub(super) enum Write {
     OpenSession(Box<NewSession>),
     AddObservations(NewObservations),
     EndSession(Box<SessionEnd>),
+    /// Brings observations that have arrived to their table.
+    Settle,
     /// Those last active before this time.
     ExpireSessions(Timestamp),
     PutLearner(NewLearner),
@@ -142,6 +145,7 @@ async fn run(
     models_generation: Arc<AtomicU64>,
 ) {
     let mut group = Vec::with_capacity(MAX_GROUP);
+    let mut arrivals = Arrivals::default();
     loop {
         tokio::select! {
             n_jobs = jobs.recv_many(&mut group, MAX_GROUP) => if n_jobs == 0 { break },
@@ -153,7 +157,7 @@ async fn run(
         }
         let is_of_models = |job: &Job| matches!(job.write, Write::PutModel(_) | Write::DeleteModel(_));
         let are_models_changed = group.iter().any(is_of_models);
-        let committed = commit(&mut connection, &group).await;
+        let committed = commit(&mut connection, &mut arrivals, &group).await;
         if are_models_changed {
             models_generation.fetch_add(1, Ordering::AcqRel);
         }
@@ -173,7 +177,7 @@ async fn run(
             Err(_) if group.len() > 1 => {
                 // One write must not spoil the others: each gets a transaction and an error of its own.
                 for job in group.drain(..) {
-                    let written = commit(&mut connection, std::slice::from_ref(&job)).await;
+                    let written = commit(&mut connection, &mut arrivals, std::slice::from_ref(&job)).await;
                     if is_of_models(&job) {
                         models_generation.fetch_add(1, Ordering::AcqRel);
                     }
@@ -187,33 +191,106 @@ async fn run(
             }
         }
     }
+    if !arrivals.is_empty()
+        && let Err(error) = settle(&mut connection, &mut arrivals).await
+    {
+        // They are durable where they are.
+        tracing::warn!(error = &error as &dyn std::error::Error, "observations were left for the next start to settle");
+    }
     // Checkpoints the log, so that what is left behind is a single file.
     if let Err(error) = connection.close().await {
         tracing::warn!(error = &error as &dyn std::error::Error, "the database was not closed cleanly");
     }
 }
 
-/// Applies `group` in one transaction: policies first and rewards last, all together. Nobody was answered yet, so that any order
-/// is one in which they may have come.
-async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<Written>, StoreError> {
+/// Applies `group`; what was known is forgotten if it cannot be.
+async fn commit(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &[Job],
+) -> Result<Vec<Written>, StoreError> {
+    let observations = group.iter().map(|job| match &job.write {
+        Write::AddObservations(new) => Some(new),
+        _ => None,
+    });
+    let committed = match observations.collect::<Option<Vec<_>>>() {
+        Some(news) if arrivals.is_known() && !arrivals.is_full() => {
+            match add_observations(connection, arrivals, &news).await {
+                Ok(None) => transact(connection, arrivals, group).await,
+                Ok(Some(written)) => Ok(written),
+                Err(error) => Err(error),
+            }
+        }
+        _ => transact(connection, arrivals, group).await,
+    };
+    if committed.is_err() {
+        arrivals.forget();
+    }
+    committed
+}
+
+/// Adds observations in one statement. Gives nothing, and has done nothing, if one of them does not come next as far as is
+/// known, or others have written meanwhile: that takes a closer look.
+async fn add_observations(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    news: &[&NewObservations],
+) -> Result<Option<Vec<Written>>, StoreError> {
+    let accepted = arrivals.accept(connection, news).await?;
+    if accepted.is_next.contains(&false) || !arrivals.add_at_once(connection, &accepted).await? {
+        arrivals.forget();
+        return Ok(None);
+    }
+    Ok(Some(accepted.is_next.into_iter().map(Written::Done).collect()))
+}
+
+/// Applies `group` in one transaction: observations and policies first, rewards last, each all together. Nobody was answered yet, so that
+/// any order is one in which they may have come.
+async fn transact(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &[Job],
+) -> Result<Vec<Written>, StoreError> {
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    let observations = group.iter().filter_map(|job| match &job.write {
+        Write::AddObservations(new) => Some(new),
+        _ => None,
+    });
+    let observations: Vec<_> = observations.collect();
+    let is_read = |job: &Job| matches!(job.write, Write::EndSession(_) | Write::ExpireSessions(_) | Write::Settle);
+    let are_read = group.iter().any(is_read);
+    let mut are_next = Vec::new();
+    // Whoever has nothing to do with observations does not wait for them.
+    if are_read || !observations.is_empty() {
+        arrivals.check(&mut transaction).await?;
+        if !arrivals.is_known() {
+            arrivals.settle(&mut transaction).await?;
+        }
+        let accepted = arrivals.accept(&mut transaction, &observations).await?;
+        arrivals.add(&mut transaction, &accepted).await?;
+        if are_read || arrivals.is_full() {
+            arrivals.settle(&mut transaction).await?;
+        }
+        are_next = accepted.is_next;
+    }
+
+    let mut are_next = are_next.into_iter();
     let mut written = Vec::with_capacity(group.len());
     let mut rewards = Vec::new();
-    let mut added = add_observations(&mut transaction, group).await?;
     let added_policies = group.iter().filter_map(|job| match &job.write {
         Write::AddPolicies(added, to_refine) if to_refine.is_empty() => Some(added),
         _ => None,
     });
     policies::add_all(&mut transaction, &added_policies.flatten().collect::<Vec<_>>()).await?;
-    for (n, job) in group.iter().enumerate() {
+    for job in group {
         written.push(match &job.write {
+            Write::AddObservations(_) => are_next.next().map(Written::Done),
             Write::PutReward(reward) => {
                 rewards.push(reward);
                 None
             }
             Write::AddPolicies(_, to_refine) if to_refine.is_empty() => Some(Written::Done(true)),
-            Write::AddObservations(_) if let Some(was_next) = added.remove(&n) => Some(Written::Done(was_next)),
-            write => Some(apply(&mut transaction, write).await?),
+            write => Some(apply(&mut transaction, arrivals, write).await?),
         });
     }
     if !rewards.is_empty() {
@@ -227,8 +304,19 @@ async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<
     Ok(written.into_iter().flatten().collect())
 }
 
-/// Applies a single write.
-async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Written, StoreError> {
+/// Brings what has arrived to its table.
+async fn settle(connection: &mut SqliteConnection, arrivals: &mut Arrivals) -> Result<(), StoreError> {
+    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    arrivals.settle(&mut transaction).await?;
+    Ok(transaction.commit().await?)
+}
+
+/// Applies a single write, which is neither of observations nor of a reward.
+async fn apply(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    write: &Write,
+) -> Result<Written, StoreError> {
     Ok(match write {
         Write::PutModel(model) => Written::PutModel(models::put(connection, model).await?),
         Write::DeleteModel(name) => Written::DeleteModel(models::delete(connection, name).await?),
@@ -249,15 +337,24 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
             refinements::end(connection, end).await?;
             Written::Done(true)
         }
-        Write::OpenSession(session) => Written::Done(sessions::open(connection, session).await?),
-        Write::AddObservations(observations) => {
-            Written::Done(sessions::add(connection, &[observations]).await? == [true])
+        Write::OpenSession(session) => {
+            let was_opened = sessions::open(connection, session).await?;
+            if was_opened {
+                arrivals.opened(&session.id);
+            }
+            Written::Done(was_opened)
         }
-        Write::EndSession(end) => Written::Done(sessions::end(connection, end).await?),
+        Write::EndSession(end) => {
+            arrivals.ended(&end.session_id);
+            Written::Done(sessions::end(connection, end).await?)
+        }
         Write::ExpireSessions(before) => {
+            arrivals.expired();
             sessions::expire(connection, *before).await?;
             Written::Done(true)
         }
+        // Was done before.
+        Write::Settle => Written::Done(true),
         Write::PutLearner(learner) => Written::PutLearner(learners::put(connection, learner).await?),
         Write::DeleteLearner(name) => Written::DeleteLearner(learners::delete(connection, name).await?),
         Write::AddWeights { learner, weights } => {
@@ -267,31 +364,6 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
         Write::FailTrial { id, reason } => {
             Written::FailTrial(Box::new(trials::fail(connection, id, reason.as_deref()).await?))
         }
-        Write::PutReward(reward) => {
-            let mut put = trials::reward_all(connection, &[reward]).await?;
-            Written::PutReward(Box::new(put.pop().ok_or(StoreError::Closed)?))
-        }
+        Write::AddObservations(_) | Write::PutReward(_) => unreachable!("applied together with their like"),
     })
-}
-
-/// Adds the observations of a group at once, but for those to a session that the group has already added to: a session was
-/// resumed meanwhile. Gives by index in the group whether they came next. What else a group does to these
-/// sessions was not waited for by their owner, so any order will do.
-async fn add_observations(
-    connection: &mut SqliteConnection,
-    group: &[Job],
-) -> Result<HashMap<usize, bool>, StoreError> {
-    let mut sessions_added = HashSet::new();
-    let (indices, news): (Vec<usize>, Vec<&NewObservations>) = group
-        .iter()
-        .enumerate()
-        .filter_map(|(n, job)| match &job.write {
-            Write::AddObservations(new) => sessions_added.insert(&new.session_id).then_some((n, new)),
-            _ => None,
-        })
-        .unzip();
-    if news.is_empty() {
-        return Ok(HashMap::new());
-    }
-    Ok(indices.into_iter().zip(sessions::add(connection, &news).await?).collect())
 }
