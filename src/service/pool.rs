@@ -1,7 +1,8 @@
 //! The bounded pool that everything CPU-bound runs on.
 //!
 //! A job is admitted if fewer than `n_threads + max_waiting` are in the pool, waits for a thread, and runs there. Whoever waits for
-//! a job may go away at any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`].
+//! a job may go away at any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`]. A job that is
+//! over before a change of threads would have paid for itself waits its turn like the others, and then runs where it is.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -94,6 +95,15 @@ impl SearchPool {
         self.run_admitted(None, None, job).await
     }
 
+    /// Waits for a thread.
+    async fn turn(&self) -> Result<OwnedSemaphorePermit, PoolError> {
+        tokio::select! {
+            biased;
+            () = self.abort.cancelled() => Err(PoolError::Stopped),
+            thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped),
+        }
+    }
+
     async fn run_admitted<T, F>(
         &self,
         admitted: Option<Arc<OwnedSemaphorePermit>>,
@@ -107,10 +117,7 @@ impl SearchPool {
         let cancel = self.abort.child_token();
         // Dropped with this future: whoever waited is gone.
         let _gone: DropGuard = cancel.clone().drop_guard();
-        let thread = tokio::select! {
-            thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped)?,
-            () = cancel.cancelled() => return Err(PoolError::Stopped),
-        };
+        let thread = self.turn().await?;
         let span = tracing::Span::current();
         let running = self.tasks.spawn_blocking(move || {
             // Held until the job has really ended, even if nobody waits for it any more.
@@ -146,6 +153,22 @@ impl Admission {
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
         self.pool.run_admitted(Some(Arc::clone(&self.admitted)), deadline, job).await
+    }
+
+    /// Runs `job`, which takes no longer than a millisecond or so, in place of a thread of the pool: on the one that polls the
+    /// returned future. It is told to finish when `deadline` has passed.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the service ends before it has begun.
+    pub async fn run_here<T>(
+        &self,
+        deadline: Option<Instant>,
+        job: impl FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled>,
+    ) -> Result<T, PoolError> {
+        let _thread = self.pool.turn().await?;
+        let mut interrupt = Watch { cancel: self.pool.abort.clone(), deadline };
+        job(&mut interrupt).map_err(|Cancelled| PoolError::Stopped)
     }
 }
 
@@ -221,6 +244,27 @@ mod tests {
         abort.cancel();
         assert_eq!(running.await.unwrap(), Err(PoolError::Stopped));
         assert_eq!(waiting.await.unwrap(), Err(PoolError::Stopped));
+    }
+
+    #[tokio::test]
+    async fn a_job_that_runs_where_it_is_waits_its_turn() {
+        let (pool, abort) = pool(1, 1);
+        let running = tokio::spawn({
+            let pool = pool.clone();
+            async move { pool.admit()?.run(None, until_cancelled).await }
+        });
+        while pool.n_jobs() == 0 {
+            tokio::task::yield_now().await;
+        }
+        let place = pool.admit().unwrap();
+        assert_eq!(pool.admit().map(drop), Err(PoolError::Busy), "it is counted");
+        let mut waiting = Box::pin(place.run_here(None, |_| Ok(7)));
+        assert!(futures_util::poll!(&mut waiting).is_pending());
+        running.abort();
+        assert_eq!(waiting.await, Ok(7));
+        assert_eq!(place.run_here(Some(Instant::now()), until_cancelled).await, Ok(()));
+        abort.cancel();
+        assert_eq!(place.run_here(None, |_| Ok(7)).await, Err(PoolError::Stopped));
     }
 
     #[tokio::test]
