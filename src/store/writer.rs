@@ -175,19 +175,25 @@ async fn run(
     }
 }
 
-/// Applies `group` in one transaction: rewards last, all together. Nobody was answered yet, so that any order is one in which
-/// they may have come.
+/// Applies `group` in one transaction: policies first and rewards last, all together. Nobody was answered yet, so that any order
+/// is one in which they may have come.
 async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<Written>, StoreError> {
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     let mut written = Vec::with_capacity(group.len());
     let mut rewards = Vec::new();
     let mut added = add_observations(&mut transaction, group).await?;
+    let added_policies = group.iter().filter_map(|job| match &job.write {
+        Write::AddPolicies(added, to_refine) if to_refine.is_empty() => Some(added),
+        _ => None,
+    });
+    policies::add_all(&mut transaction, &added_policies.flatten().collect::<Vec<_>>()).await?;
     for (n, job) in group.iter().enumerate() {
         written.push(match &job.write {
             Write::PutReward(reward) => {
                 rewards.push(reward);
                 None
             }
+            Write::AddPolicies(_, to_refine) if to_refine.is_empty() => Some(Written::Done(true)),
             Write::AddObservations(_) if let Some(was_next) = added.remove(&n) => Some(Written::Done(was_next)),
             write => Some(apply(&mut transaction, write).await?),
         });
@@ -209,9 +215,7 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
         Write::PutModel(model) => Written::PutModel(models::put(connection, model).await?),
         Write::DeleteModel(name) => Written::DeleteModel(models::delete(connection, name).await?),
         Write::AddPolicies(added, to_refine) => {
-            for policy in added {
-                policies::add(connection, policy).await?;
-            }
+            policies::add_all(connection, &added.iter().collect::<Vec<_>>()).await?;
             for refinement in to_refine {
                 refinements::add(connection, refinement).await?;
             }
