@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use sqlx::{Connection, SqliteConnection};
+use tokio::runtime::Handle;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -91,7 +92,10 @@ impl Writer {
         let (queue, jobs) = mpsc::channel(MAX_WAITING);
         let closing = CancellationToken::new();
         let models_generation = Arc::new(AtomicU64::new(0));
-        tasks.spawn(run(connection, jobs, closing.clone(), Arc::clone(&models_generation)));
+        let running = run(connection, jobs, closing.clone(), Arc::clone(&models_generation));
+        // A thread of its own: whatever keeps the others busy, no commit waits for it between two statements.
+        let runtime = Handle::current();
+        tasks.spawn_blocking(move || runtime.block_on(running));
         Self { queue, closing, models_generation }
     }
 
