@@ -1,5 +1,6 @@
-//! Models of growing size through the real HTTP path: `cargo bench --bench scale [-- most states]`, ten million if left out, which
-//! takes half an hour, 8 GiB of memory and 1 GB of disk.
+//! Models of growing size through the real HTTP path: `cargo bench --bench scale [-- states ..] [shuffled]`, a hundred to ten million
+//! states if left out, which takes some minutes and 2 GiB of memory. `shuffled`: every state has a number of its own, and transitions are
+//! not in the order of states, which is the least that a model can do to be compact.
 //!
 //! A model of N states has ten transitions a state. It is generated, compressed and sent as a stream, and never held as text. The service
 //! is a process of its own, fresh for each size, so that its peak of resident memory (`VmHWM`) is of that model alone. Client and service
@@ -20,6 +21,7 @@ use flate2::Compression;
 use flate2::write::GzEncoder;
 use reqwest::{Body, Client};
 use serde_json::{Value, json};
+use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
@@ -29,34 +31,41 @@ const MAX_GZIP: u64 = 100_000;
 const N_ACTIONS: u64 = 10;
 /// The argument by which this program runs itself to read and compile a model alone.
 const ALONE: &str = "--alone";
+const SHUFFLED: &str = "shuffled";
 
 #[tokio::main]
 async fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
-    if let [flag, n] = arguments.as_slice()
-        && flag == ALONE
-    {
-        alone(n.parse().expect("a number of states"));
+    let order = if arguments.iter().any(|argument| argument == SHUFFLED) { Order::Shuffled } else { Order::Sorted };
+    let mut sizes: Vec<u64> = arguments.iter().filter_map(|argument| argument.parse().ok()).collect();
+    if arguments.iter().any(|argument| argument == ALONE) {
+        for n in sizes {
+            alone(n, order);
+        }
         return;
     }
-    let most = arguments.first().map_or(u64::MAX, |n| n.parse().expect("a number of states"));
+    if sizes.is_empty() {
+        sizes = SIZES.to_vec();
+    }
     let mut times = Vec::new();
-    for n in SIZES.into_iter().filter(|n| *n <= most) {
+    for n in sizes {
         println!("{n} states, {} transitions", n * N_ACTIONS);
         if n <= MAX_GZIP {
-            report("  JSON, gzip", n, &upload(n, Layout::Json).await);
+            report("  JSON, gzip", n, &upload(n, Layout::Json, order).await);
         }
-        let sent = upload(n, Layout::Ndjson).await;
+        let sent = upload(n, Layout::Ndjson, order).await;
         report("  NDJSON, zstd", n, &sent);
         times.push((n, sent.elapsed));
-        let run_alone =
-            Command::new(std::env::current_exe().expect("this program")).args([ALONE, &n.to_string()]).status();
-        assert!(run_alone.expect("this program").success());
+        let mut alone = Command::new(std::env::current_exe().expect("this program"));
+        alone.args([ALONE, &n.to_string()]).args((order == Order::Shuffled).then_some(SHUFFLED));
+        assert!(alone.status().expect("this program").success());
         if let [.., before, last] = times.as_slice() {
             println!("  time grows as N^{:.2} from the size before", exponent(&[*before, *last]));
         }
     }
-    println!("time of NDJSON uploads grows as N^{:.2} over all sizes", exponent(&times));
+    if times.len() > 1 {
+        println!("time of NDJSON uploads grows as N^{:.2} over all sizes", exponent(&times));
+    }
     let large: Vec<_> = times.iter().copied().filter(|(n, _)| *n >= 10_000).collect();
     if large.len() > 1 {
         println!("time of NDJSON uploads grows as N^{:.2} from ten thousand states on", exponent(&large));
@@ -107,6 +116,12 @@ fn report(name: &str, n: u64, sent: &Sent) {
     );
 }
 
+#[derive(Clone, Copy, PartialEq)]
+enum Order {
+    Sorted,
+    Shuffled,
+}
+
 #[derive(Clone, Copy)]
 enum Layout {
     Json,
@@ -114,11 +129,11 @@ enum Layout {
 }
 
 /// Uploads a model to a fresh service.
-async fn upload(n: u64, layout: Layout) -> Sent {
+async fn upload(n: u64, layout: Layout, order: Order) -> Sent {
     let started = Instant::now();
     let (text_bytes, wire_bytes) = {
         let mut sink = Counted { inner: io::sink(), n_bytes: 0 };
-        let text_bytes = compress(n, layout, &mut sink);
+        let text_bytes = compress(n, layout, order, &mut sink);
         (text_bytes, sink.n_bytes)
     };
     let generating = started.elapsed();
@@ -128,7 +143,7 @@ async fn upload(n: u64, layout: Layout) -> Sent {
     let client = Client::builder().no_proxy().build().expect("a client");
 
     let (sender, chunks) = mpsc::channel(4);
-    std::thread::spawn(move || compress(n, layout, io::BufWriter::with_capacity(1 << 18, Chunks(sender))));
+    std::thread::spawn(move || compress(n, layout, order, io::BufWriter::with_capacity(1 << 18, Chunks(sender))));
     let (content_type, encoding) = match layout {
         Layout::Json => ("application/json", "gzip"),
         Layout::Ndjson => ("application/x-ndjson", "zstd"),
@@ -163,11 +178,11 @@ async fn upload(n: u64, layout: Layout) -> Sent {
 
 /// Reads and compiles a model in this process, and prints where time and memory go.
 #[expect(clippy::cast_precision_loss, reason = "far below 2^52")]
-fn alone(n: u64) {
+fn alone(n: u64, order: Order) {
     let (reader, mut writer) = io::pipe().expect("a pipe");
     let generator = std::thread::spawn(move || {
         let mut writer = io::BufWriter::with_capacity(1 << 16, &mut writer);
-        write_model(n, Layout::Ndjson, &mut writer);
+        write_model(n, Layout::Ndjson, order, &mut writer);
     });
     let mut last = Instant::now();
     let mut step = |name: &str| {
@@ -184,8 +199,9 @@ fn alone(n: u64) {
     step("read, not compressed, while it is generated");
     let model = Model::compile(&definition, Limits::NONE, &mut Uninterrupted).expect("a model");
     step("compile");
-    definition.write(io::sink()).expect("a sink");
-    step("write the canonical text");
+    let mut hash = Sha256::new();
+    definition.write(io::BufWriter::with_capacity(1 << 16, &mut hash)).expect("a sink");
+    step("write and hash the canonical text");
     drop(definition);
     let size = model.size_bytes() as f64;
     let graph = (n * N_ACTIONS * 8 + (n + 1) * 4) as f64;
@@ -201,11 +217,11 @@ fn alone(n: u64) {
 }
 
 /// Writes the model, compressed. Gives the bytes of the text.
-fn compress(n: u64, layout: Layout, writer: impl Write) -> u64 {
+fn compress(n: u64, layout: Layout, order: Order, writer: impl Write) -> u64 {
     match layout {
         Layout::Json => {
             let mut text = Counted { inner: GzEncoder::new(writer, Compression::fast()), n_bytes: 0 };
-            write_model(n, layout, &mut text);
+            write_model(n, layout, order, &mut text);
             let mut writer = text.inner.finish().expect("a reader");
             writer.flush().expect("a reader");
             text.n_bytes
@@ -213,7 +229,7 @@ fn compress(n: u64, layout: Layout, writer: impl Write) -> u64 {
         Layout::Ndjson => {
             let encoder = zstd::Encoder::new(writer, 1).expect("an encoder");
             let mut text = Counted { inner: encoder, n_bytes: 0 };
-            write_model(n, layout, &mut text);
+            write_model(n, layout, order, &mut text);
             let mut writer = text.inner.finish().expect("a reader");
             writer.flush().expect("a reader");
             text.n_bytes
@@ -222,22 +238,34 @@ fn compress(n: u64, layout: Layout, writer: impl Write) -> u64 {
 }
 
 /// A grid of cells with four headings, from each of which ten actions lead elsewhere: to neighbours, and far away.
-fn write_model(n: u64, layout: Layout, writer: &mut impl Write) {
+fn write_model(n: u64, layout: Layout, order: Order, writer: &mut impl Write) {
     const NAMES: [&str; 10] =
         ["forward", "turn_left", "turn_right", "back", "sidestep", "jump", "climb", "leap", "slide", "teleport"];
     const LABELS: [&str; 4] = ["east", "north", "west", "south"];
     let n_columns = (n / 4).isqrt().max(1);
     let offsets = [4, 1, 3, n - 4, 8, 4 * n_columns, n - 4 * n_columns, 12, 2 * n_columns, n / 2 + 1];
     let actions: Vec<Value> = NAMES.iter().map(|name| json!({"name": name, "cost": 0.3})).collect();
-    let attributes = json!([
+    let mut attributes = json!([
         {"name": "x", "kind": "number"}, {"name": "y", "kind": "number"},
         {"name": "heading", "kind": "cyclic", "labels": LABELS},
     ]);
+    if order == Order::Shuffled {
+        attributes.as_array_mut().expect("an array").push(json!({"name": "id", "kind": "number", "weight": 0}));
+    }
     let state = |state: u64| {
-        format!("[{},{},\"{}\"]", state / 4 % n_columns, state / 4 / n_columns, LABELS[(state % 4) as usize])
+        let (x, y, heading) = (state / 4 % n_columns, state / 4 / n_columns, LABELS[(state % 4) as usize]);
+        match order {
+            Order::Sorted => format!("[{x},{y},\"{heading}\"]"),
+            Order::Shuffled => format!("[{x},{y},\"{heading}\",{state}.5]"),
+        }
     };
     let transition = |k: u64| {
-        let (from, action) = (k / N_ACTIONS, (k % N_ACTIONS) as usize);
+        let (from, action) = match order {
+            Order::Sorted => (k / N_ACTIONS, k % N_ACTIONS),
+            // From here and there: the step has no factor in common with any number of states that is measured.
+            Order::Shuffled => ((k % n) * 7_919 % n, k / n),
+        };
+        let action = usize::try_from(action).expect("one of ten");
         format!("[{from},\"{}\",{}]", NAMES[action], (from + offsets[action]) % n)
     };
     let result = match layout {

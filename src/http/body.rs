@@ -37,10 +37,7 @@ pub(super) async fn read_json(request: Request, limit: usize) -> Result<Bytes, P
     let limit = SentLimit { n_bytes: limit, setting: "ETUDE_MAX_BODY_BYTES" };
     let read = async {
         let body = open(request, limit).await?;
-        let (bytes, rest) = collect(body, limit, limit.n_bytes).await?;
-        if rest.is_some() {
-            return Err(too_large(limit));
-        }
+        let (bytes, _) = collect(body, limit, usize::MAX).await?;
         if is_json {
             Ok((bytes, encoding.map_err(|encoding| unsupported_encoding(&encoding))?))
         } else {
@@ -52,6 +49,7 @@ pub(super) async fn read_json(request: Request, limit: usize) -> Result<Bytes, P
     if encoding == Encoding::Identity {
         return Ok(bytes);
     }
+    // Off the threads that serve others; bounded by the limit.
     let decode = move || -> io::Result<Vec<u8>> {
         let limit = DecodedLimit { n_bytes: limit.n_bytes as u64, setting: limit.setting };
         let mut decoded = Vec::new();

@@ -55,12 +55,15 @@ impl Table {
     /// a `skip` does for nothing.
     pub(super) fn compile(&self) -> Model {
         let n_states = self.states.len() as usize;
-        let mut is_unsafe = vec![false; n_states];
+        // Where none is, none is noted.
+        let n_noted = if self.unsafe_states.is_empty() { 0 } else { n_states };
+        let mut is_unsafe = vec![false; n_noted];
         for state in &self.unsafe_states {
             is_unsafe[*state as usize] = true;
         }
-        let is_useful =
-            |(from, transition): &(StateIdx, Transition)| *from != transition.to && !is_unsafe[transition.to as usize];
+        let is_useful = |(from, transition): &(StateIdx, Transition)| {
+            *from != transition.to && is_unsafe.get(transition.to as usize) != Some(&true)
+        };
         let graph = Graph::new(n_states, self.edges.iter().filter(is_useful));
         Model {
             schema: self.schema.clone(),
