@@ -1,5 +1,5 @@
 //! The mapping against its peers on the same problems, in one run: `cargo bench --bench mapping [-- part ..]`, where a part is `peers`,
-//! `growth` or `instructions`; all if none is named.
+//! `growth`, `deadline` or `instructions`; all if none is named.
 //!
 //! Every solver is given the problem ready: models are compiled, and terms of distances are tabulated by observation and value,
 //! for the peers too. Rounds are interleaved, so that a machine that slows down slows all of them down; in each, a solver
@@ -8,7 +8,9 @@
 //! which may cost more.
 
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
+#![expect(clippy::cast_precision_loss, reason = "counts and costs here are far below 2^52")]
 
+mod deadline;
 mod growth;
 mod instructions;
 mod peers;
@@ -48,6 +50,9 @@ fn main() {
     }
     if is_wanted("growth") {
         growth::measure();
+    }
+    if is_wanted("deadline") {
+        deadline::measure();
     }
     if is_wanted("instructions") {
         instructions::measure();

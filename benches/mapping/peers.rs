@@ -226,7 +226,7 @@ impl IntoEdgeReferences for Unfolded<'_> {
     }
 }
 
-impl<'p> IntoEdges for Unfolded<'p> {
+impl IntoEdges for Unfolded<'_> {
     type Edges = std::vec::IntoIter<Edge>;
 
     fn edges(self, from: Node) -> Self::Edges {
