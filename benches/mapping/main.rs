@@ -75,6 +75,8 @@ fn problem<'m>(mapper: &'m Mapper, world: &World) -> Problem<'m> {
     request.expect("worlds have their demonstrations").problem
 }
 
+type Solver<'a> = Box<dyn Fn() -> Solved + 'a>;
+
 fn compare(world: &World) {
     const N_ROUNDS: usize = 7;
     let started = Instant::now();
@@ -100,7 +102,7 @@ fn compare(world: &World) {
         }
     };
     let bound = mapper.lower_bounds(problem);
-    let solvers: Vec<(&str, Box<dyn Fn() -> Solved + '_>)> = vec![
+    let solvers: Vec<(&str, Solver<'_>)> = vec![
         ("etude", Box::new(etude(HeuristicName::Default))),
         ("etude, no heuristic", Box::new(etude(HeuristicName::None))),
         ("pathfinding A*, paper's", Box::new(|| peer.pathfinding(|node| peer.paper(node)))),
