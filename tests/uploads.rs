@@ -125,7 +125,7 @@ async fn a_model_in_pieces_is_compiled_anew_after_a_restart() {
     let service = Service::start(&[]).await;
     let lines = lines_of(&ring(N_LARGE), 1000);
     assert_eq!(put(&service, "ring", NDJSON, Some("zstd"), zstd(lines.as_bytes())).await.0, 201);
-    let request = json!({"model": "ring", "demonstration": [{"x": 0}, {"x": 1}, {"x": 2}, {"x": 3}], "start": 0});
+    let request = json!({"model": "ring", "demonstration": [{"x": 0}, {"x": 1}, {"x": 2}, {"x": 3}], "start": 0, "weights": {"x": 4}});
     let (status, before) = service.post("/v1/policies", &request).await;
     assert_eq!((status, &before["actions"]), (201, &json!(["on", "on", "on"])), "{before}");
     let service = Service::start_in(service.stop().await, &[]).await;

@@ -1,5 +1,7 @@
 //! Worlds to measure on: the examples, and caves of any size from a seed.
 
+#![allow(dead_code, clippy::allow_attributes, reason = "each benchmark uses its part of this module")]
+
 use std::path::Path;
 
 use serde_json::{Value, json};
