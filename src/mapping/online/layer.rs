@@ -209,7 +209,7 @@ pub(super) struct Sweep {
     pub(super) action_costs: Vec<f64>,
     /// Distances to the observation in hand. Shape `[n_states]`.
     distances: Vec<f64>,
-    open: OpenList,
+    pub(super) open: OpenList,
 }
 
 impl Sweep {
@@ -284,8 +284,9 @@ impl Sweep {
         }
         let is_lower = |state: StateIdx, cost: f64| cost < before[state as usize];
         for state in reached {
-            if is_lower(*state, costs[*state as usize]) {
-                self.extras(model, *state, &mut costs, &mut nodes, is_lower);
+            let cost = costs[*state as usize];
+            if is_lower(*state, cost) {
+                self.open.push(cost, *state);
             }
         }
         while let Some((cost, state)) = self.open.pop() {

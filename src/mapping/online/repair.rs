@@ -1,6 +1,16 @@
-//! New ways for survivors that have lost theirs.
+//! New ways for survivors that have lost theirs, where these are few.
+//!
+//! What the window's nodes say was true of some root. As a root's ways are among those of the root before it, a node whose way
+//! is *lost*, because it does not lead from the root, says too little at most: a lower bound. A node is *sound* if its source
+//! is, and if it still costs what its source's cost makes of it. Two passes give every survivor a sound node again:
+//!
+//! - back from the newest layer: a wanted node's new way leads over a sound node, which gives an upper bound, or over a lost
+//!   one whose lower bound is less; only those of the latter are wanted in their turn;
+//! - forward again: wanted nodes get their ways from sound ones, layer by layer, by Dijkstra's algorithm within a layer.
+//!
+//! Nodes that nobody wanted stay lost, as lower bounds for the next time.
 
-use super::layer::Source;
+use super::layer::{Source, Sweep};
 use super::open_list::OpenList;
 use super::window::{Place, Window, action};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
@@ -40,9 +50,6 @@ impl Predecessors {
     }
 }
 
-/// Where one survivor in this many has lost its way, it takes less time to sweep all layers.
-const SWEEP: usize = 16;
-
 /// Which survivors have a way again.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Repaired {
@@ -63,18 +70,20 @@ enum Standing {
     Wanted,
 }
 
+/// A repair of a window whose layers are kept whole.
 pub(super) struct Repair<'r> {
     window: &'r mut Window,
     model: &'r Model,
     predecessors: &'r Predecessors,
     action_costs: &'r [f64],
+    open: &'r mut OpenList,
     n_states: usize,
     /// Shape `[n_layers, n_states]`.
     standings: Vec<Standing>,
     /// By layer.
     wanted: Vec<Vec<StateIdx>>,
+    /// Nodes in hand of [`Self::is_sound`], kept for its memory.
     chain: Vec<Place>,
-    open: OpenList,
 }
 
 impl<'r> Repair<'r> {
@@ -82,23 +91,29 @@ impl<'r> Repair<'r> {
         window: &'r mut Window,
         model: &'r Model,
         predecessors: &'r Predecessors,
-        action_costs: &'r [f64],
+        sweep: &'r mut Sweep,
     ) -> Self {
+        let Sweep { action_costs, open, .. } = sweep;
         let (n_layers, n_states) = (window.layers.len(), model.graph().n_states());
         Self {
             window,
             model,
             predecessors,
             action_costs,
+            open,
             n_states,
             standings: vec![Standing::Unknown; n_layers * n_states],
             wanted: vec![Vec::new(); n_layers],
             chain: Vec::new(),
-            open: OpenList::new(),
         }
     }
 
-    pub(super) fn run(mut self, interrupt: &mut dyn Interrupt) -> Result<Repaired, Cancelled> {
+    /// Gives every survivor a way, unless more than `most` have lost theirs.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
+    pub(super) fn run(mut self, most: usize, interrupt: &mut dyn Interrupt) -> Result<Repaired, Cancelled> {
         let newest = self.wanted.len() - 1;
         let reached = std::mem::take(&mut self.window.reached);
         for state in reached.iter().copied() {
@@ -107,7 +122,7 @@ impl<'r> Repair<'r> {
             }
         }
         self.window.reached = reached;
-        if self.wanted[newest].len() * SWEEP > self.window.layers[newest].n_alive() {
+        if self.wanted[newest].len() > most {
             return Ok(Repaired::TooMany);
         }
         for index in (0..=newest).rev() {
@@ -131,6 +146,7 @@ impl<'r> Repair<'r> {
         index * self.n_states + state as usize
     }
 
+    /// Wants a new way to a lost node.
     fn want(&mut self, place: Place) {
         let at = self.at(place);
         self.standings[at] = Standing::Wanted;
@@ -145,6 +161,7 @@ impl<'r> Repair<'r> {
         self.window.layers[index].observed.distance(self.model.states(), state)
     }
 
+    /// Whether a node's way leads from the root and costs what it says. Every node of the way is noted as what it is.
     fn is_sound(&mut self, mut place: Place) -> bool {
         let root = (0, self.window.root);
         let mut is_sound = loop {
@@ -156,6 +173,7 @@ impl<'r> Repair<'r> {
                     self.standings[at] = Standing::Sound;
                     break true;
                 }
+                // Until it has turned out otherwise.
                 Standing::Unknown => self.standings[at] = Standing::Lost,
             }
             self.chain.push(place);
@@ -174,7 +192,7 @@ impl<'r> Repair<'r> {
         is_sound
     }
 
-    /// Whether a node still costs what its source's cost makes of it.
+    /// Whether a node still costs what its source's cost makes of it, as those that survivors hang on do.
     fn is_consistent(&self, place: Place) -> bool {
         let (index, state) = place;
         let node = self.window.layers[index].node(state);
@@ -240,8 +258,7 @@ impl<'r> Repair<'r> {
             self.each_origin((index, state), |this, origin, action_cost| {
                 let cost = this.cost(origin) + action_cost + distance;
                 if cost < best.0 && this.is_sound(origin) {
-                    let source =
-                        if origin.0 == index { Source::within(origin.1) } else { Source::before(origin.1) };
+                    let source = if origin.0 == index { Source::within(origin.1) } else { Source::before(origin.1) };
                     best = (cost, source);
                 }
             });
@@ -270,6 +287,7 @@ impl<'r> Repair<'r> {
         self.wanted[index] = wanted;
     }
 
+    /// Gives a wanted node a way.
     fn set(&mut self, (index, state): Place, (cost, source): (f64, Source)) {
         let layer = &mut self.window.layers[index];
         layer.costs[state as usize] = cost;
