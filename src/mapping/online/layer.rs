@@ -7,7 +7,8 @@ use crate::mapping::distances::ObservedDistances;
 use crate::model::{Model, StateIdx};
 
 /// Where a way comes from: a state of the layer before (by a skip if it is the same state, else by a match) or of the same
-/// layer (by an extra). The action is the cheapest that leads from there, the first among equals.
+/// layer (by an extra). The action is the cheapest that leads from there, the first among equals. The highest bit tells
+/// which: memory ends before there are 2^31 states.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Source(u32);
 
