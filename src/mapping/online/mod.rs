@@ -355,7 +355,7 @@ mod tests {
             };
             for x in observed {
                 let observation = [Some(Value::Number(f64::from(x)))];
-                let mut observe = |online: &mut OnlineMapping| online.observe(&observation, &mut Uninterrupted).unwrap();
+                let observe = |online: &mut OnlineMapping| online.observe(&observation, &mut Uninterrupted).unwrap();
                 prop_assert_eq!(observe(&mut swept), observe(&mut thinned));
                 prop_assert_eq!(costs(&swept), costs(&thinned));
                 prop_assert_eq!(swept.n_nodes(), thinned.n_nodes());

@@ -73,7 +73,9 @@ mod tests {
             // Twice, as what is empty can be filled again with less.
             for _ in 0..2 {
                 let mut waiting = first.clone();
-                first.iter().for_each(|cost| open.push(*cost, 7));
+                for cost in &first {
+                    open.push(*cost, 7);
+                }
                 let mut steps = steps.iter();
                 while let Some((cost, state)) = open.pop() {
                     waiting.sort_by(f64::total_cmp);
