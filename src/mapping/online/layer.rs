@@ -1,141 +1,328 @@
 //! The cheapest ways to every state at one observation, made from those at the observation before.
 
-use std::collections::BinaryHeap;
+use rustc_hash::FxHashMap;
 
-use super::tree::{NO_ACTION, NO_NODE, NodeId, Tree, TreeNode};
+use super::open_list::OpenList;
 use crate::mapping::distances::ObservedDistances;
-use crate::mapping::open_list::CheapestFirst;
-use crate::model::{ActionIdx, Graph, Model, StateIdx};
+use crate::model::{Model, StateIdx};
+
+/// Where a way comes from: a state of the layer before (by a skip if it is the same state, else by a match) or of the same
+/// layer (by an extra). The action is the cheapest that leads from there, the first among equals. The highest bit tells
+/// which: memory ends before there are 2^31 states.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Source(u32);
+
+impl Source {
+    const WITHIN: u32 = 1 << 31;
+    /// Of the root, and of states that no way leads to.
+    pub(super) const NONE: Self = Self(u32::MAX);
+
+    pub(super) fn before(state: StateIdx) -> Self {
+        Self(state)
+    }
+
+    pub(super) fn within(state: StateIdx) -> Self {
+        Self(state | Self::WITHIN)
+    }
+
+    pub(super) fn is_within(self) -> bool {
+        self.0 & Self::WITHIN != 0
+    }
+
+    pub(super) fn state(self) -> StateIdx {
+        self.0 & !Self::WITHIN
+    }
+}
+
+/// A state at an observation, as part of a way.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Node {
+    pub(super) source: Source,
+    /// How many nodes with a survivor have it as their source; [`Self::DEAD`] if no survivor hangs on it.
+    pub(super) n_children: u32,
+}
+
+impl Node {
+    pub(super) const DEAD: u32 = u32::MAX;
+    const ABSENT: Self = Self { source: Source::NONE, n_children: Self::DEAD };
+
+    pub(super) fn is_alive(self) -> bool {
+        self.n_children != Self::DEAD
+    }
+}
 
 /// The cheapest ways to every state at one observation.
 #[derive(Debug)]
 pub(super) struct Layer {
-    /// Cost of the way; infinite where there is none. Shape `[n_states]`.
+    /// Of the states to the observation.
+    pub(super) observed: ObservedDistances,
+    /// Costs of the ways; infinite where there is none. Shape `[n_states]`; empty once they were forgotten.
     pub(super) costs: Vec<f64>,
-    /// The tree's node of the state, [`NO_NODE`] until it has grown. Shape `[n_states]`.
-    pub(super) nodes: Vec<NodeId>,
-    /// How the way comes to the state. Shape `[n_states]`.
-    origins: Vec<Origin>,
-    /// Distances of the states to the observation. Shape `[n_states]`.
-    distances: Vec<f64>,
-    open: BinaryHeap<CheapestFirst>,
+    nodes: Nodes,
+    n_alive: usize,
+    /// How many states there may be a way to; nothing was written of others.
+    n_reached: usize,
 }
 
-/// How a way comes to a state.
-#[derive(Clone, Copy, Debug)]
-enum Origin {
-    /// From this node of the layer before.
-    Before(NodeId, ActionIdx),
-    /// From this state of the same layer.
-    Within(StateIdx, ActionIdx),
+#[derive(Debug)]
+enum Nodes {
+    /// Shape `[n_states]`.
+    Dense(Vec<Node>),
+    /// Those that are alive.
+    Sparse(FxHashMap<StateIdx, Node>),
+}
+
+/// Arrays that a layer has no more use for, kept to be filled again.
+#[derive(Debug, Default)]
+pub(super) struct Spare {
+    pub(super) costs: Vec<f64>,
+    pub(super) nodes: Vec<Node>,
+    /// How many states were written of, since all was cleared.
+    pub(super) n_reached: usize,
+}
+
+impl Spare {
+    /// Arrays that say of states out of reach that no way leads there. As what is within reach only ever shrinks, those
+    /// written of as many states as now are have nothing to be cleared.
+    fn cleared(mut self, n_states: usize, n_reached: usize) -> Self {
+        if self.costs.len() != n_states || self.nodes.len() != n_states || self.n_reached != n_reached {
+            self.costs.clear();
+            self.costs.resize(n_states, f64::INFINITY);
+            self.nodes.clear();
+            self.nodes.resize(n_states, Node::ABSENT);
+        }
+        self
+    }
 }
 
 impl Layer {
-    pub(super) fn new(n_states: usize) -> Self {
-        Self {
-            costs: vec![f64::INFINITY; n_states],
-            nodes: vec![NO_NODE; n_states],
-            origins: vec![Origin::Before(NO_NODE, NO_ACTION); n_states],
-            distances: vec![0.0; n_states],
-            open: BinaryHeap::new(),
+    /// How many nodes survivors hang on.
+    pub(super) fn n_alive(&self) -> usize {
+        self.n_alive
+    }
+
+    pub(super) fn node(&self, state: StateIdx) -> Node {
+        match &self.nodes {
+            Nodes::Dense(nodes) => nodes[state as usize],
+            Nodes::Sparse(nodes) => nodes.get(&state).copied().unwrap_or(Node::ABSENT),
         }
     }
 
-    pub(super) fn clear(&mut self) {
-        self.costs.fill(f64::INFINITY);
-        self.nodes.fill(NO_NODE);
+    /// The node of a state that there is one of.
+    fn node_mut(&mut self, state: StateIdx) -> &mut Node {
+        match &mut self.nodes {
+            Nodes::Dense(nodes) => &mut nodes[state as usize],
+            Nodes::Sparse(nodes) => nodes.get_mut(&state).expect("what a survivor hangs on is kept"),
+        }
+    }
+
+    pub(super) fn set_source(&mut self, state: StateIdx, source: Source) {
+        self.node_mut(state).source = source;
+    }
+
+    /// Counts a child of `state`. Says whether that brought it to life.
+    pub(super) fn add_child(&mut self, state: StateIdx) -> bool {
+        let node = self.node_mut(state);
+        let was_dead = !node.is_alive();
+        node.n_children = if was_dead { 1 } else { node.n_children + 1 };
+        self.n_alive += usize::from(was_dead);
+        was_dead
+    }
+
+    /// Takes off a child of `state`, and gives how many are left.
+    pub(super) fn remove_child(&mut self, state: StateIdx) -> u32 {
+        let node = self.node_mut(state);
+        node.n_children -= 1;
+        node.n_children
+    }
+
+    /// Lets a node die.
+    pub(super) fn kill(&mut self, state: StateIdx) {
+        self.n_alive -= 1;
+        match &mut self.nodes {
+            Nodes::Dense(nodes) => nodes[state as usize].n_children = Node::DEAD,
+            Nodes::Sparse(nodes) => drop(nodes.remove(&state)),
+        }
+    }
+
+    /// Lets every node die.
+    pub(super) fn kill_all(&mut self) {
+        self.n_alive = 0;
+        match &mut self.nodes {
+            Nodes::Dense(nodes) => nodes.iter_mut().for_each(|node| node.n_children = Node::DEAD),
+            Nodes::Sparse(nodes) => nodes.clear(),
+        }
+    }
+
+    /// Lets every node that has a way live: the newest layer's are the survivors. There are none but at `reached`.
+    pub(super) fn revive_all(&mut self, reached: &[StateIdx]) {
+        let Nodes::Dense(nodes) = &mut self.nodes else { return };
+        self.n_alive = 0;
+        for state in reached.iter().map(|state| *state as usize) {
+            let is_reached = self.costs[state].is_finite();
+            nodes[state].n_children = if is_reached { 0 } else { Node::DEAD };
+            self.n_alive += usize::from(is_reached);
+        }
+    }
+
+    /// Forgets the costs, and where few survivors hang on it, all nodes but theirs. Gives what can be filled again.
+    pub(super) fn forget(&mut self) -> Spare {
+        let nodes = self.thin().unwrap_or_default();
+        Spare { costs: std::mem::take(&mut self.costs), nodes, n_reached: self.n_reached }
+    }
+
+    /// Keeps only nodes that are alive, if that takes less memory. Gives the array that is free then.
+    pub(super) fn thin(&mut self) -> Option<Vec<Node>> {
+        /// A hash table's entry is taken for this many of an array's.
+        const ENTRY: usize = 16;
+        let Nodes::Dense(nodes) = &self.nodes else { return None };
+        if self.n_alive * ENTRY > nodes.len() {
+            return None;
+        }
+        let alive = (0..).zip(nodes.iter().copied()).filter(|(_, node)| node.is_alive()).collect();
+        match std::mem::replace(&mut self.nodes, Nodes::Sparse(alive)) {
+            Nodes::Dense(nodes) => Some(nodes),
+            Nodes::Sparse(_) => None,
+        }
+    }
+
+    /// What can be filled again.
+    pub(super) fn into_spare(self) -> (Spare, ObservedDistances) {
+        let nodes = match self.nodes {
+            Nodes::Dense(nodes) => nodes,
+            Nodes::Sparse(_) => Vec::new(),
+        };
+        (Spare { costs: self.costs, nodes, n_reached: self.n_reached }, self.observed)
     }
 
     /// The state with the cheapest way, the lowest among equals. `None` if no state has one.
-    pub(super) fn cheapest(&self) -> Option<usize> {
+    #[expect(clippy::cast_possible_truncation, reason = "states are counted in u32")]
+    pub(super) fn cheapest(&self) -> Option<StateIdx> {
         let reached = self.costs.iter().enumerate().filter(|(_, cost)| cost.is_finite());
-        reached.min_by(|(_, cost), (_, other)| cost.total_cmp(other)).map(|(state, _)| state)
+        reached.min_by(|(_, cost), (_, other)| cost.total_cmp(other)).map(|(state, _)| state as StateIdx)
+    }
+}
+
+/// Makes layers.
+#[derive(Debug)]
+pub(super) struct Sweep {
+    /// By action.
+    pub(super) action_costs: Vec<f64>,
+    /// Distances to the observation in hand. Shape `[n_states]`.
+    distances: Vec<f64>,
+    pub(super) open: OpenList,
+}
+
+impl Sweep {
+    pub(super) fn new(model: &Model) -> Self {
+        let action_costs = model.actions().iter().map(|action| action.cost).collect();
+        Self { action_costs, distances: vec![0.0; model.graph().n_states()], open: OpenList::new() }
     }
 
-    /// Skips and matches from the layer `before`; distances are added by [`Self::spread`].
-    pub(super) fn follow(&mut self, before: &Self, model: &Model) {
+    /// The layer of the root, which costs `cost`: extras lead on from there (Dijkstra's algorithm). They lead to none but
+    /// `reached`.
+    pub(super) fn begin(
+        &mut self,
+        model: &Model,
+        (root, cost): (StateIdx, f64),
+        reached: &[StateIdx],
+        observed: ObservedDistances,
+        spare: Spare,
+    ) -> Layer {
+        for state in reached {
+            self.distances[*state as usize] = observed.distance(model.states(), *state);
+        }
+        let Spare { mut costs, mut nodes, .. } = spare.cleared(model.graph().n_states(), usize::MAX);
+        for state in reached.iter().map(|state| *state as usize) {
+            (costs[state], nodes[state]) = (f64::INFINITY, Node::ABSENT);
+        }
+        costs[root as usize] = cost;
+        self.open.push(cost, root);
+        while let Some((cost, state)) = self.open.pop() {
+            if cost <= costs[state as usize] {
+                self.extras(model, state, &mut costs, &mut nodes, |_, _| true);
+            }
+        }
+        let mut layer = Layer { observed, costs, nodes: Nodes::Dense(nodes), n_alive: 0, n_reached: reached.len() };
+        layer.revive_all(reached);
+        layer
+    }
+
+    /// The layer after one with the costs `before`: skips and matches from there, and extras wherever they lead to a state
+    /// more cheaply. There are no ways but to `reached`.
+    ///
+    /// An extra from a state is worth a look only where the state costs less than it did in the layer before: from there, the
+    /// same action would have matched.
+    pub(super) fn follow(
+        &mut self,
+        model: &Model,
+        before: &[f64],
+        reached: &[StateIdx],
+        observed: ObservedDistances,
+        spare: Spare,
+    ) -> Layer {
         let graph = model.graph();
-        for (state, cost) in (0..).zip(before.costs.iter().copied()).filter(|(_, cost)| cost.is_finite()) {
-            let node = before.nodes[state as usize];
-            self.offer(state, cost, Origin::Before(node, NO_ACTION));
-            for transition in graph.successors(state) {
-                let cost = cost + model.action(transition.action).cost;
-                self.offer(transition.to, cost, Origin::Before(node, transition.action));
+        let Spare { mut costs, mut nodes, .. } = spare.cleared(before.len(), reached.len());
+        for state in reached {
+            costs[*state as usize] = before[*state as usize];
+            nodes[*state as usize] = Node { source: Source::before(*state), n_children: 0 };
+        }
+        for state in reached {
+            let from = before[*state as usize];
+            for transition in graph.successors(*state) {
+                let cost = from + self.action_costs[usize::from(transition.action)];
+                let to = transition.to as usize;
+                if cost < costs[to] {
+                    costs[to] = cost;
+                    nodes[to].source = Source::before(*state);
+                }
             }
         }
+        for state in reached {
+            let at = *state as usize;
+            self.distances[at] = observed.distance(model.states(), *state);
+            costs[at] += self.distances[at];
+        }
+        let is_lower = |state: StateIdx, cost: f64| cost < before[state as usize];
+        for state in reached {
+            let cost = costs[*state as usize];
+            if is_lower(*state, cost) {
+                self.open.push(cost, *state);
+            }
+        }
+        while let Some((cost, state)) = self.open.pop() {
+            if cost <= costs[state as usize] {
+                self.extras(model, state, &mut costs, &mut nodes, is_lower);
+            }
+        }
+        let n_alive = reached.len();
+        Layer { observed, costs, nodes: Nodes::Dense(nodes), n_alive, n_reached: n_alive }
     }
 
-    /// Adds the distances to the observation, where a way comes from the layer before, and then takes extra actions
-    /// wherever they lead to a state more cheaply (Dijkstra's algorithm from all states at once).
-    pub(super) fn spread(&mut self, model: &Model, observed: &ObservedDistances) {
-        let (states, graph) = (model.states(), model.graph());
-        for (state, distance) in (0..).zip(&mut self.distances) {
-            *distance = observed.distance(states, state);
-        }
-        for ((cost, node), distance) in self.costs.iter_mut().zip(&self.nodes).zip(&self.distances) {
-            // The root has paid already.
-            if *node == NO_NODE {
-                *cost += distance;
-            }
-        }
-        for state in 0..states.len() {
-            let cost = self.costs[state as usize];
-            if cost.is_finite() {
-                self.extras(model, graph, state, cost);
-            }
-        }
-        while let Some(CheapestFirst { cost, id: state }) = self.open.pop() {
-            if cost <= self.costs[state as usize] {
-                self.extras(model, graph, state, cost);
-            }
-        }
-    }
-
-    fn extras(&mut self, model: &Model, graph: &Graph, state: StateIdx, cost: f64) {
-        for transition in graph.successors(state) {
-            let cost = cost + model.action(transition.action).cost + self.distances[transition.to as usize];
-            if self.offer(transition.to, cost, Origin::Within(state, transition.action)) {
-                self.open.push(CheapestFirst { cost, id: transition.to });
-            }
-        }
-    }
-
-    /// Takes a way if it is cheaper.
-    fn offer(&mut self, state: StateIdx, cost: f64, origin: Origin) -> bool {
-        let state = state as usize;
-        let is_cheaper = cost < self.costs[state];
-        if is_cheaper {
-            self.costs[state] = cost;
-            self.origins[state] = origin;
-        }
-        is_cheaper
-    }
-
-    /// Adds the states' nodes to the tree.
-    pub(super) fn grow(&mut self, tree: &mut Tree, observation: u32) {
-        let mut waiting = Vec::new();
-        for state in 0..self.costs.len() {
-            if self.costs[state].is_infinite() || self.nodes[state] != NO_NODE {
+    /// Takes extras from `state`; what they improve is looked at later if `leads_on`.
+    fn extras(
+        &mut self,
+        model: &Model,
+        state: StateIdx,
+        costs: &mut [f64],
+        nodes: &mut [Node],
+        leads_on: impl Fn(StateIdx, f64) -> bool,
+    ) {
+        let from = costs[state as usize];
+        for transition in model.graph().successors(state) {
+            let to = transition.to as usize;
+            let cost = from + self.action_costs[usize::from(transition.action)];
+            // A distance is never negative.
+            if cost >= costs[to] {
                 continue;
             }
-            waiting.push(state);
-            // Origins within the layer come first. Each is strictly cheaper than what comes from it, or was there
-            // before it, so this ends.
-            while let Some(state) = waiting.last().copied() {
-                let (parent, action) = match self.origins[state] {
-                    Origin::Before(parent, action) => (parent, action),
-                    Origin::Within(from, action) => (self.nodes[from as usize], action),
-                };
-                if parent == NO_NODE
-                    && let Origin::Within(from, _) = self.origins[state]
-                {
-                    waiting.push(from as usize);
-                    continue;
+            let cost = cost + self.distances[to];
+            if cost < costs[to] {
+                costs[to] = cost;
+                nodes[to].source = Source::within(state);
+                if leads_on(transition.to, cost) {
+                    self.open.push(cost, transition.to);
                 }
-                #[expect(clippy::cast_possible_truncation, reason = "states are counted in u32")]
-                let node = TreeNode { parent, action, state: state as StateIdx, observation, ..TreeNode::default() };
-                self.nodes[state] = tree.add(node);
-                waiting.pop();
             }
         }
     }

@@ -1,0 +1,299 @@
+//! New ways for survivors that have lost theirs, where these are few.
+//!
+//! What the window's nodes say was true of some root. As a root's ways are among those of the root before it, a node whose way
+//! is *lost*, because it does not lead from the root, says too little at most: a lower bound. A node is *sound* if its source
+//! is, and if it still costs what its source's cost makes of it. Two passes give every survivor a sound node again:
+//!
+//! - back from the newest layer: a wanted node's new way leads over a sound node, which gives an upper bound, or over a lost
+//!   one whose lower bound is less; only those of the latter are wanted in their turn;
+//! - forward again: wanted nodes get their ways from sound ones, layer by layer, by Dijkstra's algorithm within a layer.
+//!
+//! Nodes that nobody wanted stay lost, as lower bounds for the next time.
+
+use super::layer::{Source, Sweep};
+use super::open_list::OpenList;
+use super::window::{Place, Window, action};
+use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::model::{ActionIdx, Graph, Model, StateIdx};
+
+/// The ways into states.
+#[derive(Debug)]
+pub(super) struct Predecessors {
+    /// Shape `[n_states + 1]`.
+    offsets: Vec<u32>,
+    /// By state that is led to.
+    transitions: Vec<(StateIdx, ActionIdx)>,
+}
+
+impl Predecessors {
+    pub(super) fn new(graph: &Graph) -> Self {
+        let mut offsets = vec![0_u32; graph.n_states() + 1];
+        for (_, transition) in graph.iter() {
+            offsets[transition.to as usize + 1] += 1;
+        }
+        for state in 0..graph.n_states() {
+            offsets[state + 1] += offsets[state];
+        }
+        let mut free = offsets.clone();
+        let mut transitions = vec![(0, 0); graph.n_transitions()];
+        for (from, transition) in graph.iter() {
+            let place = &mut free[transition.to as usize];
+            transitions[*place as usize] = (from, transition.action);
+            *place += 1;
+        }
+        Self { offsets, transitions }
+    }
+
+    fn of(&self, state: StateIdx) -> &[(StateIdx, ActionIdx)] {
+        let state = state as usize;
+        &self.transitions[self.offsets[state] as usize..self.offsets[state + 1] as usize]
+    }
+}
+
+/// Which survivors have a way again.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Repaired {
+    All,
+    /// None, as too many had lost theirs.
+    TooMany,
+}
+
+/// What is known of a node's way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Standing {
+    Unknown,
+    /// It leads from the root, and costs what the node says.
+    Sound,
+    /// It does not; what the node says is a lower bound.
+    Lost,
+    /// So, and a new one is wanted.
+    Wanted,
+}
+
+/// A repair of a window whose layers are kept whole.
+pub(super) struct Repair<'r> {
+    window: &'r mut Window,
+    model: &'r Model,
+    predecessors: &'r Predecessors,
+    action_costs: &'r [f64],
+    open: &'r mut OpenList,
+    n_states: usize,
+    /// Shape `[n_layers, n_states]`.
+    standings: Vec<Standing>,
+    /// By layer.
+    wanted: Vec<Vec<StateIdx>>,
+    /// Nodes in hand of [`Self::is_sound`], kept for its memory.
+    chain: Vec<Place>,
+}
+
+impl<'r> Repair<'r> {
+    pub(super) fn new(
+        window: &'r mut Window,
+        model: &'r Model,
+        predecessors: &'r Predecessors,
+        sweep: &'r mut Sweep,
+    ) -> Self {
+        let Sweep { action_costs, open, .. } = sweep;
+        let (n_layers, n_states) = (window.layers.len(), model.graph().n_states());
+        Self {
+            window,
+            model,
+            predecessors,
+            action_costs,
+            open,
+            n_states,
+            standings: vec![Standing::Unknown; n_layers * n_states],
+            wanted: vec![Vec::new(); n_layers],
+            chain: Vec::new(),
+        }
+    }
+
+    /// Gives every survivor a way, unless more than `most` have lost theirs.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
+    pub(super) fn run(mut self, most: usize, interrupt: &mut dyn Interrupt) -> Result<Repaired, Cancelled> {
+        let newest = self.wanted.len() - 1;
+        let reached = std::mem::take(&mut self.window.reached);
+        for state in reached.iter().copied() {
+            if self.window.layers[newest].costs[state as usize].is_finite() && !self.is_sound((newest, state)) {
+                self.want((newest, state));
+            }
+        }
+        self.window.reached = reached;
+        if self.wanted[newest].len() > most {
+            return Ok(Repaired::TooMany);
+        }
+        for index in (0..=newest).rev() {
+            if interrupt.poll() == Signal::Cancel {
+                return Err(Cancelled);
+            }
+            self.look_back(index);
+        }
+        for index in 0..=newest {
+            if interrupt.poll() == Signal::Cancel {
+                return Err(Cancelled);
+            }
+            self.find(index);
+        }
+        self.window.recount();
+        self.window.shrink();
+        Ok(Repaired::All)
+    }
+
+    fn at(&self, (index, state): Place) -> usize {
+        index * self.n_states + state as usize
+    }
+
+    /// Wants a new way to a lost node.
+    fn want(&mut self, place: Place) {
+        let at = self.at(place);
+        self.standings[at] = Standing::Wanted;
+        self.wanted[place.0].push(place.1);
+    }
+
+    fn cost(&self, (index, state): Place) -> f64 {
+        self.window.layers[index].costs[state as usize]
+    }
+
+    fn distance(&self, (index, state): Place) -> f64 {
+        self.window.layers[index].observed.distance(self.model.states(), state)
+    }
+
+    /// Whether a node's way leads from the root and costs what it says. Every node of the way is noted as what it is.
+    fn is_sound(&mut self, mut place: Place) -> bool {
+        let root = (0, self.window.root);
+        let mut is_sound = loop {
+            let at = self.at(place);
+            match self.standings[at] {
+                Standing::Sound => break true,
+                Standing::Lost | Standing::Wanted => break false,
+                Standing::Unknown if place == root => {
+                    self.standings[at] = Standing::Sound;
+                    break true;
+                }
+                // Until it has turned out otherwise.
+                Standing::Unknown => self.standings[at] = Standing::Lost,
+            }
+            self.chain.push(place);
+            match self.window.source(place) {
+                Some(source) => place = source,
+                None => break false,
+            }
+        };
+        while let Some(place) = self.chain.pop() {
+            is_sound = is_sound && self.is_consistent(place);
+            if is_sound {
+                let at = self.at(place);
+                self.standings[at] = Standing::Sound;
+            }
+        }
+        is_sound
+    }
+
+    /// Whether a node still costs what its source's cost makes of it, as those that survivors hang on do.
+    fn is_consistent(&self, place: Place) -> bool {
+        let (index, state) = place;
+        let node = self.window.layers[index].node(state);
+        if node.is_alive() {
+            return true;
+        }
+        let Some(source) = self.window.source(place) else { return false };
+        let is_skip = source.0 != index && source.1 == state;
+        let action_cost = if is_skip {
+            0.0
+        } else {
+            action(self.model, source.1, state).map_or(f64::INFINITY, |action| self.action_costs[usize::from(action)])
+        };
+        #[expect(clippy::float_cmp, reason = "the same sum gives the same float")]
+        let is_same = self.cost(source) + action_cost + self.distance(place) == self.cost(place);
+        is_same
+    }
+
+    /// Calls with each node that a step leads from to `place`, and what the step's action costs.
+    fn each_origin(&mut self, (index, state): Place, mut look: impl FnMut(&mut Self, Place, f64)) {
+        if index > 0 {
+            look(self, (index - 1, state), 0.0);
+        }
+        let predecessors = self.predecessors;
+        for (from, action) in predecessors.of(state) {
+            let action_cost = self.action_costs[usize::from(*action)];
+            if index > 0 {
+                look(self, (index - 1, *from), action_cost);
+            }
+            look(self, (index, *from), action_cost);
+        }
+    }
+
+    /// Wants every node that a new way of a wanted node of this layer may lead over.
+    fn look_back(&mut self, index: usize) {
+        let mut next = 0;
+        while let Some(state) = self.wanted[index].get(next).copied() {
+            next += 1;
+            let place = (index, state);
+            let distance = self.distance(place);
+            let mut bound = f64::INFINITY;
+            self.each_origin(place, |this, origin, action_cost| {
+                let cost = this.cost(origin) + action_cost + distance;
+                if cost < bound && this.is_sound(origin) {
+                    bound = cost;
+                }
+            });
+            self.each_origin(place, |this, origin, action_cost| {
+                let cost = this.cost(origin) + action_cost + distance;
+                if cost < bound && !this.is_sound(origin) && this.standings[this.at(origin)] != Standing::Wanted {
+                    this.want(origin);
+                }
+            });
+        }
+    }
+
+    /// Gives the wanted nodes of this layer their new ways; those of earlier layers have theirs.
+    fn find(&mut self, index: usize) {
+        let wanted = std::mem::take(&mut self.wanted[index]);
+        for state in wanted.iter().copied() {
+            let distance = self.distance((index, state));
+            let mut best = (f64::INFINITY, Source::NONE);
+            self.each_origin((index, state), |this, origin, action_cost| {
+                let cost = this.cost(origin) + action_cost + distance;
+                if cost < best.0 && this.is_sound(origin) {
+                    let source = if origin.0 == index { Source::within(origin.1) } else { Source::before(origin.1) };
+                    best = (cost, source);
+                }
+            });
+            self.set((index, state), best);
+        }
+        while let Some((cost, state)) = self.open.pop() {
+            if cost > self.cost((index, state)) {
+                continue;
+            }
+            for transition in self.model.graph().successors(state) {
+                let to = (index, transition.to);
+                if self.standings[self.at(to)] != Standing::Wanted {
+                    continue;
+                }
+                let cost = cost + self.action_costs[usize::from(transition.action)] + self.distance(to);
+                if cost < self.cost(to) {
+                    self.set(to, (cost, Source::within(state)));
+                }
+            }
+        }
+        for state in wanted.iter().copied() {
+            let at = self.at((index, state));
+            let is_found = self.cost((index, state)).is_finite();
+            self.standings[at] = if is_found { Standing::Sound } else { Standing::Lost };
+        }
+        self.wanted[index] = wanted;
+    }
+
+    /// Gives a wanted node a way.
+    fn set(&mut self, (index, state): Place, (cost, source): (f64, Source)) {
+        let layer = &mut self.window.layers[index];
+        layer.costs[state as usize] = cost;
+        layer.set_source(state, source);
+        if cost.is_finite() {
+            self.open.push(cost, state);
+        }
+    }
+}

@@ -1,0 +1,217 @@
+//! The ways to the survivors: layers from the root's to the newest, of which only what survivors hang on is alive.
+
+use std::collections::VecDeque;
+
+use super::layer::{Layer, Source, Spare};
+use crate::mapping::distances::ObservedDistances;
+use crate::mapping::{Move, MoveKind};
+use crate::model::{ActionIdx, Model, StateIdx};
+
+/// A node's place: the index of its layer in the window, and its state.
+pub(super) type Place = (usize, StateIdx);
+
+/// Layers from the root's to the newest.
+#[derive(Debug)]
+pub(super) struct Window {
+    pub(super) layers: VecDeque<Layer>,
+    /// The observation of the first layer.
+    pub(super) first: u32,
+    /// The last committed node's state; it is in the first layer.
+    pub(super) root: StateIdx,
+    /// The states that a way may lead to, ascending; they only ever become fewer.
+    pub(super) reached: Vec<StateIdx>,
+    /// Whether older layers keep the costs of their nodes, and the nodes that no survivor hangs on.
+    keeps: bool,
+    spare: Vec<Spare>,
+}
+
+impl Window {
+    pub(super) fn new(n_states: StateIdx, keeps: bool) -> Self {
+        let reached = (0..n_states).collect();
+        Self { layers: VecDeque::new(), first: 0, root: 0, reached, keeps, spare: Vec::new() }
+    }
+
+    /// How many nodes survivors hang on.
+    pub(super) fn n_alive(&self) -> usize {
+        self.layers.iter().map(Layer::n_alive).sum()
+    }
+
+    pub(super) fn keeps(&self) -> bool {
+        self.keeps
+    }
+
+    /// Arrays to be filled.
+    pub(super) fn spare(&mut self) -> Spare {
+        self.spare.pop().unwrap_or_default()
+    }
+
+    /// Drops all layers, and gives the distances to their observations.
+    pub(super) fn clear(&mut self) -> Vec<ObservedDistances> {
+        let layers = std::mem::take(&mut self.layers);
+        let observed = layers.into_iter().map(|layer| {
+            let (spare, observed) = layer.into_spare();
+            self.recycle(spare);
+            observed
+        });
+        observed.collect()
+    }
+
+    fn recycle(&mut self, spare: Spare) {
+        /// A layer comes, another goes; more are used where all are swept anew.
+        const MAX_SPARE: usize = 2;
+        if self.keeps || self.spare.len() < MAX_SPARE {
+            self.spare.push(spare);
+        }
+    }
+
+    /// The source of a node; `None` of the root.
+    pub(super) fn source(&self, place: Place) -> Option<Place> {
+        let (index, state) = place;
+        let source = self.layers[index].node(state).source;
+        if source == Source::NONE {
+            None
+        } else if source.is_within() {
+            Some((index, source.state()))
+        } else {
+            Some((index.checked_sub(1)?, source.state()))
+        }
+    }
+
+    /// Adds a layer, whose nodes hang on those of the layer before or on each other.
+    pub(super) fn push(&mut self, layer: Layer) {
+        self.layers.push_back(layer);
+        let newest = self.layers.len() - 1;
+        let reached = std::mem::take(&mut self.reached);
+        for state in reached.iter().copied() {
+            self.attach((newest, state));
+        }
+        if newest > 0 {
+            for state in reached.iter().copied() {
+                if self.layers[newest - 1].node(state).n_children == 0 {
+                    self.cut((newest - 1, state), newest - 1);
+                }
+            }
+            if !self.keeps {
+                let spare = self.layers[newest - 1].forget();
+                self.recycle(spare);
+            }
+        }
+        self.reached = reached;
+    }
+
+    /// States that no way leads to any more are out of reach for good.
+    pub(super) fn shrink(&mut self) {
+        if let Some(newest) = self.layers.back() {
+            self.reached.retain(|state| newest.costs[*state as usize].is_finite());
+        }
+    }
+
+    /// Counts a node as a child of its source, and so on up if that brings the source to life.
+    fn attach(&mut self, mut place: Place) {
+        while let Some((index, state)) = self.source(place) {
+            if !self.layers[index].add_child(state) {
+                return;
+            }
+            place = (index, state);
+        }
+    }
+
+    /// Lets a childless node die, and so on up, but not the root. The layer at `held` is not thinned.
+    fn cut(&mut self, mut place: Place, held: usize) {
+        while place != (0, self.root) {
+            let source = self.source(place);
+            let (index, state) = place;
+            self.layers[index].kill(state);
+            if !self.keeps && index != held {
+                // It is left to the allocator: there is one for the next layer already.
+                drop(self.layers[index].thin());
+            }
+            let Some(source) = source else { return };
+            if self.layers[source.0].remove_child(source.1) > 0 {
+                return;
+            }
+            place = source;
+        }
+    }
+
+    /// Finds anew what is alive.
+    pub(super) fn recount(&mut self) {
+        let newest = self.layers.len() - 1;
+        for layer in self.layers.range_mut(..newest) {
+            layer.kill_all();
+        }
+        let reached = std::mem::take(&mut self.reached);
+        self.layers[newest].revive_all(&reached);
+        for state in reached.iter().copied() {
+            if self.layers[newest].node(state).is_alive() {
+                self.attach((newest, state));
+            }
+        }
+        self.reached = reached;
+    }
+
+    /// The only child of the root, if it has just one and is not in the newest layer.
+    pub(super) fn only_child(&self, model: &Model) -> Option<Place> {
+        let root = self.root;
+        if self.layers.len() == 1 || self.layers[0].node(root).n_children != 1 {
+            return None;
+        }
+        let is_child = |(index, state): Place| {
+            self.layers[index].node(state).is_alive() && self.source((index, state)) == Some((0, root))
+        };
+        let successors = model.graph().successors(root).iter().map(|transition| transition.to);
+        std::iter::once((1, root)).chain(successors.flat_map(|state| [(1, state), (0, state)])).find(|at| is_child(*at))
+    }
+
+    /// Makes a node the root. Layers before its own go.
+    pub(super) fn advance(&mut self, (index, state): Place) {
+        if index == 0 {
+            self.layers[0].kill(self.root);
+        }
+        for _ in 0..index {
+            if let Some(layer) = self.layers.pop_front() {
+                let (spare, _) = layer.into_spare();
+                self.recycle(spare);
+                self.first += 1;
+            }
+        }
+        self.root = state;
+        self.layers[0].set_source(state, Source::NONE);
+    }
+
+    /// The places of the way from the root, without it, to the state `survivor` of the newest layer.
+    pub(super) fn path(&self, survivor: StateIdx) -> Vec<Place> {
+        let mut path = Vec::new();
+        let mut place = (self.layers.len() - 1, survivor);
+        while place != (0, self.root) {
+            path.push(place);
+            let Some(source) = self.source(place) else { break };
+            place = source;
+        }
+        path.reverse();
+        path
+    }
+
+    /// The step that leads to a node.
+    pub(super) fn step(&self, model: &Model, place: Place) -> Move {
+        let (index, state) = place;
+        let source = self.layers[index].node(state).source;
+        let (kind, action) = if source.is_within() {
+            (MoveKind::Extra, action(model, source.state(), state))
+        } else if source.state() == state {
+            (MoveKind::Skip, None)
+        } else {
+            (MoveKind::Match, action(model, source.state(), state))
+        };
+        #[expect(clippy::cast_possible_truncation, reason = "observations are counted in u32")]
+        let observation = self.first + index as u32;
+        Move { kind, action, observation, state }
+    }
+}
+
+/// The cheapest action from one state to another, the first among equals.
+pub(super) fn action(model: &Model, from: StateIdx, to: StateIdx) -> Option<ActionIdx> {
+    let actions = model.graph().successors(from).iter().filter(|transition| transition.to == to);
+    let cost = |action: ActionIdx| model.action(action).cost;
+    actions.map(|transition| transition.action).min_by(|action, other| cost(*action).total_cmp(&cost(*other)))
+}
