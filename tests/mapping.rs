@@ -15,18 +15,23 @@ use std::collections::HashMap;
 use etude::attribute::Scalar;
 use etude::document::{Faults, Place};
 use etude::interrupt::{Cancelled, Signal, Uninterrupted};
-use etude::mapping::{Mapper, Mapping, MoveKind, Policy, Request, Stamp, Status};
+use etude::mapping::{Grouping, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status};
 use etude::model::Act;
 use problems::{close, example, mapper, problem};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
 fn solve(mapper: &Mapper, request: &Value) -> Policy {
+    solve_grouped(mapper, request, Grouping::default())
+}
+
+fn solve_grouped(mapper: &Mapper, request: &Value, grouping: Grouping) -> Policy {
     let mut faults = Faults::default();
     let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
     let read = Request::read(mapper.model(), &object, &mut faults);
     let request = faults.check(read).unwrap();
-    let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();
+    let settings = Settings { grouping, ..request.settings };
+    let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
     Policy::new(Stamp::default(), &request.problem, &mapping)
 }
 
@@ -97,12 +102,13 @@ proptest! {
     fn costs_equal_the_independent_solvers((model, demonstration, weights, start) in problem()) {
         let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
         let mapper = mapper(&model);
-        for heuristic in ["default", "none"] {
+        let searches = [("default", Grouping::WhenItPays), ("default", Grouping::Widest), ("none", Grouping::WhenItPays)];
+        for (heuristic, grouping) in searches {
             let request = json!({
                 "model": "m", "demonstration": demonstration, "weights": weights, "start": start, "heuristic": heuristic,
             });
-            let policy = solve(&mapper, &request);
-            prop_assert!(close(policy.cost.total, optimum), "{heuristic}: {} against {optimum}", policy.cost.total);
+            let policy = solve_grouped(&mapper, &request, grouping);
+            prop_assert!(close(policy.cost.total, optimum), "{heuristic}, {grouping:?}: {} against {optimum}", policy.cost.total);
             prop_assert_eq!(policy.status, Status::Optimal);
             check_policy(&model, &demonstration, &weights, &policy);
         }
@@ -113,6 +119,7 @@ proptest! {
         (model, demonstration, weights, start) in problem(),
         max_expansions in 0u64..12,
         heuristic in prop_oneof![Just("default"), Just("none"), Just("paper")],
+        grouping in prop_oneof![Just(Grouping::WhenItPays), Just(Grouping::Widest)],
     ) {
         let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
         let mapper = mapper(&model);
@@ -120,7 +127,7 @@ proptest! {
             "model": "m", "demonstration": demonstration, "weights": weights, "start": start,
             "heuristic": heuristic, "max_expansions": max_expansions,
         });
-        let policy = solve(&mapper, &request);
+        let policy = solve_grouped(&mapper, &request, grouping);
         check_policy(&model, &demonstration, &weights, &policy);
         let bound = policy.lower_bound.unwrap();
         prop_assert!(bound <= optimum + 1e-9 * (1.0 + optimum), "bound {bound} above the optimum {optimum}");
@@ -184,9 +191,13 @@ proptest! {
         }
         let demonstration = Value::from(demonstration);
         let optimum = oracle::optimal_cost(&table, &demonstration, &json!({}), None);
-        let policy = solve(&cave_mapper, &json!({"model": "m", "demonstration": demonstration}));
-        prop_assert!(close(policy.cost.total, optimum), "{} against {optimum}", policy.cost.total);
-        check_policy(&table, &demonstration, &json!({}), &policy);
+        for grouping in [Grouping::WhenItPays, Grouping::Widest] {
+            let request = json!({"model": "m", "demonstration": demonstration});
+            let policy = solve_grouped(&cave_mapper, &request, grouping);
+            prop_assert!(close(policy.cost.total, optimum), "{grouping:?}: {} against {optimum}", policy.cost.total);
+            prop_assert_eq!(policy.status, Status::Optimal);
+            check_policy(&table, &demonstration, &json!({}), &policy);
+        }
     }
 }
 
@@ -226,6 +237,47 @@ fn figure_4_goes_around_the_wumpus_and_takes_the_gold() {
         policy.steps.iter().filter(is_at).count()
     };
     assert_eq!((at(3, 0), at(3, 1) > 0, at(5, 0) > 0), (0, true, true));
+}
+
+#[test]
+fn projecting_attributes_together_takes_fewer_expansions() {
+    let mapper = mapper(&example("figure-4/model.json"));
+    let request = json!({"model": "m", "demonstration": example("figure-4/demonstration.json")});
+    let [singly, together] = [Grouping::WhenItPays, Grouping::Widest].map(|g| solve_grouped(&mapper, &request, g));
+    assert_eq!(singly.cost, together.cost);
+    let [singly, together] = [singly, together].map(|policy| policy.search.expanded);
+    assert!(together * 3 < singly, "{together} against {singly} expansions");
+}
+
+#[test]
+fn a_search_is_cut_short_while_it_projects_attributes_together() {
+    let request = long_request(2_000, &json!({}));
+    let mapper = mapper(&example("figure-4/model.json"));
+    let mut faults = Faults::default();
+    let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+    let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
+    let settings = Settings { grouping: Grouping::Widest, ..request.settings };
+    let map_until = |n: u32, signal: Signal| {
+        let mut n_polls = 0;
+        let mut interrupt = || {
+            n_polls += 1;
+            if n_polls >= n { signal } else { Signal::Continue }
+        };
+        let mapping = mapper.map(&request.problem, settings, &mut interrupt);
+        (n_polls, mapping)
+    };
+    let (n_polls, optimal) = map_until(u32::MAX, Signal::Continue);
+    let optimal = optimal.unwrap();
+    assert_eq!(optimal.status, Status::Optimal);
+    for n in (1..n_polls).step_by((n_polls as usize / 40).max(1)) {
+        let (_, mapping) = map_until(n, Signal::Finish);
+        let mapping = mapping.unwrap();
+        assert!(mapping.lower_bound.unwrap() <= optimal.cost.total * (1.0 + 1e-9));
+        assert!(optimal.cost.total <= mapping.cost.total * (1.0 + 1e-9));
+        assert_eq!(mapping.moves.last().unwrap().observation, 1_999);
+        let (n_cancelled, mapping) = map_until(n, Signal::Cancel);
+        assert_eq!((n_cancelled, mapping.err()), (n, Some(Cancelled)));
+    }
 }
 
 #[test]

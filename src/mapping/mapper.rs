@@ -11,7 +11,7 @@ use super::cost::{Cost, cost_of};
 use super::heuristic::paper::Paper;
 use super::heuristic::projected::Projected;
 use super::heuristic::projection::Projections;
-use super::heuristic::{Blind, Heuristic, HeuristicName};
+use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
 use super::search::best_first::{self, Buffers};
 use super::search::{Found, Move, astar};
 use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
@@ -47,6 +47,8 @@ pub struct Settings {
     /// The cost of a mapping that is known already: nothing that costs more is looked at. Has no effect with the paper's
     /// heuristic.
     pub upper_bound: Option<f64>,
+    /// When the default heuristic projects attributes together.
+    pub grouping: Grouping,
 }
 
 /// What was proven of a mapping.
@@ -157,12 +159,13 @@ impl Mapper {
         let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
         match settings.heuristic {
             HeuristicName::Default => {
-                if let Some(projected) = Projected::solve(&self.projections, problem, interrupt)? {
-                    return self.best_first(problem, &projected, budget, most_f, interrupt);
+                let projected = Projected::solve(&self.projections, problem, settings.grouping, interrupt)?;
+                if let Some(mut projected) = projected {
+                    return self.best_first(problem, &mut projected, budget, most_f, interrupt);
                 }
                 // No time for the estimate, so none for a search either.
                 let budget = Budget { max_expansions: 0, ..budget };
-                self.best_first(problem, &Projected::blind(problem), budget, most_f, interrupt)
+                self.best_first(problem, &mut Projected::blind(problem), budget, most_f, interrupt)
             }
             HeuristicName::None => {
                 let found = astar::search(problem, &Blind, budget, most_f, interrupt)?;
@@ -172,7 +175,7 @@ impl Mapper {
                 let found = astar::search(problem, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, problem.start);
-                match Projected::solve(&self.projections, problem, interrupt)? {
+                match Projected::solve(&self.projections, problem, settings.grouping, interrupt)? {
                     Some(projected) => {
                         let least_f = first + projected.cost_to_go(0, problem.start);
                         conclude(problem, &projected, Found { least_f, ..found }, interrupt)
@@ -190,7 +193,7 @@ impl Mapper {
     fn best_first(
         &self,
         problem: &Problem<'_>,
-        projected: &Projected<'_>,
+        projected: &mut Projected<'_>,
         budget: Budget,
         most_f: f64,
         interrupt: &mut dyn Interrupt,

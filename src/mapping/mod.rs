@@ -44,7 +44,7 @@ mod search;
 
 pub use cost::Cost;
 pub use demonstration::Demonstration;
-pub use heuristic::HeuristicName;
+pub use heuristic::{Grouping, HeuristicName};
 pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
 pub use online::{CommittedStep, OnlineMapping};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step};

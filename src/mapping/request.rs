@@ -8,7 +8,9 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Budget, Demonstration, HeuristicName, Mapper, Mapping, OnlineMapping, Policy, Problem, Settings};
+use super::{
+    Budget, Demonstration, Grouping, HeuristicName, Mapper, Mapping, OnlineMapping, Policy, Problem, Settings,
+};
 use crate::attribute::{Scalar, Weights};
 use crate::document::{Faults, Object, Place};
 use crate::interrupt::{Cancelled, Interrupt};
@@ -127,7 +129,7 @@ impl<'m> Request<'m> {
             None => Some(None),
         };
         let budget = Budget { max_expansions: max_expansions?, ..Budget::DEFAULT };
-        let settings = Settings { heuristic: heuristic?, budget, upper_bound: None };
+        let settings = Settings { heuristic: heuristic?, budget, upper_bound: None, grouping: Grouping::default() };
         Some(Options { settings, lookahead: lookahead?, deadline: deadline? })
     }
 }

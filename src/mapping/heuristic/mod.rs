@@ -6,6 +6,8 @@
 //! | `none` | yes | yes | nothing: A* becomes Dijkstra's algorithm |
 //! | `paper` | no | no | differences and least action cost ([`paper`]) |
 
+mod bounded;
+mod grouping;
 pub(super) mod paper;
 pub(super) mod projected;
 pub(super) mod projection;
@@ -20,7 +22,8 @@ use crate::model::StateIdx;
 /// *Admissible*: never above the least cost of a completion; a search with it finds the optimum. *Consistent*: along no
 /// move does it fall by more than the move's cost; a search with it expands no node twice.
 pub(super) trait Heuristic {
-    /// Estimated cost from `(observation, state)` to the end. Finite, at least 0; 0 at the last observation.
+    /// Estimated cost from `(observation, state)` to the end. At least 0; infinite only for nodes that cannot be on a
+    /// mapping cheaper than one that is known, else 0 at the last observation.
     fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64;
 
     /// How much work an estimate for a node at `observation` is, in looks at a distance. At least 1.
@@ -38,6 +41,16 @@ impl Heuristic for Blind {
     fn cost_to_go(&self, _: usize, _: StateIdx) -> f64 {
         0.0
     }
+}
+
+/// When attributes are projected together, which makes estimates better and takes longer.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Grouping {
+    /// When a search takes so long that better estimates shorten it.
+    #[default]
+    WhenItPays,
+    /// At once, the largest groups: the fewest expansions, whatever the estimates cost.
+    Widest,
 }
 
 /// Which estimate guides a search.

@@ -5,18 +5,31 @@
 //! cost, if no cost is counted twice:
 //!
 //! - distances are sums over attributes, so each group pays the terms of its own;
-//! - the cost of an action is split evenly among the groups that the transition changes. A group that it does not
-//!   change moves for nothing, which is the projected `skip`.
+//! - the cost of an action is split evenly among the attributes that the transition changes, of those that take part, and a group
+//!   pays for its attributes. A group that it does not change moves for nothing, which is the projected `skip`. Where
+//!   none of the attributes that change takes part, the first group that changes pays all;
+//! - an extra action pays the distance once more, in all attributes: also in those that it does not change, which a projection
+//!   on the others does not see. So let `least_k(i)` be the least term of the attribute k at observation i, of any value that
+//!   it may have; it is above 0 where the body can never have what was seen. The sum of these over all attributes is paid
+//!   by every extra action at i, and is split as the cost of the action is (`share_i`, of both); a group that changes pays, besides,
+//!   what its terms are above their least (`rest`).
 //!
-//! Every move of the real problem is then, in each group, a projected move, and the projected costs add up to at most
+//! Every move of the real problem is then, in each group, a projected move or none, and the projected costs add up to at most
 //! the real one. Hence the sum of the exact projected costs-to-go is admissible, and, as it satisfies the triangle inequality of
 //! each projection, consistent (Holte, Felner, Newton, Meshulam & Furcy 2006, on additive pattern databases; Katz & Domshlak 2010,
-//! on cost partitioning).
+//! on cost partitioning). The coarser the partition into groups the higher the estimate, as a group pays at least what its
+//! attributes pay alone.
+//!
+//! Each attribute alone is projected for every problem. The groups of several that [`grouping`] chooses have many classes, and their
+//! tables are made for searches that take long ([`super::bounded`]).
+
+use std::sync::OnceLock;
 
 use rustc_hash::{FxHashMap, FxHashSet};
 
+use super::grouping::{self, Partition};
 use super::projected::Estimate;
-use crate::interrupt::{Cancelled, Interrupt, Meter};
+use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
 use crate::model::{ActionIdx, Model};
 
@@ -26,6 +39,16 @@ pub(crate) struct Projections {
     groups: Vec<Group>,
     /// Distinct sets of groups that some transition changes.
     change_sets: Vec<Vec<u16>>,
+    /// Partitions into larger and larger groups, chosen when a search is long enough.
+    levels: OnceLock<Vec<Level>>,
+}
+
+/// A partition of the attributes into groups.
+#[derive(Debug)]
+struct Level {
+    partition: Partition,
+    /// Its groups of several attributes, built when a search is long enough.
+    groups: OnceLock<Vec<Group>>,
 }
 
 /// A model, projected on some of its attributes.
@@ -37,7 +60,9 @@ pub(super) struct Group {
     /// The attributes, ascending.
     digits: Vec<Digit>,
     n_classes: usize,
-    /// Distinct ways to change the class.
+    /// `offsets[v]..offsets[v + 1]` are the edges into `v`. Shape `[n_classes + 1]`.
+    offsets: Vec<u32>,
+    /// Distinct ways to change the class, by where they lead.
     edges: Vec<ProjectedEdge>,
     /// Whether its edges fit.
     is_kept: bool,
@@ -50,6 +75,8 @@ struct Digit {
     position: usize,
     /// What the attribute's domain index is multiplied with.
     stride: usize,
+    /// How many values the attribute has.
+    n_values: usize,
 }
 
 /// A class of a group.
@@ -58,10 +85,10 @@ pub(super) type ClassIdx = u32;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub(super) struct ProjectedEdge {
     pub(super) from: ClassIdx,
-    pub(super) to: ClassIdx,
+    /// Which single attributes change with it: an index into the change sets, doubled; plus 1 if the group is the first of its
+    /// partition's that change.
+    pub(super) kind: u32,
     pub(super) action: ActionIdx,
-    /// Which groups change together with this one: an index into the change sets.
-    pub(super) change_set: u32,
 }
 
 /// Most edges of all groups together, and most entries of all change sets: 256 and 32 MB. Groups whose edges do not fit are
@@ -89,7 +116,8 @@ impl Projections {
 
         let mut change_sets = ChangeSets::default();
         // `None` for a group that is left out.
-        let mut edges: Vec<Option<FxHashSet<ProjectedEdge>>> = vec![Some(FxHashSet::default()); groups.len()];
+        let mut edges: Vec<Option<FxHashSet<(ClassIdx, ProjectedEdge)>>> =
+            vec![Some(FxHashSet::default()); groups.len()];
         let mut n_edges = 0;
         let mut changed = Vec::new();
         for (from, transition) in model.graph().iter() {
@@ -104,8 +132,8 @@ impl Projections {
                 let group = &groups[usize::from(*number)];
                 #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
                 let [from, to] = [row, row_after].map(|row| group.class_of(row) as ClassIdx);
-                let edge = ProjectedEdge { from, to, action: transition.action, change_set };
-                let is_new = edges[usize::from(*number)].as_mut().is_some_and(|edges| edges.insert(edge));
+                let edge = ProjectedEdge { from, kind: change_set * 2, action: transition.action };
+                let is_new = edges[usize::from(*number)].as_mut().is_some_and(|edges| edges.insert((to, edge)));
                 n_edges += usize::from(is_new);
             }
             if n_edges > max_edges || change_sets.n_entries > max_edges {
@@ -116,15 +144,105 @@ impl Projections {
         }
         for (group, edges) in groups.iter_mut().zip(edges) {
             group.is_kept = edges.is_some();
-            group.edges = edges.into_iter().flatten().collect();
-            // The order of a hash set must not reach the results.
-            group.edges.sort_unstable();
+            let edges: Vec<(ClassIdx, ProjectedEdge)> = edges.into_iter().flatten().collect();
+            group.set_edges(&edges, &mut meter)?;
         }
-        Ok(Self { groups, change_sets: change_sets.sets })
+        Ok(Self { groups, change_sets: change_sets.sets, levels: OnceLock::new() })
     }
 
+    /// The groups of a single attribute.
     pub(super) fn groups(&self) -> &[Group] {
         &self.groups
+    }
+
+    /// The groups of several attributes at a level, from 0; they are the larger the higher the level. `None` if there is
+    /// no such level. They are made when they are first asked for, in time proportional to the transitions.
+    ///
+    /// # Errors
+    ///
+    /// What `interrupt` said, if that was not to continue.
+    pub(super) fn level(
+        &self,
+        model: &Model,
+        level: usize,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<&[Group]>, Signal> {
+        let mut interrupt = Stopper { interrupt, signal: Signal::Continue };
+        let built = self.level_or_cancelled(model, level, &mut interrupt);
+        built.map_err(|Cancelled| interrupt.signal)
+    }
+
+    fn level_or_cancelled(
+        &self,
+        model: &Model,
+        level: usize,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<&[Group]>, Cancelled> {
+        // Two searches that come at the same time may both do the work, with the same result.
+        let levels = match self.levels.get() {
+            Some(levels) => levels,
+            None => {
+                let partitions = grouping::choose(model, interrupt)?;
+                let levels = partitions.into_iter().map(|partition| Level { partition, groups: OnceLock::new() });
+                let levels = levels.collect();
+                self.levels.get_or_init(|| levels)
+            }
+        };
+        let Some(level) = levels.get(level) else { return Ok(None) };
+        match level.groups.get() {
+            Some(groups) => Ok(Some(groups)),
+            None => {
+                let groups = self.joint_groups(model, &level.partition, MAX_EDGES, interrupt)?;
+                Ok(Some(level.groups.get_or_init(|| groups)))
+            }
+        }
+    }
+
+    /// Projects `model` on the groups of `partition` that have several attributes.
+    fn joint_groups(
+        &self,
+        model: &Model,
+        partition: &Partition,
+        max_edges: usize,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Vec<Group>, Cancelled> {
+        /// How many classes are looked up between two looks at the interrupt: about a millisecond.
+        const POLL_EVERY: u64 = 1 << 14;
+        let mut meter = Meter::new(interrupt, POLL_EVERY);
+        let mut numbers: FxHashMap<&[u16], u32> = FxHashMap::default();
+        numbers.extend(self.change_sets.iter().map(Vec::as_slice).zip(0..));
+        let states = model.states();
+        let joint = partition.iter().filter(|positions| positions.len() > 1);
+        let mut groups: Vec<Group> = joint.map(|positions| Group::new(model, positions)).collect();
+        let mut edges: Vec<Vec<(ClassIdx, ProjectedEdge)>> = vec![Vec::new(); groups.len()];
+        let mut changed = Vec::new();
+        for (from, transition) in model.graph().iter() {
+            meter.spend_or_cancel((self.groups.len() + groups.len()) as u64)?;
+            let (row, row_after) = (states.row(from), states.row(transition.to));
+            let is_changed = |group: &Group| group.positions().any(|at| row[at] != row_after[at]);
+            changed.clear();
+            let singles = self.groups.iter().zip(0u16..).filter(|(group, _)| group.is_kept && is_changed(group));
+            changed.extend(singles.map(|(_, number)| number));
+            // Every transition's set is there, as all were looked at when the projections were made.
+            let Some(change_set) = numbers.get(changed.as_slice()) else { continue };
+            let mut is_first = 1;
+            for (group, edges) in groups.iter().zip(&mut edges).filter(|(group, _)| is_changed(group)) {
+                let kind = change_set * 2 + is_first;
+                is_first = 0;
+                if edges.len() <= max_edges {
+                    #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+                    let [from, to] = [row, row_after].map(|row| group.class_of(row) as ClassIdx);
+                    edges.push((to, ProjectedEdge { from, kind, action: transition.action }));
+                }
+            }
+        }
+        for (group, edges) in groups.iter_mut().zip(edges) {
+            group.is_kept = edges.len() <= max_edges;
+            if group.is_kept {
+                group.set_edges(&edges, &mut meter)?;
+            }
+        }
+        Ok(groups)
     }
 
     /// Distinct sets of groups that some transition changes.
@@ -136,12 +254,27 @@ impl Projections {
     pub(crate) fn size_bytes(&self) -> usize {
         let change_sets: usize =
             self.change_sets.iter().map(|set| size_of_val(set) + size_of_val(set.as_slice())).sum();
-        change_sets + self.groups.iter().map(Group::size_bytes).sum::<usize>()
+        let levels = self.levels.get().into_iter().flatten();
+        let joint = levels.filter_map(|level| level.groups.get()).flatten();
+        change_sets + self.groups.iter().chain(joint).map(Group::size_bytes).sum::<usize>()
+    }
+}
+
+/// Makes every signal but to continue a reason to cancel, and remembers it.
+struct Stopper<'i> {
+    interrupt: &'i mut dyn Interrupt,
+    signal: Signal,
+}
+
+impl Interrupt for Stopper<'_> {
+    fn poll(&mut self) -> Signal {
+        self.signal = self.interrupt.poll();
+        if self.signal == Signal::Continue { Signal::Continue } else { Signal::Cancel }
     }
 }
 
 /// Leaves out half of the groups that are kept, those with the most edges; the later ones among equals.
-fn leave_out_larger_half(edges: &mut [Option<FxHashSet<ProjectedEdge>>]) {
+fn leave_out_larger_half(edges: &mut [Option<FxHashSet<(ClassIdx, ProjectedEdge)>>]) {
     let kept = edges.iter().enumerate().filter_map(|(number, edges)| Some((edges.as_ref()?.len(), number)));
     let mut kept: Vec<_> = kept.collect();
     kept.sort_unstable();
@@ -171,7 +304,7 @@ impl ChangeSets {
     }
 
     /// Removes the groups that have no edges any more, and numbers the sets anew.
-    fn rebuild(&mut self, edges: &mut [Option<FxHashSet<ProjectedEdge>>]) {
+    fn rebuild(&mut self, edges: &mut [Option<FxHashSet<(ClassIdx, ProjectedEdge)>>]) {
         let old = std::mem::take(self);
         let numbers: Vec<u32> = old
             .sets
@@ -182,10 +315,22 @@ impl ChangeSets {
             })
             .collect();
         for edges in edges.iter_mut().flatten() {
-            let renumbered =
-                |edge: ProjectedEdge| ProjectedEdge { change_set: numbers[edge.change_set as usize], ..edge };
+            let renumbered = |(to, edge): (ClassIdx, ProjectedEdge)| {
+                (to, ProjectedEdge { kind: numbers[edge.kind as usize / 2] * 2, ..edge })
+            };
             *edges = std::mem::take(edges).into_iter().map(renumbered).collect();
         }
+    }
+}
+
+#[cfg(test)]
+impl Projections {
+    /// As if these partitions had been chosen.
+    pub(super) fn with_levels(model: &Model, partitions: impl IntoIterator<Item = Partition>) -> Self {
+        let projections = Self::new(model, &mut crate::interrupt::Uninterrupted).unwrap();
+        let levels = partitions.into_iter().map(|partition| Level { partition, groups: OnceLock::new() });
+        projections.levels.set(levels.collect()).unwrap();
+        projections
     }
 }
 
@@ -193,11 +338,48 @@ impl Group {
     fn new(model: &Model, positions: &[usize]) -> Self {
         let mut n_classes = 1;
         let digits = positions.iter().map(|position| {
-            let digit = Digit { position: *position, stride: n_classes };
-            n_classes *= model.states().domain(*position).len();
+            let n_values = model.states().domain(*position).len();
+            let digit = Digit { position: *position, stride: n_classes, n_values };
+            n_classes *= n_values;
             digit
         });
-        Self { digits: digits.collect(), n_classes, edges: Vec::new(), is_kept: true }
+        Self { digits: digits.collect(), n_classes, offsets: Vec::new(), edges: Vec::new(), is_kept: true }
+    }
+
+    /// Takes the edges, each with the class that it leads to, and sorts them.
+    fn set_edges(&mut self, edges: &[(ClassIdx, ProjectedEdge)], meter: &mut Meter<'_>) -> Result<(), Cancelled> {
+        let mut starts = vec![0u32; self.n_classes + 1];
+        for (to, _) in edges {
+            starts[*to as usize + 1] += 1;
+        }
+        for class in 0..self.n_classes {
+            starts[class + 1] += starts[class];
+        }
+        let mut free = starts.clone();
+        let mut sorted = vec![ProjectedEdge { from: 0, kind: 0, action: 0 }; edges.len()];
+        for (to, edge) in edges {
+            let place = &mut free[*to as usize];
+            sorted[*place as usize] = *edge;
+            *place += 1;
+        }
+        self.offsets = Vec::with_capacity(self.n_classes + 1);
+        self.offsets.push(0);
+        self.edges = Vec::with_capacity(edges.len());
+        for bounds in starts.windows(2) {
+            let into = &mut sorted[bounds[0] as usize..bounds[1] as usize];
+            meter.spend_or_cancel(1 + into.len() as u64)?;
+            into.sort_unstable();
+            let first = self.edges.len();
+            for edge in into {
+                if self.edges[first..].last() != Some(edge) {
+                    self.edges.push(*edge);
+                }
+            }
+            #[expect(clippy::cast_possible_truncation, reason = "at most `MAX_EDGES`")]
+            self.offsets.push(self.edges.len() as u32);
+        }
+        self.edges.shrink_to_fit();
+        Ok(())
     }
 
     /// The class of a state with these domain indices, shape `[n_attributes]`.
@@ -206,17 +388,26 @@ impl Group {
         self.digits.iter().map(|digit| values[digit.position] as usize * digit.stride).sum()
     }
 
-    /// The position of its attribute, if it has but one.
-    pub(super) fn single(&self) -> Option<usize> {
-        if let [digit] = self.digits.as_slice() { Some(digit.position) } else { None }
-    }
-
     pub(super) fn n_classes(&self) -> usize {
         self.n_classes
     }
 
-    pub(super) fn edges(&self) -> &[ProjectedEdge] {
-        &self.edges
+    /// The edges into a class, by where they come from.
+    #[inline]
+    pub(super) fn edges_into(&self, class: usize) -> &[ProjectedEdge] {
+        match (self.offsets.get(class), self.offsets.get(class + 1)) {
+            (Some(first), Some(end)) => &self.edges[*first as usize..*end as usize],
+            _ => &[],
+        }
+    }
+
+    pub(super) fn n_edges(&self) -> usize {
+        self.edges.len()
+    }
+
+    /// The positions of its attributes, and how many values they have: the digits of a class, the lowest first.
+    pub(super) fn digits(&self) -> impl Iterator<Item = (usize, usize)> {
+        self.digits.iter().map(|digit| (digit.position, digit.n_values))
     }
 
     pub(super) fn is_kept(&self) -> bool {
@@ -234,14 +425,12 @@ impl Group {
 
     /// Writes what its attributes add to the distance of the observation `i`, by class.
     pub(super) fn write_terms(&self, problem: &Problem<'_>, i: usize, row: &mut [Estimate]) {
-        let states = problem.model.states();
         for digit in &self.digits {
             if !problem.distances.is_active(digit.position) {
                 continue;
             }
-            let n_values = states.domain(digit.position).len();
             // Classes with equal digits come in runs, and the runs of all values follow each other again and again.
-            for runs in row.chunks_exact_mut(digit.stride * n_values) {
+            for runs in row.chunks_exact_mut(digit.stride * digit.n_values) {
                 for (run, value) in runs.chunks_exact_mut(digit.stride).zip(0..) {
                     let term = problem.distances.term(digit.position, i, value);
                     for entry in run {
@@ -253,7 +442,7 @@ impl Group {
     }
 
     fn size_bytes(&self) -> usize {
-        size_of_val(self.edges.as_slice())
+        size_of_val(self.edges.as_slice()) + size_of_val(self.offsets.as_slice())
     }
 }
 

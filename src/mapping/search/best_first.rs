@@ -6,6 +6,8 @@
 //!    is the new incumbent. When no node is left whose `f` is below the incumbent's cost, that is the optimum.
 //! 3. Should that take long, wider probes look for better incumbents in between: they keep the memory small, and a search
 //!    that runs out of budget has something to show.
+//! 4. Should it take very long, attributes are projected together ([`Projected::deepen`]). All nodes get their better estimates;
+//!    the ways to them that were found stay as they are.
 //!
 //! So the nodes are expanded whose `f` is below the optimum, as A* must (Dechter & Pearl 1985), and those of the probes; but
 //! none of the many whose `f` equals it. As incumbents bound `f`, the open list needs no heap: costs are
@@ -18,7 +20,7 @@ use super::buckets::Buckets;
 use super::nodes::{Arrival, NO_NODE, Node, NodeId, Nodes};
 use super::{Found, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
-use crate::mapping::heuristic::projected::Projected;
+use crate::mapping::heuristic::projected::{Deepened, Projected};
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::{Budget, Problem};
 use crate::model::Transition;
@@ -54,7 +56,7 @@ impl Buffers {
 /// [`Cancelled`] if `interrupt` said so.
 pub(in crate::mapping) fn search(
     problem: &Problem<'_>,
-    projected: &Projected<'_>,
+    projected: &mut Projected<'_>,
     budget: Budget,
     most: f64,
     buffers: &mut Buffers,
@@ -94,9 +96,9 @@ enum End {
     CutShort,
 }
 
-struct Search<'s> {
+struct Search<'s, 'p> {
     problem: &'s Problem<'s>,
-    projected: &'s Projected<'s>,
+    projected: &'s mut Projected<'p>,
     budget: Budget,
     buffers: &'s mut Buffers,
     /// Mappings of this cost or more are of no interest.
@@ -108,7 +110,7 @@ struct Search<'s> {
     meter: Meter<'s>,
 }
 
-impl Search<'_> {
+impl Search<'_, '_> {
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
     fn probe(&mut self, width: u64) -> Result<End, Cancelled> {
@@ -155,6 +157,11 @@ impl Search<'_> {
     fn expand_best_first(&mut self) -> Result<End, Cancelled> {
         let n_layers = self.problem.last() as u64;
         let mut probe_width = PROBE_WIDENING;
+        while self.is_deepening_due() {
+            if self.deepen()? == End::CutShort {
+                return Ok(End::CutShort);
+            }
+        }
         let mut bucketed_limit = self.fill_buckets();
         while let Some(id) = self.buffers.open.pop() {
             if !self.is_open(&self.buffers.nodes.get(id)) {
@@ -167,6 +174,10 @@ impl Search<'_> {
                 let f = buffers.nodes.get(id).f();
                 buffers.open.push(id, f);
             });
+            let is_deepening_due = self.is_deepening_due();
+            if is_deepening_due && self.deepen()? == End::CutShort {
+                return Ok(End::CutShort);
+            }
             let is_probe_due = self.n_expanded / PROBE_SHARE >= probe_width.saturating_mul(n_layers);
             if is_probe_due {
                 probe_width *= PROBE_WIDENING;
@@ -174,12 +185,36 @@ impl Search<'_> {
                     return Ok(End::CutShort);
                 }
             }
-            // What a probe found is not in the buckets; and those for a much higher limit are too wide.
-            if is_probe_due || self.limit < bucketed_limit / 4.0 {
+            // What a probe found is not in the buckets, and better estimates are for others; and those for a much higher limit
+            // are too wide.
+            if is_deepening_due || is_probe_due || self.limit < bucketed_limit / 4.0 {
                 bucketed_limit = self.fill_buckets();
             }
         }
         Ok(End::Done)
+    }
+
+    /// Whether better estimates are worth a try. They are for what is cheaper than a known mapping; until there is one, a
+    /// completion may need the estimates of all nodes.
+    #[inline]
+    fn is_deepening_due(&self) -> bool {
+        self.n_expanded >= self.projected.deepening_due() && self.incumbent.is_some()
+    }
+
+    /// Has better estimates made, if there are any, and gives them to all nodes.
+    #[cold]
+    fn deepen(&mut self) -> Result<End, Cancelled> {
+        match self.projected.deepen(self.limit, self.n_expanded, &mut self.meter)? {
+            Deepened::CutShort => return Ok(End::CutShort),
+            Deepened::No => return Ok(End::Done),
+            Deepened::Yes => {}
+        }
+        #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
+        for id in 0..self.buffers.nodes.len() as NodeId {
+            let Node { observation, state, .. } = self.buffers.nodes.get(id);
+            self.buffers.nodes.estimate(id, self.projected.at(observation as usize).of(state));
+        }
+        self.probe(1)
     }
 
     /// Puts all open nodes into the buckets, and gives the limit that these are for.
@@ -216,7 +251,7 @@ impl Search<'_> {
     /// way.
     #[inline]
     fn expand(&mut self, id: NodeId, mut found: impl FnMut(&mut Buffers, NodeId)) {
-        let (problem, projected) = (self.problem, self.projected);
+        let (problem, projected) = (self.problem, &*self.projected);
         let actions = problem.model.actions();
         let node = self.buffers.nodes.get(id);
         let (g, observation) = (node.g(), node.observation);

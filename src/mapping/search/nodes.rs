@@ -112,6 +112,11 @@ impl Nodes {
         joined(&self.keys[id as usize], &self.rest[id as usize])
     }
 
+    /// Takes a new estimate of a node.
+    pub(super) fn estimate(&mut self, id: NodeId, estimate: Estimate) {
+        self.rest[id as usize].estimate = estimate;
+    }
+
     #[inline]
     pub(super) fn close(&mut self, id: NodeId) {
         self.rest[id as usize].is_closed = true;
