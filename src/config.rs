@@ -29,7 +29,7 @@ pub struct ServeConfig {
     /// Largest request body.
     #[arg(long, env = "ETUDE_MAX_BODY_BYTES", default_value_t = 8 * 1024 * 1024, value_name = "BYTES")]
     pub max_body_bytes: usize,
-    /// Most states of a model.
+    /// Most states of a model; a wumpus world of more is searched lazily.
     #[arg(long, env = "ETUDE_MAX_STATES", default_value_t = model::Limits::DEFAULT.max_states, value_name = "N")]
     pub max_states: usize,
     /// Memory for models that are kept ready to be searched.

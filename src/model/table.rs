@@ -56,6 +56,7 @@ impl Table {
             n_transitions: self.edges.len(),
             n_unsafe: is_unsafe.iter().filter(|is_unsafe| **is_unsafe).count(),
             is_unsafe,
+            unexplored: None,
         }
     }
 

@@ -6,19 +6,20 @@ use quick_cache::Weighter;
 use quick_cache::sync::Cache;
 
 use crate::mapping::Mapper;
+use crate::store::ModelKey;
 
 /// Compiled models by the hash of their content, the least useful evicted. Concurrent requests for a model that is not
 /// there compile it once.
 #[derive(Debug)]
 pub(super) struct MapperCache {
-    cache: Cache<String, Arc<Mapper>, SizeBytes>,
+    cache: Cache<ModelKey, Arc<Mapper>, SizeBytes>,
 }
 
 #[derive(Clone, Debug)]
 struct SizeBytes;
 
-impl Weighter<String, Arc<Mapper>> for SizeBytes {
-    fn weight(&self, _: &String, mapper: &Arc<Mapper>) -> u64 {
+impl Weighter<ModelKey, Arc<Mapper>> for SizeBytes {
+    fn weight(&self, _: &ModelKey, mapper: &Arc<Mapper>) -> u64 {
         mapper.size_bytes() as u64 + 1
     }
 }
@@ -32,16 +33,16 @@ impl MapperCache {
     }
 
     /// Puts in a model that has just been compiled.
-    pub(super) fn insert(&self, hash: String, mapper: Arc<Mapper>) {
-        self.cache.insert(hash, mapper);
+    pub(super) fn insert(&self, key: ModelKey, mapper: Arc<Mapper>) {
+        self.cache.insert(key, mapper);
     }
 
-    /// The model with this hash; `compile` makes it if it is not there.
+    /// The model with this key; `compile` makes it if it is not there.
     pub(super) async fn get_or_compile<E>(
         &self,
-        hash: &str,
+        key: &ModelKey,
         compile: impl Future<Output = Result<Arc<Mapper>, E>>,
     ) -> Result<Arc<Mapper>, E> {
-        self.cache.get_or_insert_async(hash, compile).await
+        self.cache.get_or_insert_async(key, compile).await
     }
 }

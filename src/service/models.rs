@@ -12,7 +12,7 @@ use crate::document;
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::Mapper;
 use crate::model::{ActionDocument, CompileError, Definition, Limits, Model, hash_of};
-use crate::store::{ModelSummary, NewModel, Page, PutModel, StoreError};
+use crate::store::{ModelKey, ModelSize, ModelSummary, NewModel, Page, PutModel, StoreError};
 
 /// A model and its definition, as registered.
 #[derive(Debug)]
@@ -55,13 +55,15 @@ impl Etude {
             hash,
             attributes,
             actions,
-            n_states: model.graph().n_states() as u64,
-            n_transitions: model.n_transitions() as u64,
+            size: (!model.is_lazy()).then(|| ModelSize {
+                n_states: model.graph().n_states() as u64,
+                n_transitions: model.n_transitions() as u64,
+            }),
             n_unsafe: model.n_unsafe() as u64,
             // As exact as it is stored.
             created_at: now.round(Unit::Millisecond).unwrap_or(now),
         };
-        let hash = summary.hash.clone();
+        let key = ModelKey { hash: summary.hash.clone(), is_lazy: model.is_lazy() };
         let (registered, summary) = match self.store.put_model(NewModel { summary, definition }).await? {
             PutModel::Created(summary) => (Registered::New, summary),
             PutModel::Unchanged(summary) => (Registered::Already, summary),
@@ -69,7 +71,7 @@ impl Etude {
                 return Err(ServiceError::Conflict { kind: "model", name: name.to_string(), existing_hash });
             }
         };
-        self.mappers.insert(hash, Arc::new(mapper));
+        self.mappers.insert(key, Arc::new(mapper));
         Ok((registered, summary))
     }
 
@@ -111,11 +113,13 @@ impl Etude {
         place: Option<&Admission>,
     ) -> Result<(String, Arc<Mapper>), ServiceError> {
         let unknown = || unknown(name, Some(pointer));
-        let hash = self.store.model_hash(name).await?.ok_or_else(unknown)?;
+        let key = self.store.model_key(name).await?.ok_or_else(unknown)?;
+        let (hash, is_lazy) = (key.hash.clone(), key.is_lazy);
         let compile = async {
             // Deleted and registered anew in between, it has another hash; then the next request finds that.
             let row = self.store.model(name).await?.filter(|row| row.summary.hash == hash).ok_or_else(unknown)?;
-            let limits = Limits { max_states: usize::MAX };
+            // What it was found to be when it was registered, whatever the limit is now.
+            let limits = Limits { max_states: if is_lazy { 0 } else { usize::MAX } };
             let text = row.definition;
             let job = move |interrupt: &mut dyn Interrupt| prepare(text.as_bytes(), limits, interrupt);
             let prepared = match place {
@@ -126,7 +130,7 @@ impl Etude {
             let prepared = prepared.map_err(|error| corrupt_definition(error.into()))?;
             Ok::<_, ServiceError>(Arc::new(prepared.mapper))
         };
-        let mapper = self.mappers.get_or_compile(&hash, compile).await?;
+        let mapper = self.mappers.get_or_compile(&key, compile).await?;
         Ok((hash, mapper))
     }
 }
@@ -163,11 +167,7 @@ fn prepare(
         Err(CompileError::Faults(faults)) => return Ok(Err(faults.into())),
         Err(CompileError::Cancelled(cancelled)) => return Err(cancelled),
     };
-    let model = match Model::compile(&definition, limits, interrupt) {
-        Ok(model) => model,
-        Err(CompileError::Faults(faults)) => return Ok(Err(faults.into())),
-        Err(CompileError::Cancelled(cancelled)) => return Err(cancelled),
-    };
+    let model = Model::compile(&definition, limits, interrupt)?;
     let attributes = model.schema().attributes().iter().map(AttributeDocument::from).collect();
     let actions = model.actions().iter().map(ActionDocument::from).collect();
     let mapper = Mapper::new(model, interrupt)?;

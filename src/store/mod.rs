@@ -21,7 +21,7 @@ use std::path::Path;
 use std::time::Duration;
 
 pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
-pub use models::{ModelRow, ModelSummary, NewModel, PutModel};
+pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewModel, PutModel};
 pub use policies::{NewPolicy, PolicySummaryRow};
 pub use refinements::{NewRefinement, RefinementEnd};
 pub use sessions::{NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus};

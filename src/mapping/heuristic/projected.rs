@@ -7,7 +7,6 @@ use super::projection::{Group, ProjectedEdge, Projections};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
 use crate::mapping::open_list::CheapestFirst;
-use crate::model::{StateIdx, States};
 
 /// What a node `(i, s)` costs: what is paid on arriving, and what must still be paid after.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -25,7 +24,6 @@ pub(in crate::mapping) struct Estimate {
 #[derive(Debug)]
 pub(crate) struct Projected<'p> {
     problem: &'p Problem<'p>,
-    states: &'p States,
     columns: Vec<Column<'p>>,
     /// Of the columns of a single attribute: its position, and where its values begin in a row.
     singles: Vec<(usize, usize)>,
@@ -99,7 +97,6 @@ impl<'p> Projected<'p> {
         let untabled = (0..problem.model.schema().len()).filter(|position| problem.distances.is_active(*position));
         Self {
             problem,
-            states: problem.model.states(),
             columns: Vec::new(),
             singles: Vec::new(),
             groups: Vec::new(),
@@ -201,10 +198,10 @@ pub(in crate::mapping) struct EstimatesAt<'p> {
 }
 
 impl EstimatesAt<'_> {
+    /// What the node of the state with this row costs.
     #[inline]
-    pub(in crate::mapping) fn of(&self, state: StateIdx) -> Estimate {
+    pub(in crate::mapping) fn of(&self, values: &[u32]) -> Estimate {
         let projected = self.projected;
-        let values = projected.states.row(state);
         let mut sum = Estimate::default();
         let mut add = |entry: Estimate| {
             sum.distance += entry.distance;
@@ -225,8 +222,8 @@ impl EstimatesAt<'_> {
 
 impl Heuristic for Projected<'_> {
     #[inline]
-    fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64 {
-        self.at(observation).of(state).cost_to_go
+    fn cost_to_go(&self, observation: usize, row: &[u32]) -> f64 {
+        self.at(observation).of(row).cost_to_go
     }
 }
 

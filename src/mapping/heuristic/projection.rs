@@ -18,7 +18,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 use super::projected::Estimate;
 use crate::interrupt::{Cancelled, Interrupt, Meter};
 use crate::mapping::Problem;
-use crate::model::{ActionIdx, Model};
+use crate::model::{ActionIdx, Model, Operator};
 
 /// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
 #[derive(Debug)]
@@ -69,7 +69,7 @@ pub(super) struct ProjectedEdge {
 const MAX_EDGES: usize = 1 << 24;
 
 impl Projections {
-    /// Projects `model` on each of its attributes that varies.
+    /// Projects `model` on each of its attributes that varies; a model that is searched lazily, by its operators.
     ///
     /// # Errors
     ///
@@ -87,33 +87,22 @@ impl Projections {
         let alone = (0..model.schema().len()).filter(varies).map(|attribute| Group::new(model, &[attribute]));
         let mut groups: Vec<Group> = alone.collect();
 
-        let mut change_sets = ChangeSets::default();
-        // `None` for a group that is left out.
-        let mut edges: Vec<Option<FxHashSet<ProjectedEdge>>> = vec![Some(FxHashSet::default()); groups.len()];
-        let mut n_edges = 0;
-        let mut changed = Vec::new();
-        for (from, transition) in model.graph().iter() {
-            meter.spend_or_cancel(groups.len() as u64)?;
-            let (row, row_after) = (states.row(from), states.row(transition.to));
-            let is_changed = |group: &Group| group.positions().any(|at| row[at] != row_after[at]);
-            let kept = groups.iter().zip(&edges).zip(0u16..).filter(|((_, edges), _)| edges.is_some());
-            changed.clear();
-            changed.extend(kept.filter(|((group, _), _)| is_changed(group)).map(|(_, number)| number));
-            let change_set = change_sets.number_of(&changed);
-            for number in &changed {
-                let group = &groups[usize::from(*number)];
-                #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
-                let [from, to] = [row, row_after].map(|row| group.class_of(row) as ClassIdx);
-                let edge = ProjectedEdge { from, to, action: transition.action, change_set };
-                let is_new = edges[usize::from(*number)].as_mut().is_some_and(|edges| edges.insert(edge));
-                n_edges += usize::from(is_new);
+        let mut ways = Ways::of(&groups, max_edges);
+        match model.unexplored() {
+            None => {
+                for (from, transition) in model.graph().iter() {
+                    meter.spend_or_cancel(groups.len() as u64)?;
+                    ways.add_transition(transition.action, states.row(from), states.row(transition.to));
+                }
             }
-            if n_edges > max_edges || change_sets.n_entries > max_edges {
-                leave_out_larger_half(&mut edges);
-                change_sets.rebuild(&mut edges);
-                n_edges = edges.iter().flatten().map(FxHashSet::len).sum();
+            Some(cave) => {
+                for operator in cave.operators() {
+                    meter.spend_or_cancel(groups.len() as u64)?;
+                    ways.add_operator(&operator);
+                }
             }
         }
+        let Ways { edges, change_sets, .. } = ways;
         for (group, edges) in groups.iter_mut().zip(edges) {
             group.is_kept = edges.is_some();
             group.edges = edges.into_iter().flatten().collect();
@@ -137,6 +126,73 @@ impl Projections {
         let change_sets: usize =
             self.change_sets.iter().map(|set| size_of_val(set) + size_of_val(set.as_slice())).sum();
         change_sets + self.groups.iter().map(Group::size_bytes).sum::<usize>()
+    }
+}
+
+/// Distinct ways to change classes, of all groups.
+struct Ways<'g> {
+    groups: &'g [Group],
+    /// By group; `None` for one that is left out.
+    edges: Vec<Option<FxHashSet<ProjectedEdge>>>,
+    n_edges: usize,
+    max_edges: usize,
+    change_sets: ChangeSets,
+    /// The groups that change, of those that are kept.
+    changed: Vec<u16>,
+}
+
+impl<'g> Ways<'g> {
+    fn of(groups: &'g [Group], max_edges: usize) -> Self {
+        let edges = vec![Some(FxHashSet::default()); groups.len()];
+        Self { groups, edges, n_edges: 0, max_edges, change_sets: ChangeSets::default(), changed: Vec::new() }
+    }
+
+    /// Adds what a transition between states with these rows changes.
+    fn add_transition(&mut self, action: ActionIdx, row: &[u32], row_after: &[u32]) {
+        let change_set = self.change_set(|group| group.positions().any(|at| row[at] != row_after[at]));
+        let groups = self.groups;
+        for n in 0..self.changed.len() {
+            let group = &groups[usize::from(self.changed[n])];
+            #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+            let [from, to] = [row, row_after].map(|row| group.class_of(row) as ClassIdx);
+            self.insert(n, ProjectedEdge { from, to, action, change_set });
+        }
+        self.make_room();
+    }
+
+    /// Adds what any transition that is like `operator` may change.
+    fn add_operator(&mut self, operator: &Operator) {
+        let change_set = self.change_set(|group| operator.changed.iter().any(|(at, _, _)| group.has(*at)));
+        let groups = self.groups;
+        for n in 0..self.changed.len() {
+            for (from, to) in groups[usize::from(self.changed[n])].classes_of(operator) {
+                self.insert(n, ProjectedEdge { from, to, action: operator.action, change_set });
+            }
+        }
+        self.make_room();
+    }
+
+    /// Finds the groups that change, and numbers the set of them.
+    fn change_set(&mut self, is_changed: impl Fn(&Group) -> bool) -> u32 {
+        let kept = self.groups.iter().zip(&self.edges).zip(0u16..).filter(|((_, edges), _)| edges.is_some());
+        self.changed.clear();
+        self.changed.extend(kept.filter(|((group, _), _)| is_changed(group)).map(|(_, number)| number));
+        self.change_sets.number_of(&self.changed)
+    }
+
+    /// Adds an edge of the `n`-th group that changes.
+    fn insert(&mut self, n: usize, edge: ProjectedEdge) {
+        let edges = &mut self.edges[usize::from(self.changed[n])];
+        let is_new = edges.as_mut().is_some_and(|edges| edges.insert(edge));
+        self.n_edges += usize::from(is_new);
+    }
+
+    fn make_room(&mut self) {
+        if self.n_edges > self.max_edges || self.change_sets.n_entries > self.max_edges {
+            leave_out_larger_half(&mut self.edges);
+            self.change_sets.rebuild(&mut self.edges);
+            self.n_edges = self.edges.iter().flatten().map(FxHashSet::len).sum();
+        }
     }
 }
 
@@ -198,6 +254,26 @@ impl Group {
             digit
         });
         Self { digits: digits.collect(), n_classes, edges: Vec::new(), is_kept: true }
+    }
+
+    /// The classes from and to which `operator` changes, whatever the values of which it says nothing.
+    fn classes_of(&self, operator: &Operator) -> Vec<(ClassIdx, ClassIdx)> {
+        let mut classes = vec![(0, 0)];
+        let ends = self.digits.iter().skip(1).map(|digit| digit.stride).chain([self.n_classes]);
+        for (Digit { position, stride }, end) in self.digits.iter().zip(ends) {
+            let kept = operator.kept.iter().find(|(at, _)| at == position).map(|(_, value)| (*value, *value));
+            let changed = operator.changed.iter().find(|(at, _, _)| at == position).map(|(_, from, to)| (*from, *to));
+            #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+            let (stride, n_values) = (*stride as ClassIdx, (end / stride) as u32);
+            let values: Vec<(u32, u32)> = match kept.or(changed) {
+                Some(values) => vec![values],
+                None => (0..n_values).map(|value| (value, value)).collect(),
+            };
+            let with =
+                |(from, to): (u32, u32), class: &(ClassIdx, ClassIdx)| (class.0 + from * stride, class.1 + to * stride);
+            classes = values.iter().flat_map(|values| classes.iter().map(|class| with(*values, class))).collect();
+        }
+        classes
     }
 
     /// The class of a state with these domain indices, shape `[n_attributes]`.

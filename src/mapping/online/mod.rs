@@ -79,8 +79,13 @@ pub struct OnlineMapping {
 impl OnlineMapping {
     /// A mapping of a demonstration of which nothing has come yet. `start` overrides the model's; `lookahead` is how many
     /// observations past the current one a decision may wait for, `None` for all.
+    ///
+    /// # Panics
+    ///
+    /// If the model is searched lazily: each layer looks at all states.
     #[must_use]
     pub fn new(mapper: Arc<Mapper>, weights: Weights, start: Option<StateIdx>, lookahead: Option<NonZeroU32>) -> Self {
+        assert!(!mapper.model().is_lazy(), "each layer needs all states");
         let n_states = mapper.model().graph().n_states();
         Self {
             mapper,
@@ -169,7 +174,8 @@ impl OnlineMapping {
         // Each observation looks at every state once.
         let n_expanded = u64::from(self.n_observed) * self.layer.costs.len() as u64;
         let n_generated = u64::from(self.n_observed) * self.mapper.model().graph().n_transitions() as u64;
-        let mapping = Mapping { moves: self.moves, cost: self.cost, status, lower_bound, n_expanded, n_generated };
+        let mapping =
+            Mapping { moves: self.moves, cost: self.cost, status, lower_bound, n_expanded, n_generated, states: None };
         Some((committed, mapping))
     }
 
@@ -244,7 +250,7 @@ impl OnlineMapping {
         let model = self.mapper.model();
         let mut writer = self.writer;
         let terms = self.distances_of(step.observation).terms(model.states(), step.state);
-        let written = writer.write(model, &step, terms);
+        let written = writer.write(model, model.states(), &step, terms);
         self.cost = writer.cost();
         self.writer = writer;
         self.moves.push(step);
