@@ -38,10 +38,11 @@ fn main() {
 }
 
 fn measure(world: &World) {
-    let definition = Definition::read(&world.model, Limits { max_states: 20_000_000 }, &mut Uninterrupted)
-        .expect("worlds are models");
+    let definition =
+        Definition::read(&world.model, Limits { max_states: 20_000_000, ..Limits::DEFAULT }, &mut Uninterrupted)
+            .expect("worlds are models");
     let started = Instant::now();
-    let model = Model::compile(&definition, Limits { max_states: 20_000_000 }, &mut Uninterrupted)
+    let model = Model::compile(&definition, Limits { max_states: 20_000_000, ..Limits::DEFAULT }, &mut Uninterrupted)
         .expect("worlds are small enough");
     let mapper = &Mapper::new(model, &mut Uninterrupted).expect("nothing interrupts");
     let compiled = started.elapsed();

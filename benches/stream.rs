@@ -1,5 +1,6 @@
-//! Streaming: the core per observation, round trips beside a bare echo, commits of the disk, and memory.
+//! Streaming: the core per observation, round trips beside a bare echo and what the disk can do, and memory.
 //!
+//! `cargo bench --bench stream` runs all of it, `cargo bench --bench stream -- core round-trips memory` the parts named.
 //! Rounds of what is compared are interleaved, so that a machine that slows down slows all of them down. Client and
 //! service share the machine. Figures are medians, and in brackets the least and the most.
 
@@ -7,7 +8,7 @@
 
 mod worlds;
 
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::num::NonZeroU32;
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
@@ -35,6 +36,32 @@ const N_ROUNDS: usize = 5;
 const ROUND: Duration = Duration::from_millis(500);
 
 fn main() -> Result<(), Failure> {
+    let parts: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
+    let is_wanted = |name: &str| parts.is_empty() || parts.iter().any(|part| part == name);
+    if is_wanted("core") {
+        core()?;
+    }
+    tokio::runtime::Runtime::new()?.block_on(async {
+        if parts == [SERVE_ECHO] {
+            return serve_echo().await;
+        }
+        if is_wanted("round-trips") {
+            for world in [corridor(), worlds::example("figure-4")] {
+                for n_connections in [1, 100] {
+                    round_trips(&world, n_connections).await?;
+                }
+            }
+        }
+        if is_wanted("memory") {
+            memory(1000, 0, Load::Idle).await?;
+            memory(200, 20, Load::Idle).await?;
+            memory(200, 20, Load::Busy).await?;
+        }
+        Ok(())
+    })
+}
+
+fn core() -> Result<(), Failure> {
     println!("microseconds per observation");
     println!("{:<28} {:>9} {:>24} {:>24} {:>24}", "", "lookahead", "at 10", "at 100", "at 10,000");
     for world in [worlds::example("figure-4"), worlds::cave(20, 5, 50, 1)] {
@@ -42,19 +69,19 @@ fn main() -> Result<(), Failure> {
             observe(&world, lookahead)?;
         }
     }
-    tokio::runtime::Runtime::new()?.block_on(async {
-        round_trips().await?;
-        memory(1000, 0).await?;
-        memory(200, 20).await
-    })
+    Ok(())
+}
+
+fn mapper(world: &World) -> Result<Arc<Mapper>, Failure> {
+    let definition =
+        Definition::read(&world.model, Limits::DEFAULT, &mut Uninterrupted).map_err(|error| error.to_string())?;
+    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).map_err(|_| "too large")?;
+    Ok(Arc::new(Mapper::new(model, &mut Uninterrupted).map_err(|_| "interrupted")?))
 }
 
 /// Feeds a demonstration that goes on for 10,000 observations, and looks at windows of it.
 fn observe(world: &World, lookahead: Option<NonZeroU32>) -> Result<(), Failure> {
-    let definition =
-        Definition::read(&world.model, Limits::DEFAULT, &mut Uninterrupted).map_err(|error| error.to_string())?;
-    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).map_err(|_| "too large")?;
-    let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted).map_err(|_| "interrupted")?);
+    let mapper = mapper(world)?;
     let schema = mapper.model().schema();
     let states = world.demonstration.as_array().ok_or("a demonstration is an array")?;
     let read = |state| schema.read_observation(&Place::root(state), &mut Faults::default()).ok_or("faults");
@@ -109,6 +136,17 @@ impl Service {
         let client = reqwest::Client::builder().no_proxy().build()?;
         client.put(format!("http://{address}/v1/models/m")).json(&world.model).send().await?.error_for_status()?;
         Ok(Self { child, address, _directory: directory })
+    }
+
+    /// User and system time it has taken so far, in seconds.
+    fn cpu_s(&self) -> Result<f64, Failure> {
+        /// Of the clock that Linux shows these times by.
+        const TICKS_PER_SECOND: f64 = 100.0;
+        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id()))?;
+        // The name of the program, in parentheses, may have blanks.
+        let (_, fields) = stat.rsplit_once(") ").ok_or("no name")?;
+        let ticks: Result<Vec<f64>, _> = fields.split(' ').skip(11).take(2).map(str::parse).collect();
+        Ok(ticks?.iter().sum::<f64>() / TICKS_PER_SECOND)
     }
 
     /// Resident memory, in KiB.
@@ -171,57 +209,149 @@ async fn echo(upgrade: WebSocketUpgrade) -> axum::response::Response {
     })
 }
 
-async fn round_trips() -> Result<(), Failure> {
-    let world = worlds::example("figure-4");
-    let service = Service::start(&world).await?;
-    let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
-    let listener = TcpListener::bind("127.0.0.1:0").await?;
-    let echo_address = listener.local_addr()?;
-    let serving = tokio::spawn(async move { axum::serve(listener, axum::Router::new().route("/", get(echo))).await });
+/// What this program does when it is started by [`Echo::start`].
+const SERVE_ECHO: &str = "serve-echo";
 
-    println!("\nround trips per second");
-    println!(
-        "{:<14} {:>28} {:>28} {:>28} {:>8}",
-        "connections", "etude", "echo of 128 bytes", "SQLite commits", "ratio"
-    );
-    for n_connections in [1, 100] {
-        let mut streams = Vec::new();
-        let mut echoes = Vec::new();
-        for _ in 0..n_connections {
-            streams.push(Stream::open(&service.address, &states).await?);
-            echoes.push(tokio_tungstenite::connect_async(format!("ws://{echo_address}/")).await?.0);
-        }
-        let (mut rates, mut echo_rates, mut commit_rates) = (Vec::new(), Vec::new(), Vec::new());
-        for _ in 0..N_ROUNDS {
-            let round = async |mut stream: Stream| -> Result<_, Failure> {
-                stream.round_trip().await?;
-                Ok(stream)
-            };
-            let (rate, back) = per_second(streams, round).await?;
-            streams = back;
-            rates.push(rate);
-            let round = async |mut socket: Socket| -> Result<_, Failure> {
-                socket.send(Message::text("e".repeat(128))).await?;
-                socket.next().await.ok_or("closed")??;
-                Ok(socket)
-            };
-            let (rate, back) = per_second(echoes, round).await?;
-            echoes = back;
-            echo_rates.push(rate);
-            commit_rates.push(commits_per_second().await?);
-        }
-        let shown = |rates: &mut Vec<f64>| {
-            rates.sort_by(f64::total_cmp);
-            let (least, median, most) = (rates[0], rates[rates.len() / 2], rates[rates.len() - 1]);
-            (median, format!("{median:.0} [{least:.0} .. {most:.0}]"))
-        };
-        let (etude, etude_shown) = shown(&mut rates);
-        let (echo, echo_shown) = shown(&mut echo_rates);
-        let (_, commits_shown) = shown(&mut commit_rates);
-        println!("{n_connections:<14} {etude_shown:>28} {echo_shown:>28} {commits_shown:>28} {:>8.2}", etude / echo);
+/// The echo, alone in a process as the service is; it ends with its standard input.
+async fn serve_echo() -> Result<(), Failure> {
+    let listener = TcpListener::bind("127.0.0.1:0").await?;
+    println!("{}", listener.local_addr()?);
+    std::thread::spawn(|| {
+        // Whatever comes, it is the end.
+        let _ = std::io::stdin().read(&mut [0]);
+        std::process::exit(0);
+    });
+    Ok(axum::serve(listener, axum::Router::new().route("/", get(echo))).await?)
+}
+
+struct Echo {
+    child: Child,
+    address: String,
+}
+
+impl Echo {
+    fn start() -> Result<Self, Failure> {
+        let mut command = Command::new(std::env::current_exe()?);
+        let mut child = command.arg(SERVE_ECHO).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
+        let mut address = String::new();
+        BufReader::new(child.stdout.take().ok_or("no output")?).read_line(&mut address)?;
+        Ok(Self { child, address: address.trim().to_owned() })
     }
-    serving.abort();
+}
+
+impl Drop for Echo {
+    fn drop(&mut self) {
+        // It is gone already if this fails.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A line of four states: next to nothing to be mapped.
+fn corridor() -> World {
+    World {
+        name: "corridor".to_owned(),
+        model: json!({
+            "attributes": [{"name": "x", "kind": "number"}],
+            "actions": [{"name": "forward", "cost": 1}],
+            "dynamics": {
+                "kind": "table", "states": [[0], [1], [2], [3]], "start": 0,
+                "transitions": [[0, "forward", 1], [1, "forward", 2], [2, "forward", 3]],
+            },
+        }),
+        demonstration: json!([{"x": 0}, {"x": 1}, {"x": 2}, {"x": 3}]),
+    }
+}
+
+/// Round trips of `n_connections` at the same time, beside what bounds them.
+async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure> {
+    let service = Service::start(world).await?;
+    let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
+    let echo = Echo::start()?;
+    let mapper = mapper(world)?;
+    let mut streams = Vec::new();
+    let mut echoes = Vec::new();
+    for _ in 0..n_connections {
+        streams.push(Stream::open(&service.address, &states).await?);
+        echoes.push(tokio_tungstenite::connect_async(format!("ws://{}/", echo.address)).await?.0);
+    }
+    // By what is measured; the service comes first.
+    let mut rates: [Vec<f64>; 5] = Default::default();
+    let mut cpu_us = Vec::new();
+    for _ in 0..N_ROUNDS {
+        let cpu_before_s = service.cpu_s()?;
+        let round = async |mut stream: Stream| -> Result<_, Failure> {
+            stream.round_trip().await?;
+            Ok(stream)
+        };
+        let (rate, back) = per_second(streams, round).await?;
+        streams = back;
+        rates[0].push(rate);
+        cpu_us.push((service.cpu_s()? - cpu_before_s) / ROUND.as_secs_f64() / rate * 1e6);
+        let round = async |mut socket: Socket| -> Result<_, Failure> {
+            socket.send(Message::text("e".repeat(128))).await?;
+            socket.next().await.ok_or("closed")??;
+            Ok(socket)
+        };
+        let (rate, back) = per_second(echoes, round).await?;
+        echoes = back;
+        rates[1].push(rate);
+        rates[2].push(rows_per_second(n_connections).await?);
+        let (mapper, states) = (Arc::clone(&mapper), Arc::clone(&states));
+        let blocking = tokio::task::spawn_blocking(move || {
+            Ok::<_, Failure>((lines_per_second(n_connections)?, observations_per_second(&mapper, &states)?))
+        });
+        let (lines, observations) = blocking.await??;
+        rates[3].push(lines);
+        rates[4].push(observations);
+    }
+    println!("\n{}, {n_connections} at a time: a second, and the service's as a multiple", world.name);
+    let row = |name: &str, rates: &[f64], ratios: &[f64]| {
+        println!(
+            "{name:<44} {:>32} {:>24}",
+            spread(rates, 0),
+            if ratios.is_empty() { String::new() } else { spread(ratios, 2) }
+        );
+    };
+    row("round trips of the service", &rates[0], &[]);
+    let names = [
+        "round trips of an echo of 128 bytes".to_owned(),
+        format!("rows into SQLite, {n_connections} a commit"),
+        format!("lines into a file, {n_connections} a sync"),
+        "observations mapped, on one core".to_owned(),
+    ];
+    for (name, others) in names.iter().zip(&rates[1..]) {
+        let ratios: Vec<f64> = rates[0].iter().zip(others).map(|(rate, other)| rate / other).collect();
+        row(name, others, &ratios);
+    }
+    println!("{:<44} {:>32}", "microseconds of the service's CPU a round trip", spread(&cpu_us, 1));
     Ok(())
+}
+
+/// Median, and in brackets the least and the most.
+fn spread(values: &[f64], n_decimals: usize) -> String {
+    let mut values = values.to_vec();
+    values.sort_by(f64::total_cmp);
+    let (least, median, most) = (values[0], values[values.len() / 2], values[values.len() - 1]);
+    format!("{median:.n_decimals$} [{least:.n_decimals$} .. {most:.n_decimals$}]")
+}
+
+/// What the search alone takes: observations per second of a session, with the lookahead of one that names none.
+fn observations_per_second(mapper: &Arc<Mapper>, states: &[Value]) -> Result<f64, Failure> {
+    let schema = mapper.model().schema();
+    let read = |state| schema.read_observation(&Place::root(state), &mut Faults::default()).ok_or("faults");
+    let observations = states.iter().map(read).collect::<Result<Vec<_>, _>>()?;
+    let mut online = OnlineMapping::new(Arc::clone(mapper), schema.weights(), None, NonZeroU32::new(8));
+    let started = Instant::now();
+    let mut n_mapped = 0_u32;
+    for observation in observations.iter().cycle() {
+        std::hint::black_box(online.observe(observation, &mut Uninterrupted).map_err(|_| "nothing interrupts")?);
+        n_mapped += 1;
+        if n_mapped.is_multiple_of(64) && started.elapsed() >= ROUND / 2 {
+            break;
+        }
+    }
+    Ok(f64::from(n_mapped) / started.elapsed().as_secs_f64())
 }
 
 /// Rounds per second of all clients together, each in a task of its own.
@@ -258,29 +388,55 @@ where
     Ok((f64::from(n_rounds) / started.elapsed().as_secs_f64(), clients))
 }
 
-/// What bounds a single connection: durable commits, one after the other, set up as the service sets its own up.
-async fn commits_per_second() -> Result<f64, Failure> {
+/// A line such as an observation that is to be kept.
+const LINE: &str = r#"["01a20166-6aab-731d-84f8-704a7d58ef84",7,1,[{"x":3,"y":0,"heading":"east","gold":0,"arrows":1}],1790000000000]"#;
+
+/// What SQLite can do: rows per second, `n_rows` a durable commit, one commit after the other, set up as the service sets
+/// its own up. With a row each this is what bounds a single connection.
+async fn rows_per_second(n_rows: usize) -> Result<f64, Failure> {
     let directory = tempfile::tempdir()?;
     let options = sqlx::sqlite::SqliteConnectOptions::new()
-        .filename(directory.path().join("commits.db"))
+        .filename(directory.path().join("rows.db"))
         .create_if_missing(true)
         .journal_mode(sqlx::sqlite::SqliteJournalMode::Wal)
         .synchronous(sqlx::sqlite::SqliteSynchronous::Full);
     let mut connection = sqlx::SqliteConnection::connect_with(&options).await?;
-    sqlx::query("CREATE TABLE t (n INTEGER PRIMARY KEY, states TEXT)").execute(&mut connection).await?;
+    sqlx::query("CREATE TABLE t (n INTEGER PRIMARY KEY, observation TEXT)").execute(&mut connection).await?;
+    let insert = format!("INSERT INTO t (observation) VALUES {}", vec!["($1)"; n_rows].join(", "));
     let started = Instant::now();
-    let mut n_commits = 0_u32;
+    let mut n_inserted = 0_u32;
     while started.elapsed() < ROUND / 2 {
-        let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
-        sqlx::query("INSERT INTO t (states) VALUES ('{\"x\": 1}')").execute(&mut *transaction).await?;
-        transaction.commit().await?;
-        n_commits += 1;
+        sqlx::query(sqlx::AssertSqlSafe(insert.as_str())).bind(LINE).execute(&mut connection).await?;
+        n_inserted += u32::try_from(n_rows)?;
     }
-    Ok(f64::from(n_commits) / started.elapsed().as_secs_f64())
+    Ok(f64::from(n_inserted) / started.elapsed().as_secs_f64())
 }
 
-/// Memory of sessions, each of which has seen `n_observations`.
-async fn memory(n_sessions: u32, n_observations: usize) -> Result<(), Failure> {
+/// What the disk can do: lines per second appended to a bare file, `n_lines` a sync, one sync after the other.
+fn lines_per_second(n_lines: usize) -> Result<f64, Failure> {
+    let mut file = tempfile::tempfile()?;
+    let lines = LINE.repeat(n_lines);
+    let started = Instant::now();
+    let mut n_written = 0_u32;
+    while started.elapsed() < ROUND / 2 {
+        file.write_all(lines.as_bytes())?;
+        file.sync_data()?;
+        n_written += u32::try_from(n_lines)?;
+    }
+    Ok(f64::from(n_written) / started.elapsed().as_secs_f64())
+}
+
+/// What sessions do while their memory is measured.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Load {
+    /// They wait.
+    Idle,
+    /// Each has an observation in flight, all the time.
+    Busy,
+}
+
+/// Memory of sessions, each of which has seen `n_observations` before.
+async fn memory(n_sessions: u32, n_observations: usize, load: Load) -> Result<(), Failure> {
     let world = worlds::example("figure-4");
     let service = Service::start(&world).await?;
     let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
@@ -293,11 +449,34 @@ async fn memory(n_sessions: u32, n_observations: usize) -> Result<(), Failure> {
         }
         streams.push(stream);
     }
-    let after = service.resident_kib()?;
-    let each = f64::from(u32::try_from(after.saturating_sub(before))?) / f64::from(n_sessions);
+    let (mut most, what) = (service.resident_kib()?, if load == Load::Busy { "busy" } else { "idle" });
+    if load == Load::Busy {
+        let round = async |mut stream: Stream| -> Result<_, Failure> {
+            stream.round_trip().await?;
+            Ok(stream)
+        };
+        let mut n_reads = 0;
+        let busy = tokio::spawn(async move {
+            let mut n_rounds = 0.0;
+            for _ in 0..N_ROUNDS {
+                let (rate, back) = per_second(streams, round).await?;
+                n_rounds += rate * ROUND.as_secs_f64();
+                streams = back;
+            }
+            Ok::<_, Failure>((n_rounds, streams))
+        });
+        while !busy.is_finished() {
+            most = most.max(service.resident_kib()?);
+            n_reads += 1;
+            tokio::time::sleep(ROUND / 20).await;
+        }
+        let (n_rounds, _streams) = busy.await??;
+        println!("\n{n_rounds:.0} observations by {n_sessions} sessions while memory was read {n_reads} times");
+    }
+    let each = f64::from(u32::try_from(most.saturating_sub(before))?) / f64::from(n_sessions);
     println!(
-        "\nmemory of {n_sessions} sessions that have each seen {n_observations} observations: {after} KiB resident, \
-         {before} KiB before them, {each:.1} KiB each"
+        "memory of {n_sessions} {what} sessions that had each seen {n_observations} observations: at most {most} KiB \
+         resident, {before} KiB before them, {each:.1} KiB each"
     );
     Ok(())
 }

@@ -26,12 +26,23 @@ pub struct ServeConfig {
     /// Searches that wait for a thread; further ones are answered 503.
     #[arg(long, env = "ETUDE_SEARCH_QUEUE", default_value_t = 64, value_name = "N")]
     pub search_queue: usize,
-    /// Largest request body.
+    /// Largest request body; once it is decompressed, too.
     #[arg(long, env = "ETUDE_MAX_BODY_BYTES", default_value_t = 8 * 1024 * 1024, value_name = "BYTES")]
     pub max_body_bytes: usize,
+    /// Largest model, as it is sent [default: as other bodies].
+    #[arg(long, env = "ETUDE_MAX_MODEL_BYTES", value_name = "BYTES")]
+    pub max_model_bytes: Option<usize>,
+    /// Largest model, once it is decompressed.
+    #[arg(long, env = "ETUDE_MAX_MODEL_TEXT_BYTES", default_value_t = 512 * 1024 * 1024, value_name = "BYTES")]
+    pub max_model_text_bytes: u64,
     /// Most states of a model; a wumpus world of more is searched lazily.
     #[arg(long, env = "ETUDE_MAX_STATES", default_value_t = model::Limits::DEFAULT.max_states, value_name = "N")]
     pub max_states: usize,
+    /// Most transitions of a model.
+    #[arg(
+        long, env = "ETUDE_MAX_TRANSITIONS", default_value_t = model::Limits::DEFAULT.max_transitions, value_name = "N"
+    )]
+    pub max_transitions: usize,
     /// Memory for models that are kept ready to be searched.
     #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", default_value_t = 1024 * 1024 * 1024, value_name = "BYTES")]
     pub model_cache_bytes: u64,
@@ -63,7 +74,7 @@ impl ServeConfig {
         let n_cores = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
         Settings {
             database: self.database.clone(),
-            limits: model::Limits { max_states: self.max_states },
+            limits: model::Limits { max_states: self.max_states, max_transitions: self.max_transitions },
             model_cache_bytes: self.model_cache_bytes,
             session_idle_timeout: self.session_idle_timeout,
             pool: PoolSettings {
@@ -80,6 +91,7 @@ impl ServeConfig {
     pub fn stream_limits(&self) -> Limits {
         Limits {
             frame_bytes: STREAM_FRAME_BYTES,
+            streams: self.max_streams,
             slow_after: self.slow_reader_timeout,
             idle_after: self.session_idle_timeout,
         }

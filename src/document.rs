@@ -23,6 +23,10 @@ pub const MAX_COST: f64 = 1e150;
 /// One thing wrong with a document, and where.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Fault {
+    /// In a document of several lines (NDJSON): the line, from 1. The pointer is then that of a place within it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(required = false, nullable = false)]
+    pub line: Option<u64>,
     /// JSON pointer (RFC 6901) to the faulty value; the empty pointer is the whole document.
     #[schema(example = "/demonstration/3/x")]
     pub pointer: String,
@@ -47,7 +51,7 @@ impl Faults {
     /// A document with a single fault.
     #[must_use]
     pub fn one(pointer: impl Into<String>, detail: impl Into<String>) -> Self {
-        let fault = Fault { pointer: pointer.into(), detail: detail.into() };
+        let fault = Fault { line: None, pointer: pointer.into(), detail: detail.into() };
         Self { listed: vec![fault], n_unlisted: 0 }
     }
 
@@ -59,10 +63,32 @@ impl Faults {
     /// Notes a fault at `path`.
     pub fn note_at(&mut self, path: &Path<'_>, detail: impl Into<String>) {
         if self.listed.len() < Self::MAX_LISTED {
-            self.listed.push(Fault { pointer: path.to_string(), detail: detail.into() });
+            self.listed.push(Fault { line: path.line(), pointer: path.to_string(), detail: detail.into() });
         } else {
             self.n_unlisted += 1;
         }
+    }
+
+    /// Notes that something else was `expected` at `path` than what was `found`.
+    pub(crate) fn note_mismatch(&mut self, path: &Path<'_>, expected: &str, found: impl fmt::Display) {
+        self.note_at(path, format!("expected {expected}, found {found}"));
+    }
+
+    /// Notes that the index at `path` is beyond a collection of `len` things called `what`.
+    pub(crate) fn note_no_index(&mut self, path: &Path<'_>, what: &str, index: impl fmt::Display, len: usize) {
+        self.note_at(path, format!("there is no {what} {index}: there are {len}, counted from 0"));
+    }
+
+    /// Counts `n` faults that are not to be listed.
+    pub(crate) fn count_unlisted(&mut self, n: usize) {
+        self.n_unlisted += n;
+    }
+
+    /// Adds the faults of another part of the document.
+    pub(crate) fn append(&mut self, other: Self) {
+        let n_fitting = (Self::MAX_LISTED - self.listed.len()).min(other.listed.len());
+        self.n_unlisted += other.count() - n_fitting;
+        self.listed.extend(other.listed.into_iter().take(n_fitting));
     }
 
     /// Whether nothing was found wrong.
@@ -108,7 +134,8 @@ impl fmt::Display for Faults {
         for (n, fault) in self.listed.iter().enumerate() {
             let separator = if n == 0 { "" } else { "\n" };
             let pointer = if fault.pointer.is_empty() { "(document)" } else { &fault.pointer };
-            write!(f, "{separator}{pointer}: {}", fault.detail)?;
+            let line = fault.line.map(|line| format!("line {line}, ")).unwrap_or_default();
+            write!(f, "{separator}{line}{pointer}: {}", fault.detail)?;
         }
         if self.n_unlisted > 0 {
             write!(f, "\nand {} more", self.n_unlisted)?;
@@ -147,16 +174,28 @@ pub fn parse(text: &[u8]) -> Result<Value, ParseError> {
 
 /// Parses once more, slowly, to say where the fault is.
 fn explain_parse_error(text: &[u8], error: &serde_json::Error) -> ParseError {
-    let detail = error.to_string();
-    // serde_json appends the position, which is given separately here.
-    let detail = detail.split(" at line ").next().unwrap_or_default().to_owned();
-    if detail == "number out of range" {
+    let place = || {
         let mut deserializer = serde_json::Deserializer::from_slice(text);
         let tracked = serde_path_to_error::deserialize::<_, Value>(&mut deserializer);
-        let pointer = tracked.err().map(|error| pointer_of(error.path())).unwrap_or_default();
-        return Faults::one(pointer, "expected a finite number, found one beyond the range of 64-bit floats").into();
+        Faults::one(tracked.err().map(|error| pointer_of(error.path())).unwrap_or_default(), BEYOND_FLOATS)
+    };
+    ParseError::of(error, place)
+}
+
+/// What is wrong with a number that a 64-bit float cannot hold.
+pub(crate) const BEYOND_FLOATS: &str = "expected a finite number, found one beyond the range of 64-bit floats";
+
+impl ParseError {
+    /// What `error` means; `beyond_floats` gives the fault of a number that is out of range.
+    pub(crate) fn of(error: &serde_json::Error, beyond_floats: impl FnOnce() -> Faults) -> Self {
+        let detail = error.to_string();
+        // serde_json appends the position, which is given separately here.
+        let detail = detail.split(" at line ").next().unwrap_or_default().to_owned();
+        if detail == "number out of range" {
+            return beyond_floats().into();
+        }
+        Self::Syntax { line: error.line(), column: error.column(), detail }
     }
-    ParseError::Syntax { line: error.line(), column: error.column(), detail }
 }
 
 fn pointer_of(path: &serde_path_to_error::Path) -> String {
@@ -180,16 +219,29 @@ fn pointer_of(path: &serde_path_to_error::Path) -> String {
 pub enum Path<'p> {
     /// The document.
     Root,
+    /// A line of a document of several, from 1.
+    Line(u64),
     /// A member of an object.
     Member(&'p Path<'p>, &'p str),
     /// An item of an array.
     Item(&'p Path<'p>, usize),
 }
 
+impl Path<'_> {
+    /// The line that it leads into, in a document of several.
+    fn line(&self) -> Option<u64> {
+        match self {
+            Path::Root => None,
+            Path::Line(line) => Some(*line),
+            Path::Member(parent, _) | Path::Item(parent, _) => parent.line(),
+        }
+    }
+}
+
 impl fmt::Display for Path<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Path::Root => Ok(()),
+            Path::Root | Path::Line(_) => Ok(()),
             Path::Member(parent, name) => write!(f, "{parent}/{}", escape(name)),
             Path::Item(parent, index) => write!(f, "{parent}/{index}"),
         }
@@ -287,22 +339,25 @@ impl<'v, 'p> Place<'v, 'p> {
         let index = self.value.as_u64().and_then(|index| u32::try_from(index).ok());
         match index {
             Some(index) if (index as usize) < len => Some(index),
-            Some(_) => {
-                faults.note(self, format!("there is no {what} {}: there are {len}, counted from 0", self.value));
+            Some(index) => {
+                faults.note_no_index(&self.path, what, index, len);
                 None
             }
-            None => {
-                let article = if what.starts_with(['a', 'e', 'i', 'o', 'u']) { "an" } else { "a" };
-                self.mismatch(&format!("the index of {article} {what}"), faults)
-            }
+            None => self.mismatch(&index_of(what), faults),
         }
     }
 
     /// Notes that something else was `expected` here, and reads nothing.
     pub fn mismatch<T>(&self, expected: &str, faults: &mut Faults) -> Option<T> {
-        faults.note(self, format!("expected {expected}, found {}", Excerpt(self.value)));
+        faults.note_mismatch(&self.path, expected, Excerpt(self.value));
         None
     }
+}
+
+/// What is expected where a thing called `what` is referred to by its index.
+pub(crate) fn index_of(what: &str) -> String {
+    let article = if what.starts_with(['a', 'e', 'i', 'o', 'u']) { "an" } else { "a" };
+    format!("the index of {article} {what}")
 }
 
 /// An object in a document.
@@ -366,7 +421,7 @@ impl Range {
         }
     }
 
-    fn describe(self) -> &'static str {
+    pub(crate) fn describe(self) -> &'static str {
         match self {
             Self::Finite => "a number",
             Self::NonNegative => "a number of at least 0",
@@ -378,7 +433,7 @@ impl Range {
 }
 
 /// A value as it is shown in a fault: whole if short, else its kind.
-struct Excerpt<'v>(&'v Value);
+pub(crate) struct Excerpt<'v>(pub(crate) &'v Value);
 
 impl fmt::Display for Excerpt<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

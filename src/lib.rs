@@ -39,6 +39,10 @@
 //! [`stream::run`] (frames), `service::sessions` (durable before it is acknowledged) and [`mapping::OnlineMapping`]
 //! (committed steps).
 //!
+//! A model passes `http::body` (decompressed, and read as it comes if it is large), [`model::Definition::parse_from`] (into compact
+//! arrays, with all faults), [`model::Model::compile`], and `store::definitions` (its canonical text, in pieces if it is long) before
+//! `store::writer` makes it visible.
+//!
 //! A trial goes the same way through `service::trials`, with weights that a [`learning::Learner`] draws. Its reward is accepted by
 //! `store::writer`, which numbers rewards in one log per learner; `service::learner_task` folds what is new in the log into
 //! the next version of the weights.

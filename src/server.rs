@@ -97,6 +97,8 @@ impl Server {
             etude: Arc::clone(&etude),
             stopping: stopping.clone(),
             max_body_bytes: config.max_body_bytes,
+            max_model_bytes: config.max_model_bytes,
+            max_model_text_bytes: config.max_model_text_bytes,
             metrics,
             stream_limits: config.stream_limits(),
             stream_places: Arc::new(Semaphore::new(config.max_streams)),

@@ -119,6 +119,27 @@ async fn a_demonstration_gives_a_policy_that_can_be_read_again() {
     assert_eq!((status, &problem["type"]), (404, &json!("/problems/unknown-policy")));
 }
 
+#[tokio::test]
+async fn a_model_that_was_replaced_is_used_from_the_next_request_on() {
+    let service = Service::start(&[]).await;
+    let (mut model, mut hashes) = (corridor(), Vec::new());
+    let request = json!({"model": "corridor", "demonstration": [[0, "east", "open"], [1, "east", "open"]]});
+    for cost in [0.5, 0.25] {
+        model["actions"][0]["cost"] = json!(cost);
+        assert_eq!(service.put("/v1/models/corridor", &model).await.0, 201);
+        // Again, when it is known.
+        for _ in 0..2 {
+            let (status, policy) = service.post("/v1/policies", &request).await;
+            assert_eq!((status, &policy["cost"]["actions"]), (201, &json!(cost)), "{policy}");
+            hashes.push(policy["model_hash"].clone());
+        }
+        assert_eq!(service.delete("/v1/models/corridor").await.0, 204);
+        let (status, problem) = service.post("/v1/policies", &request).await;
+        assert_eq!((status, &problem["type"]), (404, &json!("/problems/unknown-model")));
+    }
+    assert!(hashes[0] == hashes[1] && hashes[1] != hashes[2], "{hashes:?}");
+}
+
 /// A policy's text without what differs from request to request.
 fn comparable(mut policy: Value) -> String {
     policy["id"] = Value::Null;

@@ -5,12 +5,14 @@
 
 #![expect(clippy::unwrap_used, reason = "tests may panic")]
 
-use std::io::{BufRead, BufReader};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
+mod process;
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::process::{Child, ChildStdin, Command, Stdio};
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
+use process::Process;
 use serde_json::{Value, json};
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::Message;
@@ -23,32 +25,6 @@ const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Observations of a stream: the demonstration of figure 4, there and back.
 const N_OBSERVATIONS: usize = 48;
-
-/// A service in a process of its own.
-struct Process {
-    child: Child,
-    address: String,
-}
-
-impl Process {
-    fn start(database: &Path) -> Self {
-        let serve = ["serve", "--listen", "127.0.0.1:0", "--log-format", "text", "--database"];
-        let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
-        command.args(serve).arg(database).env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG");
-        let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
-        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
-        let listening = lines.find(|line| line.contains("listening on http://")).expect("the service starts");
-        let address = listening.split("http://").nth(1).unwrap().split(['"', ' ']).next().unwrap().to_owned();
-        std::thread::spawn(move || lines.for_each(drop));
-        Self { child, address }
-    }
-
-    /// SIGKILL: no handler runs, nothing is flushed.
-    fn kill(mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
-    }
-}
 
 type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 
@@ -176,4 +152,106 @@ async fn a_service_killed_a_hundred_times_loses_and_doubles_nothing() {
     }
     assert!(n_streams > 5 && n_resumed_midway > N_KILLS / 3, "{n_streams} streams, {n_resumed_midway} resumed midway");
     process.kill();
+}
+
+/// `etude stream` at a service.
+struct Program {
+    child: Child,
+    input: Option<ChildStdin>,
+}
+
+impl Program {
+    fn start(flags: &[&str]) -> Self {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
+        command.args(["stream", "--json", "--lookahead", "4"]).args(flags).env_remove("ETUDE_LOG");
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+        Self { input: child.stdin.take(), child }
+    }
+
+    fn write(&mut self, observations: &[Value]) {
+        for observation in observations {
+            writeln!(self.input.as_ref().unwrap(), "{observation}").unwrap();
+        }
+    }
+
+    /// Ends the input; gives the lines that were printed, whether all is well, and the errors.
+    fn end(mut self) -> (Vec<Value>, bool, String) {
+        drop(self.input.take());
+        let ended = self.child.wait_with_output().unwrap();
+        let lines = std::str::from_utf8(&ended.stdout).unwrap().lines();
+        let frames = lines.map(|line| serde_json::from_str(line).unwrap()).collect();
+        (frames, ended.status.success(), String::from_utf8(ended.stderr).unwrap())
+    }
+}
+
+#[tokio::test]
+async fn the_command_goes_on_by_itself_when_its_service_is_killed_and_restarted() {
+    const N_RESTARTS: usize = 20;
+    let there: Vec<Value> = serde_json::from_str(include_str!("../examples/figure-4/demonstration.json")).unwrap();
+    let observations: Vec<Value> =
+        there.iter().chain(there.iter().rev()).cycle().take(20 * N_RESTARTS).cloned().collect();
+    let mut undisturbed = Program::start(&["--model", "examples/figure-4/model.json"]);
+    undisturbed.write(&observations);
+    let (mut expected, _, _) = undisturbed.end();
+
+    let directory = tempfile::tempdir().unwrap();
+    let database = directory.path().join("etude.db");
+    let mut process = Process::start(&database);
+    let address = process.address.clone();
+    let server = format!("http://{address}");
+    let mut program = Program::start(&["--model", "examples/figure-4/model.json", "--server", &server]);
+    let mut output = BufReader::new(program.child.stdout.take().unwrap());
+    let mut printed = Vec::new();
+    let mut read = |printed: &mut Vec<Value>| {
+        let mut line = String::new();
+        output.read_line(&mut line).unwrap();
+        printed.push(serde_json::from_str(&line).unwrap_or_else(|_| panic!("{line:?} after {} lines", printed.len())));
+    };
+    let mut random = SplitMix(5);
+    for chunk in observations.chunks(observations.len() / N_RESTARTS) {
+        // The moment of death: after so many steps of those to come, while other lines are on their way.
+        program.write(chunk);
+        let n_steps = 1 + random.below(8);
+        (0..n_steps).for_each(|_| read(&mut printed));
+        process.kill();
+        process = Process::start_with(&["--listen", &address], &database);
+    }
+    drop(program.input.take());
+    while printed.len() < expected.len() {
+        read(&mut printed);
+    }
+    let mut rest = String::new();
+    output.read_to_string(&mut rest).unwrap();
+    let (_, is_well, errors) = program.end();
+    assert_eq!((rest.as_str(), is_well, errors.as_str()), ("", true, ""));
+    let policy_id = printed.last_mut().unwrap()["policy_id"].take();
+    assert!(policy_id.is_string());
+    let total = |done: Option<Value>| done.unwrap()["cost"]["total"].as_f64().unwrap();
+    let (done, expected_done) = (printed.pop(), expected.pop());
+    assert_eq!(total(done), total(expected_done));
+    assert_eq!(printed, expected, "no step is missing, none comes twice");
+
+    let client = reqwest::Client::builder().no_proxy().build().unwrap();
+    let sessions: Value = client.get(format!("{server}/v1/sessions")).send().await.unwrap().json().await.unwrap();
+    let [session] = sessions["items"].as_array().unwrap().as_slice() else { panic!("{sessions}") };
+    assert_eq!((&session["status"], &session["observations"]), (&json!("done"), &json!(observations.len())));
+    process.kill();
+}
+
+#[test]
+fn a_service_that_stays_away_is_given_up() {
+    let directory = tempfile::tempdir().unwrap();
+    let process = Process::start(&directory.path().join("etude.db"));
+    let server = format!("http://{}", process.address);
+    let flags = ["--model", "examples/figure-4/model.json", "--server", &server, "--retries", "2"];
+    let mut program = Program::start(&flags);
+    program.write(&[json!({"x": 0})]);
+    let mut first = String::new();
+    BufReader::new(program.child.stdout.take().unwrap()).read_line(&mut first).unwrap();
+    assert!(first.contains(r#""step":0"#), "{first}");
+    process.kill();
+    program.write(&[json!({"x": 1})]);
+    let ended = program.child.wait_with_output().unwrap();
+    let errors = String::from_utf8(ended.stderr).unwrap();
+    assert!(!ended.status.success() && errors.contains("the connection is lost; session 0"), "{errors}");
 }

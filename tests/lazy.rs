@@ -21,7 +21,7 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 /// Nothing may be known beforehand.
-const LAZY: Limits = Limits { max_states: 0 };
+const LAZY: Limits = Limits { max_states: 0, ..Limits::DEFAULT };
 
 fn cave_of(model: &Value) -> Cave {
     match Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap() {
@@ -138,7 +138,7 @@ fn large() -> (Value, Value) {
 #[test]
 fn a_world_far_beyond_the_limit_is_mapped() {
     let (model, demonstration) = large();
-    let mapper = mapper_within(Limits { max_states: 1000 }, &model);
+    let mapper = mapper_within(Limits { max_states: 1000, ..Limits::DEFAULT }, &model);
     assert!(mapper.model().is_lazy());
     let first = cave_of(&model).first_state();
 

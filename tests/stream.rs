@@ -2,6 +2,7 @@
 
 #![expect(clippy::unwrap_used, reason = "tests may panic")]
 
+mod process;
 mod service;
 
 use std::time::Duration;
@@ -9,6 +10,7 @@ use std::time::Duration;
 use etude::service::Etude;
 use etude::stream::{Closed, Incoming, Outgoing};
 use futures_util::{SinkExt, StreamExt};
+use process::Process;
 use reqwest::Body;
 use serde_json::{Value, json};
 use service::{Service, example};
@@ -16,6 +18,8 @@ use tokio::net::TcpStream;
 use tokio::sync::mpsc;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::protocol::frame::Frame;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -31,14 +35,21 @@ struct Client {
 impl Client {
     /// Connects, and takes the server's hello.
     async fn connect(service: &Service) -> Self {
-        let mut request = format!("ws://{}/v1/stream", service.address).into_client_request().unwrap();
+        Self::connect_to(&service.address.to_string()).await
+    }
+
+    async fn connect_to(address: &str) -> Self {
+        let mut request = format!("ws://{address}/v1/stream").into_client_request().unwrap();
         request.headers_mut().insert("sec-websocket-protocol", "etude.v1+json".parse().unwrap());
         let (socket, response) = tokio_tungstenite::connect_async(request).await.unwrap();
         assert_eq!(response.headers()["sec-websocket-protocol"], "etude.v1+json");
         let mut client = Self { socket };
         let hello = client.receive().await;
         assert_eq!((&hello["type"], &hello["protocol"]), (&json!("hello"), &json!("etude.v1+json")));
-        assert_eq!(hello["limits"], json!({"frame_bytes": 262_144, "observations": 100_000}));
+        assert_eq!(
+            (&hello["limits"]["frame_bytes"], &hello["limits"]["observations"]),
+            (&json!(262_144), &json!(100_000))
+        );
         client
     }
 
@@ -446,6 +457,65 @@ async fn a_client_that_never_reads_is_closed_and_holds_up_nobody() {
     drop(stuck);
 }
 
+/// The goodbye waits behind what the client left unread, and comes once that is read.
+#[tokio::test]
+async fn a_client_that_reads_too_late_is_told_that_it_was_too_slow() {
+    let directory = tempfile::tempdir().unwrap();
+    let flags = ["--listen", "127.0.0.1:0", "--slow-reader-timeout", "200ms"];
+    let mut process = Process::start_with(&flags, &directory.path().join("etude.db"));
+    let http = reqwest::Client::builder().no_proxy().build().unwrap();
+    let model = http.put(format!("http://{}/v1/models/figure-4", process.address));
+    let registered = model.json(&example("figure-4/model.json")).send().await.unwrap();
+    assert!(registered.status().is_success());
+    let mut client = Client::connect_to(&process.address).await;
+    let session = client.open(json!({"type": "open", "model": "figure-4", "lookahead": 1})).await;
+
+    let demonstration = example("figure-4/demonstration.json");
+    let states: Vec<&Value> = demonstration.as_array().unwrap().iter().cycle().take(800).collect();
+    let address = process.address.clone();
+    let parts = ["stream closed", "1013", &session];
+    let mut closing = Box::pin(process.has_logged(&parts));
+    let mut seq = 0;
+    loop {
+        let frame = json!({"type": "observe", "seq": seq, "states": states});
+        tokio::select! {
+            () = &mut closing => break,
+            // Once the service waits for this client, it takes nothing more from it.
+            sent = client.socket.send(Message::text(frame.to_string())) => sent.unwrap(),
+        }
+        seq += states.len();
+    }
+    // Steps as they were committed, none missing, and then the reason.
+    let (mut n_received, mut n_steps) = (0, 0);
+    let code = loop {
+        match client.next().await {
+            Message::Text(text) => {
+                let frame: Value = serde_json::from_str(&text).unwrap();
+                match frame["type"].as_str().unwrap() {
+                    "received" => n_received = frame["seq"].as_u64().unwrap(),
+                    "step" => {
+                        assert_eq!(frame["step"], n_steps);
+                        n_steps += 1;
+                    }
+                    _ => panic!("{frame}"),
+                }
+            }
+            Message::Close(close) => break u16::from(close.unwrap().code),
+            _ => {}
+        }
+    };
+    assert_eq!(code, 1013);
+    assert!(n_received >= 800 && n_steps > 0, "{n_received} received, {n_steps} steps");
+
+    let mut client = Client::connect_to(&address).await;
+    client.send(json!({"type": "resume", "session": session, "step": n_steps})).await;
+    let opened = client.receive().await;
+    assert!(opened["received"].as_u64().unwrap() >= n_received, "{opened}");
+    assert_eq!(client.receive().await["step"], n_steps);
+    drop(closing);
+    process.kill();
+}
+
 #[tokio::test]
 async fn a_shutdown_ends_streams_so_that_they_can_be_resumed() {
     let (service, demonstration) = figure_4().await;
@@ -484,6 +554,35 @@ async fn idle_sessions_expire() {
     client.send(json!({"type": "resume", "session": session})).await;
     assert_eq!(client.receive().await["problem"]["type"], "/problems/expired");
     assert_eq!(client.closed().await, 4404);
+}
+
+#[tokio::test]
+async fn the_limits_in_hello_are_those_that_are_kept() {
+    let flags = ["--max-streams", "2", "--session-idle-timeout", "20s", "--slow-reader-timeout", "1500ms"];
+    let service = Service::start(&flags).await;
+    let (socket, _) = tokio_tungstenite::connect_async(format!("ws://{}/v1/stream", service.address)).await.unwrap();
+    let mut client = Client { socket };
+    let limits = client.receive().await["limits"].take();
+    let expected = json!({
+        "frame_bytes": 262_144, "message_bytes": 262_144, "observations": 100_000,
+        "streams": 2, "idle_timeout_ms": 20_000, "slow_reader_timeout_ms": 1500,
+    });
+    assert_eq!(limits, expected);
+
+    // Fragments count as the message that they are parts of, up to the last byte.
+    let end = json!({"type": "end", "seq": 0}).to_string();
+    for (n_bytes, problem) in [(262_144, "not-allowed"), (262_145, "too-large")] {
+        let mut client = Client::connect(&service).await;
+        let padding = " ".repeat(n_bytes - end.len());
+        let (first, second) = padding.split_at(padding.len() / 2);
+        for (fragment, opcode, is_final) in
+            [(end.as_str(), Data::Text, false), (first, Data::Continue, false), (second, Data::Continue, true)]
+        {
+            let frame = Frame::message(fragment.as_bytes().to_vec(), OpCode::Data(opcode), is_final);
+            client.socket.send(Message::Frame(frame)).await.unwrap();
+        }
+        assert_eq!(client.receive().await["problem"]["type"], format!("/problems/{problem}"), "{n_bytes} bytes");
+    }
 }
 
 #[tokio::test]

@@ -16,6 +16,8 @@ mod schema;
 mod value;
 mod weights;
 
+use serde::Serialize;
+
 pub use by_attribute::ByAttribute;
 pub use labels::Labels;
 pub use schema::{AttributeDocument, KindName, Schema};
@@ -121,6 +123,17 @@ impl Attribute {
         if weight == 0.0 || delta == 0.0 { 0.0 } else { (weight * delta * delta).min(MAX_COST) }
     }
 
+    /// What its values are, as a fault says it.
+    pub(crate) fn expected(&self) -> String {
+        match &self.kind {
+            Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. } => Range::Finite.describe().to_owned(),
+            Kind::Cyclic { cycle: Cycle::Labels(labels), .. } => {
+                format!("one of the labels {}", list_known(labels.names()))
+            }
+            Kind::Category => "a string, an integer or a boolean".to_owned(),
+        }
+    }
+
     /// Reads a value of this attribute.
     pub fn read_value(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Value> {
         use serde_json::Value as Json;
@@ -131,13 +144,24 @@ impl Attribute {
             (Kind::Cyclic { cycle: Cycle::Labels(labels), .. }, value) => {
                 match value.as_str().and_then(|text| labels.position(text)) {
                     Some(position) => Some(Value::Label(position)),
-                    None => place.mismatch(&format!("one of the labels {}", list_known(labels.names())), faults),
+                    None => place.mismatch(&self.expected(), faults),
                 }
             }
             (Kind::Category, Json::String(_)) => read_text(place, faults).map(|text| Value::Text(text.into())),
             (Kind::Category, Json::Bool(flag)) => Some(Value::Boolean(*flag)),
             (Kind::Category, Json::Number(number)) if number.is_i64() => number.as_i64().map(Value::Integer),
-            (Kind::Category, _) => place.mismatch("a string, an integer or a boolean", faults),
+            (Kind::Category, _) => place.mismatch(&self.expected(), faults),
+        }
+    }
+
+    /// `value` as it is written outside, without a copy.
+    pub(crate) fn written<'v>(&'v self, value: &'v Value) -> Written<'v> {
+        match (value, &self.kind) {
+            (Value::Label(label), Kind::Cyclic { cycle: Cycle::Labels(labels), .. }) => {
+                Written::Text(&labels.names()[*label as usize])
+            }
+            (Value::Text(text), _) => Written::Text(text),
+            _ => Written::Scalar(self.write_value(value)),
         }
     }
 
@@ -155,6 +179,14 @@ impl Attribute {
             (Value::Boolean(flag), _) => Scalar::Boolean(*flag),
         }
     }
+}
+
+/// A value of an attribute, as it is written in JSON.
+#[derive(Serialize)]
+#[serde(untagged)]
+pub(crate) enum Written<'v> {
+    Text(&'v str),
+    Scalar(Scalar),
 }
 
 /// Reads a label, or a string of a category.

@@ -57,7 +57,7 @@ enum HeuristicArg {
 impl Map {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
         // A lookahead needs all states.
-        let limits = if self.lookahead.is_some() { Limits { max_states: usize::MAX } } else { Limits::DEFAULT };
+        let limits = if self.lookahead.is_some() { Limits::NONE } else { Limits::DEFAULT };
         let (definition, model) = read_model(&self.model, limits)?;
         let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
 
@@ -77,7 +77,7 @@ impl Map {
         let stamp = Stamp {
             id: None,
             model: request["model"].as_str().unwrap_or_default().to_owned(),
-            model_hash: hash_of(&definition.document().text()),
+            model_hash: hash_of(&definition.text()),
             lookahead: asked.lookahead.map(NonZeroU32::get),
             elapsed_us: as_micros(started.elapsed()),
             ..Stamp::default()
@@ -135,8 +135,7 @@ pub(super) fn read_model(path: &Path, limits: Limits) -> Result<(Definition, Mod
         CompileError::Faults(faults) => CliError::Faults { what: path.display().to_string(), faults },
         CompileError::Cancelled(cancelled) => cancelled.into(),
     };
-    let definition = Definition::read(&read_json(path)?, Limits { max_states: usize::MAX }, &mut Uninterrupted)
-        .map_err(model_error)?;
+    let definition = Definition::read(&read_json(path)?, Limits::NONE, &mut Uninterrupted).map_err(model_error)?;
     let model = Model::compile(&definition, limits, &mut Uninterrupted)?;
     Ok((definition, model))
 }

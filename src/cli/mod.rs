@@ -12,6 +12,7 @@ mod serve;
 mod side_by_side;
 mod stream;
 mod stream_client;
+mod stream_session;
 
 use std::error::Error;
 use std::io;

@@ -6,7 +6,6 @@
 //!
 //! With and without a server, what is printed is made from the same frames of the stream protocol.
 
-use std::collections::VecDeque;
 use std::io::{self, BufRead, Write};
 use std::num::NonZeroU32;
 use std::path::PathBuf;
@@ -19,7 +18,8 @@ use serde_json::{Map as Members, Value, json};
 use tokio::sync::mpsc;
 
 use super::map::{parse_json, parse_weight, read_json, read_model};
-use super::{CliError, client, render, runtime, stream_client};
+use super::stream_session::StreamSession;
+use super::{CliError, client, render, runtime};
 use crate::attribute::{ByAttribute, Scalar};
 use crate::document::{self, Faults, ParseError, Place};
 use crate::interrupt::Uninterrupted;
@@ -28,7 +28,7 @@ use crate::model::Limits;
 use crate::stream::frames::ServerFrame;
 
 /// Lines that were read ahead.
-const MAX_READ_AHEAD: usize = 64;
+pub(super) const MAX_READ_AHEAD: usize = 64;
 
 #[derive(Args, Debug)]
 pub(super) struct Stream {
@@ -39,6 +39,9 @@ pub(super) struct Stream {
     /// Let the service at this address do it, such as <http://127.0.0.1:8080>, and keep the session there.
     #[arg(long, value_name = "URL")]
     server: Option<String>,
+    /// How often in a row a lost connection to the service is tried anew before it is given up.
+    #[arg(long, value_name = "N", default_value_t = 10)]
+    retries: u32,
     /// How many observations past the current one a step may wait for; none: commit only what is proven.
     #[arg(long, value_name = "N|none", default_value = "8", value_parser = parse_lookahead)]
     lookahead: Lookahead,
@@ -69,7 +72,7 @@ impl Stream {
     }
 
     fn run_here(&self, printer: &mut Printer<'_, impl Write>) -> Result<(), CliError> {
-        let (_, model) = read_model(&self.model, Limits { max_states: usize::MAX })?;
+        let (_, model) = read_model(&self.model, Limits::NONE)?;
         let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
         let schema = mapper.model().schema();
         let request = Value::Object(self.options());
@@ -116,53 +119,10 @@ impl Stream {
     async fn run_at(&self, server: &str, printer: &mut Printer<'_, impl Write>) -> Result<(), CliError> {
         let client = client::client()?;
         let model = self.register(&client, server).await?;
-        let (frames, mut answers) = stream_client::connect(&client, server).await?;
         let mut open = self.options();
         open.extend([("type".to_owned(), json!("open")), ("model".to_owned(), json!(model))]);
         open.insert("lookahead".to_owned(), json!(self.lookahead.0));
-        frames.send(&open.into()).await;
-
-        let mut lines = read_lines();
-        let mut n_sent: u32 = 0;
-        // Lines that are not answered yet: each is, by `received` or an error, in order.
-        let mut unanswered = VecDeque::new();
-        let mut frames = Some(frames);
-        let mut session = String::new();
-        loop {
-            let is_reading = frames.is_some() && unanswered.len() < MAX_READ_AHEAD && !session.is_empty();
-            tokio::select! {
-                line = lines.recv(), if is_reading => {
-                    let Some(sending) = &frames else { continue };
-                    let line = match line {
-                        None => None,
-                        Some(line) => line?,
-                    };
-                    let Some(Line { number, observation }) = line else {
-                        sending.send(&json!({"type": "end", "seq": n_sent})).await;
-                        frames = None;
-                        continue;
-                    };
-                    sending.send(&json!({"type": "observe", "seq": n_sent, "states": [observation]})).await;
-                    unanswered.push_back(number);
-                    n_sent += 1;
-                }
-                answer = answers.receive() => {
-                    let Some(text) = answer? else {
-                        return Err(CliError::Stream(format!("the service ended it; session {session} can be resumed")));
-                    };
-                    match printer.frame(&text)? {
-                        Answer::Done => return Ok(()),
-                        Answer::Opened { session: id } => session = id,
-                        Answer::Received { seq } => {
-                            unanswered.pop_front();
-                            printer.received(seq);
-                        }
-                        Answer::Error { problem } => return Err(refused(problem, unanswered.pop_front())),
-                        Answer::Hello | Answer::Step => {}
-                    }
-                }
-            }
-        }
+        StreamSession::new(client, server, open.into(), read_lines()).run(printer, self.retries).await
     }
 
     /// The name of the model at the service; a file is registered under its name first.
@@ -214,10 +174,10 @@ pub(super) fn refused(problem: Problem, line: Option<u64>) -> CliError {
 }
 
 /// A line of the input.
-struct Line {
+pub(super) struct Line {
     /// Counted from 1, blank ones too.
-    number: u64,
-    observation: Value,
+    pub(super) number: u64,
+    pub(super) observation: Value,
 }
 
 struct Lines<R> {
@@ -270,7 +230,7 @@ fn read_lines() -> mpsc::Receiver<Result<Option<Line>, CliError>> {
 #[serde(tag = "type", rename_all = "lowercase")]
 pub(super) enum Frame {
     Hello,
-    Opened { session: String, weights: ByAttribute<f64> },
+    Opened { session: String, weights: ByAttribute<f64>, received: u32 },
     Received { seq: u32 },
     Step(Step),
     Done { policy_id: Option<String>, status: Status, cost: Cost },
@@ -302,6 +262,13 @@ pub(super) struct Problem {
     errors: Vec<Fault>,
 }
 
+impl Problem {
+    /// Whether it is one of the service that passes, so that the session is to be resumed.
+    pub(super) fn is_passing(&self) -> bool {
+        ["/problems/stopping", "/problems/overloaded", "/problems/internal"].contains(&self.kind.as_str())
+    }
+}
+
 #[derive(Debug, Deserialize)]
 struct Fault {
     pointer: String,
@@ -309,9 +276,9 @@ struct Fault {
 }
 
 /// What a frame was, once it was printed.
-enum Answer {
+pub(super) enum Answer {
     Hello,
-    Opened { session: String },
+    Opened { session: String, received: u32 },
     Received { seq: u32 },
     Step,
     Done,
@@ -319,7 +286,7 @@ enum Answer {
 }
 
 /// Prints frames: steps and the totals, each as soon as it is there.
-struct Printer<'o, W> {
+pub(super) struct Printer<'o, W> {
     out: &'o mut W,
     is_json: bool,
     progress: ProgressBar,
@@ -341,17 +308,17 @@ impl<'o, W: Write> Printer<'o, W> {
         Self { out, is_json, progress, weights: None, n_steps: 0, widths: (10, 20) }
     }
 
-    fn received(&self, n_observations: u32) {
+    pub(super) fn received(&self, n_observations: u32) {
         self.progress.set_position(n_observations.into());
     }
 
-    fn frame(&mut self, text: &str) -> Result<Answer, CliError> {
+    pub(super) fn frame(&mut self, text: &str) -> Result<Answer, CliError> {
         let frame: Frame = serde_json::from_str(text).map_err(|error| CliError::Io(error.into()))?;
         Ok(match frame {
             Frame::Hello => Answer::Hello,
-            Frame::Opened { session, weights } => {
+            Frame::Opened { session, weights, received } => {
                 self.weights = Some(weights);
-                Answer::Opened { session }
+                Answer::Opened { session, received }
             }
             Frame::Received { seq } => Answer::Received { seq },
             Frame::Step(step) => {
@@ -384,6 +351,16 @@ impl<'o, W: Write> Printer<'o, W> {
             }
             Frame::Error { problem } => Answer::Error { problem },
         })
+    }
+
+    /// How many steps were printed.
+    pub(super) fn n_steps(&self) -> u64 {
+        self.n_steps
+    }
+
+    /// Tells whoever watches of something, above the progress line; a pipe is told nothing.
+    pub(super) fn note(&self, text: &str) {
+        self.progress.println(text);
     }
 
     fn readable(&mut self, step: &Step) -> String {

@@ -104,11 +104,11 @@ impl From<WeightsAnswer> for WeightsBody {
     responses(
         (status = 201, description = "It is new; its weights have version 0", body = LearnerBody),
         (status = 200, description = "The same content was there already, under this name", body = LearnerBody),
-        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "`conflict`: other content is there under this name", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
     ),
 )]

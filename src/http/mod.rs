@@ -9,6 +9,7 @@
 //! The OpenAPI description is generated from the handlers of this module; [`openapi`] gives it without a running service.
 
 mod body;
+mod encoding;
 mod learners;
 mod models;
 mod observe;
@@ -45,6 +46,10 @@ pub struct Context {
     pub stopping: CancellationToken,
     /// Largest body that is read, in bytes.
     pub max_body_bytes: usize,
+    /// Largest model that is read, in bytes as it is sent. If it is left out, as for other bodies.
+    pub max_model_bytes: Option<usize>,
+    /// Largest model that is read, in bytes once it is decompressed.
+    pub max_model_text_bytes: u64,
     /// Renders what was measured.
     pub metrics: PrometheusHandle,
     /// What a stream may use.
@@ -73,7 +78,7 @@ impl Context {
         description = "A service by which an agent learns a task by watching it done: it finds the policy, in the agent's own \
                        actions, whose effects follow a demonstration most closely.\n\nEvery error is a problem document \
                        (RFC 9457) whose `type` is listed under its status; for 422 it lists all faults of the body, each \
-                       with its JSON pointer. Every answer carries an `x-request-id`, taken from the request if that has \
+                       with its JSON pointer. Every body may be compressed (`Content-Encoding: gzip` or `zstd`). Every answer carries an `x-request-id`, taken from the request if that has \
                        one.\n\nLists are read in pages: `limit` items, then `after` the `next` of the page before.",
     ),
     tags(
@@ -99,6 +104,7 @@ fn routes() -> OpenApiRouter<Context> {
         .routes(routes!(models::list_models))
         .routes(routes!(policies::make_policy, policies::list_policies))
         .routes(routes!(policies::get_policy))
+        .routes(routes!(policies::make_policies))
         .routes(routes!(stream::websocket, stream::ndjson))
         .routes(routes!(stream::list_sessions))
         .routes(routes!(stream::get_session))

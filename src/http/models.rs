@@ -1,21 +1,27 @@
 //! `/v1/models`.
 
+use std::sync::Arc;
+
 use axum::extract::{Request, State};
 use axum::http::StatusCode;
 use axum::response::Response;
+use futures_util::future::{self, OptionFuture};
+use futures_util::stream::{self, Stream};
+use futures_util::{FutureExt, StreamExt};
 use jiff::Timestamp;
 use serde::Serialize;
 use serde_json::value::RawValue;
 use utoipa::ToSchema;
 
 use super::Context;
-use super::body::{json, read_json};
+use super::body::{Pump, SentLimit, SentModel, json, json_stream, read_model};
+use super::encoding::DecodedLimit;
 use super::paging::{List, Paging};
 use super::path::PathName;
 use super::problem::Problem;
 use crate::attribute::AttributeDocument;
 use crate::model::{ActionDocument, DefinitionDocument};
-use crate::service::{ModelAnswer, Registered};
+use crate::service::{Etude, ModelAnswer, ModelDefinition, Registered, ServiceError};
 use crate::store::ModelSummary;
 
 /// A registered model.
@@ -87,18 +93,29 @@ struct WholeModelBody {
 }
 
 /// Register a model under a name.
+///
+/// The body may be compressed (`Content-Encoding: gzip` or `zstd`), and its members may stand in any order; a large one is read as it
+/// comes. As NDJSON, the first line is the model, whose `dynamics` may lack `states` and `transitions`; each further line is an object
+/// with more of one or both, such as `{"states": [[2, "east", "open"]]}`, in any number and order. A line has at most 64 MiB.
+/// Faults then carry the `line`, and a `pointer` within it.
 #[utoipa::path(
     put, path = "/v1/models/{model}", tag = "models",
-    params(("model" = String, Path, description = "Its name: 1 to 64 of `a-z A-Z 0-9 . _ -`")),
-    request_body = DefinitionDocument,
+    params(
+        ("model" = String, Path, description = "Its name: 1 to 64 of `a-z A-Z 0-9 . _ -`"),
+        ("content-encoding" = Option<String>, Header, description = "`gzip`, `zstd` or `identity`"),
+    ),
+    request_body(content(
+        (DefinitionDocument = "application/json"),
+        (String = "application/x-ndjson", example = "{\"attributes\":[{\"name\":\"x\",\"kind\":\"number\"}],\"actions\":[{\"name\":\"on\"}],\"dynamics\":{\"kind\":\"table\",\"start\":0}}\n{\"states\":[[0],[1]]}\n{\"transitions\":[[0,\"on\",1]]}\n"),
+    )),
     responses(
         (status = 201, description = "It is new", body = ModelBody),
         (status = 200, description = "The same content was there already, under this name", body = ModelBody),
-        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "`conflict`: other content is there under this name", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`; `unsupported-encoding`: see `Accept-Encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
@@ -108,8 +125,15 @@ pub(super) async fn put_model(
     PathName(name): PathName,
     request: Request,
 ) -> Result<Response, Problem> {
-    let body = read_json(request, context.max_body_bytes).await?;
-    let (registered, summary) = context.etude.put_model(&name, body, Timestamp::now()).await?;
+    let sent = match context.max_model_bytes {
+        Some(n_bytes) => SentLimit { n_bytes, setting: "ETUDE_MAX_MODEL_BYTES" },
+        None => SentLimit { n_bytes: context.max_body_bytes, setting: "ETUDE_MAX_BODY_BYTES" },
+    };
+    let decoded = DecodedLimit { n_bytes: context.max_model_text_bytes, setting: "ETUDE_MAX_MODEL_TEXT_BYTES" };
+    let SentModel { text, format, pump } = read_model(request, sent, decoded).await?;
+    let put = context.etude.put_model(&name, text, format, Timestamp::now());
+    let (put, ()) = tokio::join!(put, OptionFuture::from(pump.map(Pump::run)).map(|_| ()));
+    let (registered, summary) = put?;
     let status = match registered {
         Registered::New => StatusCode::CREATED,
         Registered::Already => StatusCode::OK,
@@ -129,7 +153,28 @@ pub(super) async fn put_model(
 )]
 pub(super) async fn get_model(State(context): State<Context>, PathName(name): PathName) -> Result<Response, Problem> {
     let ModelAnswer { summary, definition } = context.etude.model(&name).await?;
-    Ok(json(StatusCode::OK, &WholeModelBody { summary: summary.into(), definition }))
+    let summary = summary.into();
+    match definition {
+        ModelDefinition::Text(definition) => Ok(json(StatusCode::OK, &WholeModelBody { summary, definition })),
+        ModelDefinition::Pieces(id) => Ok(json_stream(whole_model(context.etude, &summary, id)?)),
+    }
+}
+
+/// The text of a [`WholeModelBody`] whose definition is too large to be held.
+fn whole_model(
+    etude: Arc<Etude>,
+    summary: &ModelBody,
+    id: i64,
+) -> Result<impl Stream<Item = Result<Vec<u8>, ServiceError>> + use<>, ServiceError> {
+    let mut head = serde_json::to_vec(summary).map_err(ServiceError::Write)?;
+    head.pop();
+    head.extend_from_slice(b",\"definition\":");
+    let pieces = stream::try_unfold(0, move |seq| {
+        let etude = Arc::clone(&etude);
+        async move { Ok(etude.definition_piece(id, seq).await?.map(|piece| (piece, seq + 1))) }
+    });
+    let of = |bytes| stream::once(future::ready(Ok(bytes)));
+    Ok(of(head).chain(pieces).chain(of(b"}".to_vec())))
 }
 
 /// Models, in the order of their names.

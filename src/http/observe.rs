@@ -2,6 +2,7 @@
 
 use std::any::Any;
 use std::panic::AssertUnwindSafe;
+use std::sync::Arc;
 use std::time::Instant;
 
 use axum::extract::{MatchedPath, Request};
@@ -19,9 +20,14 @@ const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 /// Longest request id that is taken from a client.
 const MAX_REQUEST_ID_BYTES: usize = 64;
 
+/// The id of the request, for handlers.
+#[derive(Clone, Debug)]
+pub(super) struct RequestId(pub(super) Arc<str>);
+
 /// Gives the request an id, logs and measures it, turns panics into problems and problems into documents.
-pub(super) async fn observe(request: Request, next: Next) -> Response {
-    let id = request_id(request.headers());
+pub(super) async fn observe(mut request: Request, next: Next) -> Response {
+    let id: Arc<str> = request_id(request.headers()).into();
+    request.extensions_mut().insert(RequestId(Arc::clone(&id)));
     let route = request.extensions().get::<MatchedPath>().map_or("(none)", MatchedPath::as_str).to_owned();
     let is_probe = matches!(route.as_str(), "/livez" | "/readyz" | "/metrics");
     let method = request.method().clone();

@@ -2,18 +2,23 @@
 
 use std::time::Instant;
 
+use axum::Extension;
 use axum::extract::{Request, State};
 use axum::http::header::LOCATION;
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::Response;
 use jiff::Timestamp;
+use serde::Serialize;
+use utoipa::ToSchema;
 
 use super::Context;
 use super::body::{json, json_text, read_json};
+use super::observe::RequestId;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::Problem;
 use crate::mapping::{Policy, PolicySummary, RequestDocument};
+use crate::service::{BatchRequest, ServiceError};
 
 /// Follow a demonstration: the policy whose effects come closest to it, stored.
 #[utoipa::path(
@@ -22,11 +27,11 @@ use crate::mapping::{Policy, PolicySummary, RequestDocument};
     responses(
         (status = 201, description = "The policy", body = Policy,
             headers(("location" = String, description = "Where it can be read again"))),
-        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "`unknown-model`, `unknown-learner`", body = Problem, content_type = "application/problem+json"),
         (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
@@ -40,6 +45,51 @@ pub(super) async fn make_policy(State(context): State<Context>, request: Request
         response.headers_mut().insert(LOCATION, location);
     }
     Ok(response)
+}
+
+/// Follow many demonstrations with one body: a policy or a problem for each of them, in the order of the items.
+///
+/// Options beside `items` hold for every item that has none of its own; weights are merged attribute by attribute. What is wrong
+/// with an item is told in its place, with pointers into the batch, and does not keep the others from their policies; what is
+/// wrong with the batch itself fails the whole. The policies are those that single requests give, and they are stored together:
+/// all of them are durable when the batch is answered, and none is if it is not.
+#[utoipa::path(
+    post, path = "/v1/policies:batch", tag = "policies",
+    request_body = BatchRequest,
+    responses(
+        (status = 200, description = "For each item its policy, or what is wrong with it", body = BatchAnswer),
+        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "`unknown-model`, `unknown-learner`", body = Problem, content_type = "application/problem+json"),
+        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+    ),
+)]
+pub(super) async fn make_policies(
+    State(context): State<Context>,
+    Extension(id): Extension<RequestId>,
+    request: Request,
+) -> Result<Response, Problem> {
+    let arrived = Instant::now();
+    let body = read_json(request, context.max_body_bytes).await?;
+    let made = context.etude.make_policies(body, arrived, Timestamp::now()).await?;
+    let mut text = String::with_capacity(made.iter().flatten().map(|made| made.policy.len() + 1).sum());
+    let mut separator = r#"{"items":["#;
+    for item in made {
+        text.push_str(separator);
+        match item {
+            Ok(made) => text.push_str(&made.policy),
+            Err(error) => {
+                let problem = ItemProblem { problem: Problem::from(error).of_request(&id) };
+                text.push_str(&serde_json::to_string(&problem).map_err(ServiceError::Write)?);
+            }
+        }
+        separator = ",";
+    }
+    text.push_str("]}");
+    Ok(json_text(StatusCode::OK, text))
 }
 
 /// A policy, as it was answered when it was made.
@@ -67,4 +117,30 @@ pub(super) async fn get_policy(State(context): State<Context>, PathId(id): PathI
 pub(super) async fn list_policies(State(context): State<Context>, paging: Paging) -> Result<Response, Problem> {
     let page = context.etude.policies(after_sequence(&paging)?, paging.limit).await?;
     Ok(json(StatusCode::OK, &List::of(page, |policy| policy)))
+}
+
+/// What became of a batch.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "what describes the answer, which is put together from texts")]
+pub(super) struct BatchAnswer {
+    /// For each item of the batch, in the same order.
+    items: Vec<BatchItem>,
+}
+
+/// What became of an item.
+#[derive(Serialize, ToSchema)]
+#[serde(untagged)]
+#[expect(dead_code, reason = "as above")]
+enum BatchItem {
+    /// Its policy, stored.
+    Policy(Policy),
+    /// What is wrong with it.
+    Problem(ItemProblem),
+}
+
+/// What is wrong with an item.
+#[derive(Serialize, ToSchema)]
+struct ItemProblem {
+    /// As a single request is answered; pointers lead into the batch.
+    problem: Problem,
 }

@@ -2,12 +2,14 @@
 
 use std::error::Error;
 
-use axum::http::header::{CONTENT_TYPE, RETRY_AFTER};
+use axum::http::header::{ACCEPT_ENCODING, CONTENT_TYPE, RETRY_AFTER};
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use super::encoding::Encoding;
+use super::observe::RequestId;
 use crate::document::{Fault, Faults, ParseError};
 use crate::service::{self, PoolError, ServiceError};
 use crate::store::StoreError;
@@ -17,6 +19,7 @@ use crate::store::StoreError;
 pub(super) enum ProblemKind {
     MalformedJson,
     IncompleteBody,
+    BrokenEncoding,
     NotFound,
     UnknownModel,
     UnknownPolicy,
@@ -31,6 +34,7 @@ pub(super) enum ProblemKind {
     TrialFailed,
     TooLarge,
     UnsupportedMediaType,
+    UnsupportedEncoding,
     Invalid,
     Internal,
     Busy,
@@ -44,6 +48,7 @@ impl ProblemKind {
         match self {
             Self::MalformedJson => ("malformed-json", "The body is not JSON", StatusCode::BAD_REQUEST),
             Self::IncompleteBody => ("incomplete-body", "The body ended early", StatusCode::BAD_REQUEST),
+            Self::BrokenEncoding => ("broken-encoding", "The body cannot be decompressed", StatusCode::BAD_REQUEST),
             Self::NotFound => ("not-found", "There is nothing here", StatusCode::NOT_FOUND),
             Self::UnknownModel => ("unknown-model", "There is no such model", StatusCode::NOT_FOUND),
             Self::UnknownPolicy => ("unknown-policy", "There is no such policy", StatusCode::NOT_FOUND),
@@ -61,6 +66,9 @@ impl ProblemKind {
             Self::TooLarge => ("too-large", "The body is too large", StatusCode::PAYLOAD_TOO_LARGE),
             Self::UnsupportedMediaType => {
                 ("unsupported-media-type", "The body must be JSON", StatusCode::UNSUPPORTED_MEDIA_TYPE)
+            }
+            Self::UnsupportedEncoding => {
+                ("unsupported-encoding", "The body's compression is not supported", StatusCode::UNSUPPORTED_MEDIA_TYPE)
             }
             Self::Invalid => ("invalid", "The request has faults", StatusCode::UNPROCESSABLE_ENTITY),
             Self::Internal => ("internal", "Something went wrong here", StatusCode::INTERNAL_SERVER_ERROR),
@@ -121,6 +129,11 @@ impl Problem {
         Self { errors: faults.listed().to_vec(), ..Self::new(ProblemKind::Invalid, detail) }
     }
 
+    /// The same, as part of the answer to a request.
+    pub(super) fn of_request(self, id: &RequestId) -> Self {
+        Self { request_id: id.0.to_string(), ..self }
+    }
+
     /// The document, with the id of the request it answers.
     pub(super) fn render(mut self, request_id: &str) -> Response {
         request_id.clone_into(&mut self.request_id);
@@ -128,6 +141,9 @@ impl Problem {
         let body = serde_json::to_vec(&self).unwrap_or_default();
         let mut response = (status, body).into_response();
         response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
+        if self.kind == Self::new(ProblemKind::UnsupportedEncoding, "").kind {
+            response.headers_mut().insert(ACCEPT_ENCODING, HeaderValue::from_static(Encoding::ACCEPTED));
+        }
         if status == StatusCode::SERVICE_UNAVAILABLE {
             response.headers_mut().insert(RETRY_AFTER, service::RETRY_AFTER.as_secs().into());
         }
@@ -157,6 +173,8 @@ impl From<ServiceError> for Problem {
         match error {
             ServiceError::Parse(ParseError::Syntax { .. }) => Self::new(ProblemKind::MalformedJson, detail),
             ServiceError::Parse(ParseError::Faults(faults)) | ServiceError::Faults(faults) => Self::invalid(&faults),
+            ServiceError::TooLarge(_) => Self::new(ProblemKind::TooLarge, detail),
+            ServiceError::Body(error) => super::body::unreadable(&error),
             ServiceError::Unknown { kind, pointer, .. } => {
                 let problem = match kind {
                     "policy" => ProblemKind::UnknownPolicy,
@@ -165,7 +183,8 @@ impl From<ServiceError> for Problem {
                     "trial" => ProblemKind::UnknownTrial,
                     _ => ProblemKind::UnknownModel,
                 };
-                let fault = pointer.map(|pointer| Fault { pointer: pointer.to_owned(), detail: detail.clone() });
+                let fault =
+                    pointer.map(|pointer| Fault { line: None, pointer: pointer.to_owned(), detail: detail.clone() });
                 Self { errors: fault.into_iter().collect(), ..Self::new(problem, detail) }
             }
             ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),

@@ -33,6 +33,10 @@ const MAX_WAITING: usize = 64;
 /// How much of a message over the limit is still taken in, as a multiple of the limit, so that it can be answered.
 const MAX_OVERSIZE: usize = 4;
 
+/// How much is read from a socket at once. Held by every stream, most of which wait for a small frame; a larger one is
+/// read in several goes.
+const READ_BUFFER_BYTES: usize = 8192;
+
 /// How long a closing handshake may take.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -58,7 +62,8 @@ pub(super) async fn websocket(
         .protocols([PROTOCOL])
         .max_message_size(limit * MAX_OVERSIZE)
         .max_frame_size(limit * MAX_OVERSIZE)
-        .max_write_buffer_size(limit * MAX_OVERSIZE);
+        .max_write_buffer_size(limit * MAX_OVERSIZE)
+        .read_buffer_size(READ_BUFFER_BYTES);
     let span = tracing::Span::current();
     Ok(upgrade.on_upgrade(move |socket| {
         let streams = context.streams.clone();
@@ -89,8 +94,10 @@ async fn serve_websocket(context: Context, socket: WebSocket, place: OwnedSemaph
     };
     let talking = async {
         tokio::select! {
-            () = write_websocket(sink, goes) => {}
+            // In the order in which a frame passes, so that it passes in one go.
+            biased;
             () = speaking => {}
+            () = write_websocket(sink, goes) => {}
         }
         // The client's half of the closing handshake, for which a shutdown does not wait.
         tokio::select! {
@@ -105,8 +112,9 @@ async fn serve_websocket(context: Context, socket: WebSocket, place: OwnedSemaph
         std::future::pending::<()>().await;
     };
     tokio::select! {
-        () = talking => {}
+        biased;
         () = listening => {}
+        () = talking => {}
     }
     drop(place);
 }
@@ -135,18 +143,26 @@ async fn read_websocket(mut source: SplitStream<WebSocket>, came: mpsc::Sender<I
 }
 
 async fn write_websocket(mut sink: SplitSink<WebSocket, Message>, mut goes: mpsc::Receiver<Outgoing>) {
-    while let Some(outgoing) = goes.recv().await {
-        let sent = match outgoing {
-            Outgoing::Frame(text) => sink.send(Message::Text(text.into())).await,
-            Outgoing::Close(closed) => {
-                let (code, reason) = closed.code();
-                let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
-                // A client that does not read does not hear this either.
-                let _ = tokio::time::timeout(CLOSE_TIMEOUT, sink.send(close)).await;
+    while let Some(first) = goes.recv().await {
+        // What waits together is written together: a write, and a wakeup of the client, cost more than a frame.
+        let mut next = Some(first);
+        while let Some(outgoing) = next {
+            let fed = match outgoing {
+                Outgoing::Frame(text) => sink.feed(Message::Text(text.into())).await,
+                Outgoing::Close(closed) => {
+                    let (code, reason) = closed.code();
+                    let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
+                    // A client that does not read does not hear this either.
+                    let _ = tokio::time::timeout(CLOSE_TIMEOUT, sink.send(close)).await;
+                    return;
+                }
+            };
+            if fed.is_err() {
                 return;
             }
-        };
-        if sent.is_err() {
+            next = goes.try_recv().ok();
+        }
+        if sink.flush().await.is_err() {
             return;
         }
     }

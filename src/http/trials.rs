@@ -130,11 +130,11 @@ pub(super) struct FailureBody {
     responses(
         (status = 201, description = "The trial, with its policy", body = TrialBody,
             headers(("location" = String, description = "Where it can be read again"))),
-        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "`unknown-learner`, `unknown-model`", body = Problem, content_type = "application/problem+json"),
         (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`; also if the model lacks an attribute of the learner", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
@@ -225,12 +225,12 @@ pub(super) async fn get_trial(State(context): State<Context>, PathId(id): PathId
     request_body = RewardBody,
     responses(
         (status = 200, description = "The reward is the trial's, now or already", body = TrialBody),
-        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "`unknown-trial`: also if its learner was deleted", body = Problem, content_type = "application/problem+json"),
         (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "`already-rewarded`: it has another reward; `trial-failed`", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`: among others, not finite", body = Problem, content_type = "application/problem+json"),
     ),
 )]
@@ -251,12 +251,12 @@ pub(super) async fn put_reward(
     request_body = FailureBody,
     responses(
         (status = 200, description = "The trial has failed, now or already for this reason", body = TrialBody),
-        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "`unknown-trial`: also if its learner was deleted", body = Problem, content_type = "application/problem+json"),
         (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "`already-rewarded`; `trial-failed`: for another reason", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
     ),
 )]

@@ -75,9 +75,7 @@ impl<'m> Request<'m> {
             None => Some(None),
         };
         let options = Self::read_options(object, faults);
-        if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {
-            faults.note(&place, "this world is searched lazily, which needs the whole demonstration: leave this out");
-        }
+        Self::check_lookahead(model, object, faults);
         let mut weights = base(faults)?;
         for (position, weight) in named? {
             weights.set(position, weight);
@@ -109,6 +107,13 @@ impl<'m> Request<'m> {
         }
         let (_, mapping) = online.end().expect("a demonstration is never empty");
         Ok(mapping)
+    }
+
+    /// Notes a lookahead that the model does not allow.
+    pub(crate) fn check_lookahead(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
+        if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {
+            faults.note(&place, "this world is searched lazily, which needs the whole demonstration: leave this out");
+        }
     }
 
     /// Reads what does not depend on the model.

@@ -1,13 +1,16 @@
 //! What a client registers as a model.
 
+use std::io::{self, BufRead};
+
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use utoipa::ToSchema;
 
 use super::action::ReadActions;
-use super::{ActionDocument, Cave, CompileError, Limits, TableDocument, WumpusDocument, table};
+use super::reading::{Outline, RawStates, RawTransitions, Reader};
+use super::{ActionDocument, Cave, CompileError, Format, Limits, ReadError, TableDocument, WumpusDocument, table};
 use crate::attribute::{AttributeDocument, Schema};
-use crate::document::{Faults, Place};
+use crate::document::{Faults, ParseError, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt, Meter};
 
 /// What a client registers as a model: checked, with defaults filled in, not yet compiled.
@@ -20,7 +23,7 @@ pub enum Definition {
 }
 
 impl Definition {
-    /// Reads a model.
+    /// Reads a model that is in memory as JSON values.
     ///
     /// # Errors
     ///
@@ -30,35 +33,117 @@ impl Definition {
         limits: Limits,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Self, CompileError> {
-        /// How many values are read between two looks at the interrupt: less than a millisecond.
-        const POLL_EVERY: u64 = 4096;
-        let mut faults = Faults::default();
         let mut meter = Meter::new(interrupt, POLL_EVERY);
-        let definition = read_definition(&Place::root(document), limits, &mut meter, &mut faults)?;
-        Ok(faults.check(definition)?)
+        let outline = Reader::new(limits, &mut meter).read_value(document);
+        let definition = outline.and_then(|outline| of_outline(outline, limits, &mut meter));
+        definition.map_err(|error| match error {
+            ReadError::Faults(faults) | ReadError::Parse(ParseError::Faults(faults)) => faults.into(),
+            ReadError::Cancelled(cancelled) => cancelled.into(),
+            // Values in memory are neither cut off nor malformed.
+            error => Faults::one("", error.to_string()).into(),
+        })
     }
 
-    /// The definition as a document in canonical form: defaults filled in, actions of transitions by name. Reading it
-    /// gives the same definition.
+    /// Reads a model's text.
+    ///
+    /// # Errors
+    ///
+    /// [`ReadError::Parse`] and [`ReadError::Faults`] with all faults of the text, [`ReadError::Cancelled`] if `interrupt`
+    /// said so, [`ReadError::TooLarge`] if what is not in its lists of states and transitions is too much to keep.
+    pub fn parse(
+        text: &[u8],
+        format: Format,
+        limits: Limits,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Self, ReadError> {
+        let mut meter = Meter::new(interrupt, POLL_EVERY);
+        let outline = Reader::new(limits, &mut meter).read_text(text, format)?;
+        of_outline(outline, limits, &mut meter)
+    }
+
+    /// Reads a model's text as it comes. Of its states and transitions, only compact arrays are kept.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::parse`]; [`ReadError::Read`] if `reader` failed.
+    pub fn parse_from(
+        reader: impl BufRead,
+        format: Format,
+        limits: Limits,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Self, ReadError> {
+        let mut meter = Meter::new(interrupt, POLL_EVERY);
+        let outline = Reader::new(limits, &mut meter).read_from(reader, format)?;
+        of_outline(outline, limits, &mut meter)
+    }
+
+    /// The attributes of a state.
     #[must_use]
-    pub fn document(&self) -> DefinitionDocument {
+    pub fn schema(&self) -> Schema {
         match self {
-            Self::Table(table) => DefinitionDocument {
-                attributes: Some(table.schema().attributes().iter().map(AttributeDocument::from).collect()),
-                actions: Some(table.actions().iter().map(ActionDocument::from).collect()),
-                dynamics: DynamicsDocument::Table(table.document()),
-            },
-            Self::Wumpus(cave) => DefinitionDocument {
-                attributes: None,
-                actions: Some(cave.actions().iter().map(ActionDocument::from).collect()),
-                dynamics: DynamicsDocument::Wumpus(cave.document()),
-            },
+            Self::Table(table) => table.schema().clone(),
+            Self::Wumpus(cave) => cave.schema(),
         }
     }
+
+    /// Writes the definition as JSON in canonical form: defaults filled in, actions of transitions by name. Reading it gives
+    /// the same definition, and equal content gives equal text.
+    ///
+    /// # Errors
+    ///
+    /// If `writer` failed.
+    pub fn write(&self, writer: impl io::Write) -> io::Result<()> {
+        #[derive(Serialize)]
+        struct Written<'d, D> {
+            #[serde(skip_serializing_if = "Option::is_none")]
+            attributes: Option<Vec<AttributeDocument>>,
+            actions: Vec<ActionDocument>,
+            dynamics: &'d D,
+        }
+        match self {
+            Self::Table(table) => {
+                let attributes = table.schema().attributes().iter().map(AttributeDocument::from).collect();
+                let actions = table.actions().iter().map(ActionDocument::from).collect();
+                let written = Written { attributes: Some(attributes), actions, dynamics: table };
+                serde_json::to_writer(writer, &written)?;
+            }
+            Self::Wumpus(cave) => {
+                let actions = cave.actions().iter().map(ActionDocument::from).collect();
+                let dynamics = DynamicsDocument::Wumpus(cave.document());
+                serde_json::to_writer(writer, &Written { attributes: None, actions, dynamics: &dynamics })?;
+            }
+        }
+        Ok(())
+    }
+
+    /// The canonical text that [`Self::write`] writes.
+    ///
+    /// # Panics
+    ///
+    /// Never: writing to memory does not fail.
+    #[must_use]
+    pub fn text(&self) -> String {
+        let mut text = Vec::new();
+        self.write(&mut text).expect("writing to memory does not fail");
+        String::from_utf8(text).expect("JSON is UTF-8")
+    }
+}
+
+/// How many values are read between two looks at the interrupt: less than a millisecond.
+const POLL_EVERY: u64 = 4096;
+
+fn of_outline(outline: Outline, limits: Limits, meter: &mut Meter<'_>) -> Result<Definition, ReadError> {
+    let Outline { root, line, states, transitions, faults: faults_of_lines } = outline;
+    let place = Place { value: &root, path: line.map_or(Path::Root, Path::Line) };
+    let mut faults = Faults::default();
+    let definition = read_definition(&place, (states, transitions), limits, meter, &mut faults)?;
+    faults.append(faults_of_lines);
+    Ok(faults.check(definition)?)
 }
 
 fn read_definition(
     place: &Place<'_, '_>,
+    lists: (Option<RawStates>, Option<RawTransitions>),
     limits: Limits,
     meter: &mut Meter<'_>,
     faults: &mut Faults,
@@ -72,7 +157,7 @@ fn read_definition(
             let attributes = attributes.and_then(|place| Schema::read(&place, faults));
             let actions = object.required("actions", faults);
             let actions = actions.and_then(|place| ReadActions::read(&place, table::DEFAULT_ACTION_COST, faults));
-            Ok(table::read(&dynamics, attributes, actions, limits, meter, faults)?.map(Definition::Table))
+            Ok(table::read(&dynamics, lists, attributes, actions, limits, meter, faults)?.map(Definition::Table))
         }
         (Some(dynamics), Some("wumpus")) => {
             if let Some(place) = object.optional("attributes") {
@@ -103,27 +188,19 @@ fn read_definition(
     }
 }
 
-impl DefinitionDocument {
-    /// The document as JSON text. Of [`Definition::document`]: the canonical text, equal for equal content.
-    ///
-    /// # Panics
-    ///
-    /// Never: a document has no keys but strings.
-    #[must_use]
-    pub fn text(&self) -> String {
-        serde_json::to_string(self).expect("a document has no keys but strings")
-    }
-}
-
 /// SHA-256 of a model's canonical text, in hexadecimal: equal for equal content, however that was written.
 #[must_use]
 pub fn hash_of(canonical: &str) -> String {
-    let digest = Sha256::digest(canonical.as_bytes());
-    digest.iter().fold(String::with_capacity(64), |mut hash, byte| {
+    hex(&Sha256::digest(canonical.as_bytes()))
+}
+
+/// Bytes in hexadecimal.
+pub(crate) fn hex(digest: &[u8]) -> String {
+    digest.iter().fold(String::with_capacity(2 * digest.len()), |mut hex, byte| {
         for nibble in [byte >> 4, byte & 15] {
-            hash.extend(char::from_digit(nibble.into(), 16));
+            hex.extend(char::from_digit(nibble.into(), 16));
         }
-        hash
+        hex
     })
 }
 
@@ -186,8 +263,8 @@ mod tests {
                 "actions": [{"name": "a", "cost": cost}],
                 "dynamics": {"kind": "table", "states": [[x]], "transitions": []},
             });
-            let first = read(&model.to_string()).document().text();
-            let again = read(&first).document().text();
+            let first = read(&model.to_string()).text();
+            let again = read(&first).text();
             prop_assert_eq!(&first, &again);
             let read: DefinitionDocument = serde_json::from_str(&first).unwrap();
             let attributes = read.attributes.unwrap();
@@ -263,7 +340,7 @@ mod tests {
             let mut model = two_states();
             model["dynamics"]["states"] = json!([[0], [1], [2], [3]]);
             model["dynamics"]["unsafe"] = listed;
-            read(&model.to_string()).document().text()
+            read(&model.to_string()).text()
         };
         assert_eq!(text(json!([3, 1, 3])), text(json!([1, 3])));
     }

@@ -58,11 +58,12 @@ impl<'c> Explored<'c> {
     /// What was found: the states, and the transitions between them.
     pub(super) fn into_parts(self) -> (States, Graph) {
         let Self { states, bounds, ways, .. } = self;
-        let edges = (0..).zip(bounds).filter(|(_, bounds)| *bounds != UNEXPLORED).flat_map(|(from, (begin, end))| {
-            let ways = &ways[begin as usize..end as usize];
+        let explored = (0..).zip(&bounds).filter(|(_, bounds)| **bounds != UNEXPLORED);
+        let edges = explored.flat_map(|(from, (begin, end))| {
+            let ways = &ways[*begin as usize..*end as usize];
             ways.iter().map(move |way| (from, *way))
         });
-        let graph = Graph::new(states.len() as usize, edges.collect());
+        let graph = Graph::new(states.len() as usize, edges);
         (states, graph)
     }
 

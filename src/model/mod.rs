@@ -5,9 +5,9 @@
 //! run on. A wumpus world of too many states is left unexplored: a search then finds those that it comes to ([`Space`]).
 //!
 //! ```text
-//! JSON --Definition::read--> Definition { Table | Cave } --Model::compile--> Model { schema, actions, states, graph, start }
-//!                                  |
-//!                                  +--canonical JSON--> hash, store
+//! JSON --Definition::parse--> Definition { Table | Cave } --Model::compile--> Model { schema, actions, states, graph, start }
+//!                                   |
+//!                                   +--Definition::write--> canonical JSON: hash, store
 //! ```
 //!
 //! Nothing here knows of demonstrations.
@@ -17,6 +17,7 @@ mod definition;
 mod explored;
 mod graph;
 mod operator;
+mod reading;
 mod space;
 mod states;
 mod table;
@@ -25,10 +26,12 @@ mod wumpus;
 use std::sync::Arc;
 
 pub use action::{Action, ActionDocument, ActionIdx};
+pub(crate) use definition::hex;
 pub use definition::{Definition, DefinitionDocument, DynamicsDocument, hash_of};
 pub(crate) use explored::Explored;
 pub use graph::{Graph, Transition};
 pub(crate) use operator::Operator;
+pub use reading::{Format, MAX_LINE_BYTES, ReadError};
 pub(crate) use space::{Space, Whole};
 pub use states::{StateIdx, States};
 pub use table::{ActionReference, StartDocument, Table, TableDocument, TransitionDocument};
@@ -44,11 +47,15 @@ pub struct Limits {
     /// Most states; those of a wumpus world are counted as they are reached, and if there are more, they are left to
     /// searches.
     pub max_states: usize,
+    /// Most transitions of a table.
+    pub max_transitions: usize,
 }
 
 impl Limits {
-    /// One million states: a few hundred MB with their transitions.
-    pub const DEFAULT: Self = Self { max_states: 1_000_000 };
+    /// One million states and ten million transitions: a few hundred MB.
+    pub const DEFAULT: Self = Self { max_states: 1_000_000, max_transitions: 10_000_000 };
+    /// As much as can be told apart by indices.
+    pub const NONE: Self = Self { max_states: usize::MAX, max_transitions: usize::MAX };
 }
 
 /// Why a definition gives no model.
@@ -98,7 +105,7 @@ pub enum Start {
 pub struct Model {
     schema: Schema,
     actions: Vec<Action>,
-    states: States,
+    states: Arc<States>,
     graph: Graph,
     start: Start,
     n_transitions: usize,
@@ -199,7 +206,8 @@ impl Model {
     /// Approximate size in memory, in bytes.
     #[must_use]
     pub fn size_bytes(&self) -> usize {
-        self.states.size_bytes() + self.graph.size_bytes() + self.is_unsafe.len()
+        let start = if let Start::Candidates(states) = &self.start { size_of_val(states.as_slice()) } else { 0 };
+        start + self.states.size_bytes() + self.graph.size_bytes() + self.is_unsafe.len()
     }
 
     /// Reads the start of a request: a state's index, or an object of attribute values that exactly one state has. Of a model that is

@@ -1,7 +1,5 @@
 //! The states of a model, interned.
 
-use rustc_hash::FxHashMap;
-
 use crate::attribute::Value;
 
 /// Index of a state in its model.
@@ -65,39 +63,10 @@ impl States {
     }
 
     pub(super) fn size_bytes(&self) -> usize {
-        let domains: usize = self.domains.iter().map(|domain| size_of_val(domain.as_slice())).sum();
+        let texts = |domain: &[Value]| {
+            domain.iter().map(|value| if let Value::Text(text) = value { text.len() } else { 0 }).sum::<usize>()
+        };
+        let domains: usize = self.domains.iter().map(|domain| size_of_val(domain.as_slice()) + texts(domain)).sum();
         domains + size_of_val(self.rows.as_slice())
-    }
-}
-
-/// Builds [`States`] from values as they are read.
-pub(super) struct Interner {
-    indices: Vec<FxHashMap<Value, u32>>,
-    states: States,
-}
-
-impl Interner {
-    /// An interner of states with `n_attributes` values.
-    pub(super) fn new(n_attributes: usize) -> Self {
-        let states = States { domains: vec![Vec::new(); n_attributes], rows: Vec::new() };
-        Self { indices: vec![FxHashMap::default(); n_attributes], states }
-    }
-
-    /// Adds a state.
-    pub(super) fn push(&mut self, values: impl IntoIterator<Item = Value>) {
-        for (attribute, value) in values.into_iter().enumerate() {
-            let domain = &mut self.states.domains[attribute];
-            #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
-            let next = domain.len() as u32;
-            let index = *self.indices[attribute].entry(value.clone()).or_insert_with(|| {
-                domain.push(value);
-                next
-            });
-            self.states.rows.push(index);
-        }
-    }
-
-    pub(super) fn finish(self) -> States {
-        self.states
     }
 }

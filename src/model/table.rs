@@ -1,14 +1,18 @@
 //! Dynamics that list every state and transition.
 
-use rustc_hash::FxHashMap;
-use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+use hashbrown::{DefaultHashBuilder, HashTable};
+use serde::ser::SerializeSeq;
+use serde::{Deserialize, Serialize, Serializer};
+use std::hash::BuildHasher;
 use utoipa::ToSchema;
 
 use super::action::ReadActions;
-use super::states::Interner;
+use super::reading::{Distinct, NoTransition, Raw, RawIndex, RawStates, RawTransitions};
 use super::{Action, ActionIdx, Graph, Limits, Model, Start, StateIdx, States, Transition};
-use crate::attribute::{Attribute, Scalar, Schema};
-use crate::document::{Faults, Object, Place};
+use crate::attribute::{Attribute, Scalar, Schema, Value};
+use crate::document::{Faults, Object, Path, Place, index_of};
 use crate::interrupt::{Cancelled, Meter};
 
 /// Cost of an action that names none.
@@ -19,15 +23,61 @@ pub(super) const DEFAULT_ACTION_COST: f64 = 1.0;
 pub struct Table {
     schema: Schema,
     actions: Vec<Action>,
-    states: States,
-    /// In the order of the document.
-    edges: Vec<(StateIdx, Transition)>,
+    /// Shared with the models that are compiled from this.
+    states: Arc<States>,
+    edges: Edges,
     start: Start,
     /// Ascending, all different.
     unsafe_states: Vec<StateIdx>,
 }
 
+/// Transitions in the order of the document, by column: 10 bytes each.
+#[derive(Clone, Debug)]
+struct Edges {
+    from: Vec<StateIdx>,
+    action: Vec<ActionIdx>,
+    to: Vec<StateIdx>,
+}
+
+impl Edges {
+    fn len(&self) -> usize {
+        self.from.len()
+    }
+
+    fn iter(&self) -> impl Iterator<Item = (StateIdx, Transition)> + Clone {
+        let transitions = self.action.iter().zip(&self.to).map(|(action, to)| Transition { action: *action, to: *to });
+        self.from.iter().copied().zip(transitions)
+    }
+}
+
 impl Table {
+    /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, which
+    /// a `skip` does for nothing.
+    pub(super) fn compile(&self) -> Model {
+        let n_states = self.states.len() as usize;
+        // Where none is, none is noted.
+        let n_noted = if self.unsafe_states.is_empty() { 0 } else { n_states };
+        let mut is_unsafe = vec![false; n_noted];
+        for state in &self.unsafe_states {
+            is_unsafe[*state as usize] = true;
+        }
+        let is_useful = |(from, transition): &(StateIdx, Transition)| {
+            *from != transition.to && is_unsafe.get(transition.to as usize) != Some(&true)
+        };
+        let graph = Graph::new(n_states, self.edges.iter().filter(is_useful));
+        Model {
+            schema: self.schema.clone(),
+            actions: self.actions.clone(),
+            graph,
+            states: Arc::clone(&self.states),
+            start: self.start.clone(),
+            n_transitions: self.edges.len(),
+            n_unsafe: self.unsafe_states.len(),
+            is_unsafe,
+            unexplored: None,
+        }
+    }
+
     pub(super) fn schema(&self) -> &Schema {
         &self.schema
     }
@@ -35,58 +85,64 @@ impl Table {
     pub(super) fn actions(&self) -> &[Action] {
         &self.actions
     }
+}
 
-    /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, which
-    /// a `skip` does for nothing.
-    pub(super) fn compile(&self) -> Model {
-        let n_states = self.states.len() as usize;
-        let mut is_unsafe = vec![false; n_states];
-        for state in &self.unsafe_states {
-            is_unsafe[*state as usize] = true;
+/// Written as the [`TableDocument`] that it was read from, in canonical form, without a copy of it.
+impl Serialize for Table {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        use serde::ser::SerializeStruct;
+        let start = match &self.start {
+            Start::State(state) => Some(StartDocument::State(*state)),
+            Start::Candidates(states) => Some(StartDocument::Candidates(states.clone())),
+            Start::Any => None,
+        };
+        let mut fields = serializer.serialize_struct("Table", 4 + usize::from(start.is_some()))?;
+        fields.serialize_field("kind", "table")?;
+        fields.serialize_field("states", &WrittenStates(self))?;
+        fields.serialize_field("transitions", &WrittenTransitions(self))?;
+        if let Some(start) = start {
+            fields.serialize_field("start", &start)?;
         }
-        let is_useful =
-            |(from, transition): &&(StateIdx, Transition)| *from != transition.to && !is_unsafe[transition.to as usize];
-        let edges = self.edges.iter().filter(is_useful).copied().collect();
-        Model {
-            schema: self.schema.clone(),
-            actions: self.actions.clone(),
-            graph: Graph::new(n_states, edges),
-            states: self.states.clone(),
-            start: self.start.clone(),
-            n_transitions: self.edges.len(),
-            n_unsafe: is_unsafe.iter().filter(|is_unsafe| **is_unsafe).count(),
-            is_unsafe,
-            unexplored: None,
-        }
+        fields.serialize_field("unsafe", &self.unsafe_states)?;
+        fields.end()
     }
+}
 
-    pub(super) fn document(&self) -> TableDocument {
-        let attributes = self.schema.attributes();
-        let states = (0..self.states.len()).map(|state| {
-            let values = self.states.values(state).zip(attributes);
-            values.map(|(value, attribute)| attribute.write_value(value)).collect()
-        });
-        let transitions = self.edges.iter().map(|(from, transition)| {
-            let action = self.actions[usize::from(transition.action)].name.clone();
-            TransitionDocument(*from, ActionReference::Name(action.to_string()), transition.to)
-        });
-        TableDocument {
-            states: states.collect(),
-            transitions: transitions.collect(),
-            start: match &self.start {
-                Start::State(state) => Some(StartDocument::State(*state)),
-                Start::Candidates(states) => Some(StartDocument::Candidates(states.clone())),
-                Start::Any => None,
-            },
-            unsafe_states: self.unsafe_states.clone(),
+struct WrittenStates<'t>(&'t Table);
+
+impl Serialize for WrittenStates<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_seq((0..self.0.states.len()).map(|state| WrittenState(self.0, state)))
+    }
+}
+
+struct WrittenState<'t>(&'t Table, StateIdx);
+
+impl Serialize for WrittenState<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Self(table, state) = self;
+        let mut cells = serializer.serialize_seq(Some(table.schema.len()))?;
+        for (attribute, value) in table.schema.attributes().iter().zip(table.states.values(*state)) {
+            cells.serialize_element(&attribute.written(value))?;
         }
+        cells.end()
+    }
+}
+
+struct WrittenTransitions<'t>(&'t Table);
+
+impl Serialize for WrittenTransitions<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let name = |action: ActionIdx| &*self.0.actions[usize::from(action)].name;
+        serializer.collect_seq(self.0.edges.iter().map(|(from, Transition { action, to })| (from, name(action), to)))
     }
 }
 
 /// Reads the dynamics. `attributes` and `actions` are `None` where they had faults of their own; what does not
-/// depend on them is checked all the same.
+/// depend on them is checked all the same. `lists` are the states and transitions that were taken out of the dynamics.
 pub(super) fn read(
     place: &Place<'_, '_>,
+    lists: (Option<RawStates>, Option<RawTransitions>),
     attributes: Option<Vec<Option<Attribute>>>,
     actions: Option<ReadActions<'_>>,
     limits: Limits,
@@ -96,21 +152,34 @@ pub(super) fn read(
     let Some(object) = place.object(&["kind", "states", "transitions", "start", "unsafe"], faults) else {
         return Ok(None);
     };
-    let rows = object.required("states", faults).and_then(|place| place.array(faults).map(|rows| (place, rows)));
-    let rows = rows.filter(|(place, rows)| {
-        let is_number_right = (1..=limits.max_states).contains(&rows.len());
+    let rows = object.required("states", faults).and_then(|place| place.array(faults).map(|_| place));
+    let rows = rows.zip(lists.0).filter(|(place, rows)| {
+        let is_number_right = (1..=limits.max_states).contains(&rows.n_states);
         if !is_number_right {
-            faults.note(place, format!("expected 1 to {} states, found {}", limits.max_states, rows.len()));
+            faults.note(place, format!("expected 1 to {} states, found {}", limits.max_states, rows.n_states));
         }
         is_number_right
     });
+    // Where the states are missing, any index may be right.
+    let n_states = rows.as_ref().map_or(StateIdx::MAX as usize, |(_, rows)| rows.n_states);
     let states = match rows.zip(attributes.as_ref()) {
-        Some(((place, rows), attributes)) => read_states(&place, rows, attributes, meter, faults)?,
+        Some(((_, rows), attributes)) => read_states(rows, attributes, meter, faults)?,
         None => None,
     };
-    // Where the states are missing, any index may be right.
-    let n_states = rows.map_or(StateIdx::MAX as usize, |(_, rows)| rows.len());
-    let edges = read_transitions(&object, n_states, actions.as_ref(), meter, faults)?;
+    let items = object.required("transitions", faults).and_then(|place| place.array(faults).map(|_| place));
+    let items = items.zip(lists.1).filter(|(place, items)| {
+        let is_number_right = items.n_transitions <= limits.max_transitions;
+        if !is_number_right {
+            let detail =
+                format!("expected at most {} transitions, found {}", limits.max_transitions, items.n_transitions);
+            faults.note(place, detail);
+        }
+        is_number_right
+    });
+    let edges = match items {
+        Some((_, items)) => read_transitions(items, n_states, actions.as_ref(), meter, faults)?,
+        None => None,
+    };
     let unsafe_states = match object.optional("unsafe") {
         Some(place) => read_state_list(&place, n_states, faults).map(|mut states| {
             // A set, however it is written.
@@ -125,7 +194,7 @@ pub(super) fn read(
         Some(Table {
             schema: Schema::new(attributes?.into_iter().collect::<Option<_>>()?),
             actions: actions?.complete()?,
-            states: states?,
+            states: Arc::new(states?),
             edges: edges?,
             start: start?,
             unsafe_states: unsafe_states?,
@@ -134,69 +203,238 @@ pub(super) fn read(
     Ok(table())
 }
 
+/// The values of a column, as far as they are values of its attribute.
+struct Domain {
+    /// Distinct values, in the order in which they were first met.
+    values: Vec<Value>,
+    /// Where each of the column's distinct raw values stands in `values`; [`Self::NONE`] for what is none.
+    positions: Vec<u32>,
+}
+
+impl Domain {
+    const NONE: u32 = u32::MAX;
+
+    fn read(column: &[Raw], attribute: &Attribute, meter: &mut Meter<'_>) -> Result<Self, Cancelled> {
+        let mut values: Vec<Value> = Vec::with_capacity(column.len());
+        // Numbers that are written in several ways, such as 1 and 1.0, are one.
+        let mut known: HashTable<u32> = HashTable::with_capacity(column.len());
+        let hasher = DefaultHashBuilder::default();
+        let mut positions = Vec::with_capacity(column.len());
+        let mut ignored = Faults::default();
+        for raw in column {
+            meter.spend_or_cancel(1)?;
+            let value = raw.scalar().and_then(|json| attribute.read_value(&Place::root(&json), &mut ignored));
+            let Some(value) = value else {
+                positions.push(Self::NONE);
+                continue;
+            };
+            let hash = hasher.hash_one(&value);
+            let entry = known.entry(
+                hash,
+                |position| values[*position as usize] == value,
+                |position| hasher.hash_one(&values[*position as usize]),
+            );
+            let position = match entry {
+                hashbrown::hash_table::Entry::Occupied(entry) => *entry.get(),
+                hashbrown::hash_table::Entry::Vacant(entry) => {
+                    #[expect(clippy::cast_possible_truncation, reason = "at most as many as raw values")]
+                    let position = values.len() as u32;
+                    entry.insert(position);
+                    values.push(value);
+                    position
+                }
+            };
+            positions.push(position);
+        }
+        Ok(Self { values, positions })
+    }
+
+    /// Whether every raw value is a value of its own.
+    fn is_as_found(&self) -> bool {
+        self.values.len() == self.positions.len()
+    }
+}
+
 fn read_states(
-    place: &Place<'_, '_>,
-    rows: &[serde_json::Value],
+    rows: RawStates,
     attributes: &[Option<Attribute>],
     meter: &mut Meter<'_>,
     faults: &mut Faults,
 ) -> Result<Option<States>, Cancelled> {
+    let RawStates { n_states, columns, mut cells, width, lens, no_rows, places } = rows;
+    let width_wanted = attributes.len();
+    let is_even = lens.is_none() && width == width_wanted;
+    // As long as no fault is to be told, a column's raw values are let go as soon as they are read.
+    let mut columns: Vec<Vec<Raw>> = columns.into_iter().map(Distinct::into_values).collect();
+    let mut domains = Vec::with_capacity(width_wanted);
+    for (column, attribute) in columns.iter_mut().zip(attributes) {
+        let domain = match attribute {
+            Some(attribute) => Some(Domain::read(column, attribute, meter)?),
+            None => None,
+        };
+        if is_even && domain.as_ref().is_some_and(|domain| !domain.positions.contains(&Domain::NONE)) {
+            *column = Vec::new();
+        }
+        domains.push(domain);
+    }
+    let is_faultless =
+        domains.iter().all(|domain| domain.as_ref().is_some_and(|domain| !domain.positions.contains(&Domain::NONE)));
+    if is_even && is_faultless {
+        for (k, domain) in domains.iter().flatten().enumerate() {
+            if !domain.is_as_found() {
+                for cell in cells.iter_mut().skip(k).step_by(width) {
+                    *cell = domain.positions[*cell as usize];
+                }
+            }
+        }
+        cells.shrink_to_fit();
+        let domains = domains.into_iter().flatten().map(|domain| domain.values).collect();
+        return Ok(Some(States::new(domains, cells)));
+    }
+
     let n_before = faults.count();
-    let mut interner = Interner::new(attributes.len());
-    let mut state = Vec::with_capacity(attributes.len());
-    for (n, row) in rows.iter().enumerate() {
-        meter.spend_or_cancel(attributes.len() as u64)?;
-        let place = place.item(n, row);
-        let Some(values) = place.array(faults) else { continue };
-        if values.len() != attributes.len() {
-            let detail = format!("expected {} values, one per attribute, found {}", attributes.len(), values.len());
-            faults.note(&place, detail);
+    let mut no_rows = no_rows.into_iter();
+    let mut next_cell = 0;
+    for n in 0..n_states {
+        meter.spend_or_cancel(1)?;
+        let len = lens.as_ref().map_or(width, |lens| lens[n] as usize);
+        if len == RawStates::NO_ROW as usize {
+            match no_rows.next() {
+                Some(found) => places.with_path("states", n, |path| faults.note_mismatch(path, "an array", found)),
+                None => faults.count_unlisted(1),
+            }
             continue;
         }
-        state.clear();
-        for (k, (value, attribute)) in values.iter().zip(attributes).enumerate() {
-            let Some(attribute) = attribute else { continue };
-            state.extend(attribute.read_value(&place.item(k, value), faults));
+        let row = &cells[next_cell..][..len.min(Schema::MAX_ATTRIBUTES)];
+        next_cell += row.len();
+        if len != width_wanted {
+            let detail = format!("expected {width_wanted} values, one per attribute, found {len}");
+            places.with_path("states", n, |path| faults.note_at(path, detail));
+            continue;
         }
-        if state.len() == attributes.len() {
-            interner.push(state.drain(..));
+        for (k, cell) in row.iter().enumerate() {
+            let (Some(domain), Some(attribute)) = (&domains[k], &attributes[k]) else { continue };
+            if domain.positions[*cell as usize] == Domain::NONE {
+                let found = &columns[k][*cell as usize];
+                places.with_path("states", n, |path| note_no_value(&Path::Item(path, k), found, attribute, faults));
+            }
         }
     }
-    Ok((faults.count() == n_before).then(|| interner.finish()))
+    debug_assert!(faults.count() > n_before || attributes.contains(&None), "there was a reason");
+    Ok(None)
+}
+
+/// Notes that `found` is no value of `attribute`.
+fn note_no_value(path: &Path<'_>, found: &Raw, attribute: &Attribute, faults: &mut Faults) {
+    match found.scalar() {
+        Some(value) => drop(attribute.read_value(&Place { value: &value, path: *path }, faults)),
+        None => faults.note_mismatch(path, &attribute.expected(), found),
+    }
 }
 
 fn read_transitions(
-    object: &Object<'_, '_>,
+    items: RawTransitions,
     n_states: usize,
     actions: Option<&ReadActions<'_>>,
     meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Result<Option<Vec<(StateIdx, Transition)>>, Cancelled> {
-    let place = object.required("transitions", faults);
-    let Some((place, items)) = place.and_then(|place| place.array(faults).map(|items| (place, items))) else {
-        return Ok(None);
-    };
-    let mut edges = Vec::with_capacity(items.len());
-    let mut seen: FxHashMap<(StateIdx, ActionIdx), usize> = FxHashMap::default();
-    for (n, item) in items.iter().enumerate() {
-        meter.spend_or_cancel(1)?;
-        let place = place.item(n, item);
-        let Some(parts) = place.array(faults) else { continue };
-        let [from, action, to] = parts else {
-            faults.note(&place, format!("expected [from, action, to], found an array of {}", parts.len()));
-            continue;
-        };
-        let from = place.item(0, from).index(n_states, "state", faults);
-        let action = actions.and_then(|actions| actions.read_reference(&place.item(1, action), faults));
-        let to = place.item(2, to).index(n_states, "state", faults);
-        let (Some(from), Some(action), Some(to)) = (from, action, to) else { continue };
-        if let Some(other) = seen.insert((from, action), n) {
-            let detail = format!("state {from} has a transition by this action already: transition {other}");
-            faults.note(&place, detail);
+) -> Result<Option<Edges>, Cancelled> {
+    let RawTransitions { n_transitions, from, mut action, to, references, odd, n_odd, places } = items;
+    let read_reference = |found: &Raw, path: &Path<'_>, faults: &mut Faults| {
+        let actions = actions?;
+        if let Some(value) = found.scalar() {
+            return actions.read_reference(&Place { value: &value, path: *path }, faults);
         }
-        edges.push((from, Transition { action, to }));
+        faults.note_mismatch(path, &index_of("action"), found);
+        None
+    };
+    let mut ignored = Faults::default();
+    let known: Vec<Option<ActionIdx>> =
+        references.values().iter().map(|found| read_reference(found, &Path::Root, &mut ignored)).collect();
+    let n_before = faults.count();
+    // Of any length, so that the chunks are looked at in between.
+    let are_states = |states: &[StateIdx]| states.iter().all(|state| (*state as usize) < n_states);
+    let is_faultless = n_odd == 0 && known.iter().all(Option::is_some) && are_states(&from) && are_states(&to);
+    // Where it leaves from, and by which action, of what is a transition.
+    let key = |n: usize| {
+        let action = known.get(usize::from(action[n])).copied().flatten()?;
+        ((from[n] as usize) < n_states && (to[n] as usize) < n_states && from[n] != RawTransitions::NOWHERE)
+            .then_some((from[n], action))
+    };
+    let again = find_repeated(n_transitions, key, meter)?;
+    if !is_faultless || !again.is_empty() {
+        let mut odd = odd.into_iter();
+        let mut again = again.into_iter().peekable();
+        let read_index = |found: RawIndex, path: &Path<'_>, faults: &mut Faults| match found {
+            Err(found) => faults.note_mismatch(path, &index_of("state"), found),
+            Ok(index) if index as usize >= n_states => faults.note_no_index(path, "state", index, n_states),
+            Ok(_) => {}
+        };
+        let read_parts = |path: &Path<'_>, from: RawIndex, reference: &Raw, to: RawIndex, faults: &mut Faults| {
+            read_index(from, &Path::Item(path, 0), faults);
+            read_reference(reference, &Path::Item(path, 1), faults);
+            read_index(to, &Path::Item(path, 2), faults);
+        };
+        for n in 0..n_transitions {
+            meter.spend_or_cancel(1)?;
+            if from[n] == RawTransitions::NOWHERE {
+                let Some(odd) = odd.next() else {
+                    faults.count_unlisted(1);
+                    continue;
+                };
+                places.with_path("transitions", n, |path| match odd {
+                    NoTransition::Other(found) => faults.note_mismatch(path, "an array", found),
+                    NoTransition::Array(len) => {
+                        faults.note_at(path, format!("expected [from, action, to], found an array of {len}"));
+                    }
+                    NoTransition::Parts(from, reference, to) => read_parts(path, from, &reference, to, faults),
+                });
+                continue;
+            }
+            let repeated = again.next_if(|(again, _)| *again as usize == n);
+            let (reference, is_action) = (&references.values()[usize::from(action[n])], known[usize::from(action[n])]);
+            if is_action.is_none() || from[n] as usize >= n_states || to[n] as usize >= n_states {
+                places.with_path("transitions", n, |path| read_parts(path, Ok(from[n]), reference, Ok(to[n]), faults));
+            } else if let Some((_, other)) = repeated {
+                let detail = format!("state {} has a transition by this action already: transition {other}", from[n]);
+                places.with_path("transitions", n, |path| faults.note_at(path, detail));
+            }
+        }
+        debug_assert!(faults.count() > n_before || known.contains(&None), "there was a reason");
+        return Ok(None);
     }
-    Ok((edges.len() == items.len()).then_some(edges))
+    for action in &mut action {
+        // All are known.
+        *action = known[usize::from(*action)].unwrap_or_default();
+    }
+    Ok(Some(Edges { from, action, to }))
+}
+
+/// Of `n_transitions` with these keys, those whose key an earlier one has, each with the last such one, in order.
+fn find_repeated(
+    n_transitions: usize,
+    key: impl Fn(usize) -> Option<(StateIdx, ActionIdx)>,
+    meter: &mut Meter<'_>,
+) -> Result<Vec<(u32, u32)>, Cancelled> {
+    // Most documents list transitions in order, which makes this simple.
+    let mut last = None;
+    let is_ascending = (0..n_transitions).all(|n| {
+        let before = std::mem::replace(&mut last, key(n));
+        last.is_some() && before < last
+    });
+    if is_ascending {
+        return Ok(Vec::new());
+    }
+    let mut keys: Vec<(StateIdx, ActionIdx, u32)> = Vec::with_capacity(n_transitions);
+    for (n, number) in (0..n_transitions).zip(0..) {
+        meter.spend_or_cancel(1)?;
+        keys.extend(key(n).map(|(from, action)| (from, action, number)));
+    }
+    keys.sort_unstable();
+    let pairs = keys.windows(2).filter(|pair| (pair[0].0, pair[0].1) == (pair[1].0, pair[1].1));
+    let mut again: Vec<(u32, u32)> = pairs.map(|pair| (pair[1].2, pair[0].2)).collect();
+    again.sort_unstable();
+    Ok(again)
 }
 
 fn read_state_list(place: &Place<'_, '_>, n_states: usize, faults: &mut Faults) -> Option<Vec<StateIdx>> {

@@ -8,6 +8,7 @@
 //! ([`Explored`]), or leaves that to searches if it is too much.
 
 use std::ops::Range;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -306,7 +307,7 @@ impl Cave {
     /// The model of which nothing but the start is known.
     fn unexplored(&self) -> Model {
         let states = States::new(self.domains(), self.row(&self.first_state()).collect());
-        self.model(states, Graph::new(1, Vec::new()), Some(self.clone()))
+        self.model(states, Graph::new(1, std::iter::empty()), Some(self.clone()))
     }
 
     fn model(&self, states: States, graph: Graph, unexplored: Option<Self>) -> Model {
@@ -314,7 +315,7 @@ impl Cave {
             schema: self.schema(),
             actions: self.actions.clone(),
             n_transitions: graph.n_transitions(),
-            states,
+            states: Arc::new(states),
             graph,
             start: Start::State(0),
             is_unsafe: Vec::new(),

@@ -1,18 +1,24 @@
 //! Models that are ready to be searched, as many as fit.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
-use quick_cache::Weighter;
-use quick_cache::sync::Cache;
+use quick_cache::sync::{Cache, DefaultLifecycle};
+use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
 
+use super::pool::Admission;
+use super::{Etude, ServiceError};
 use crate::mapping::Mapper;
 use crate::store::ModelKey;
 
 /// Compiled models by the hash of their content, the least useful evicted. Concurrent requests for a model that is not
 /// there compile it once.
+///
+/// A model that is larger than the whole cache is kept all the same until the next such one comes: compiling it takes longer than
+/// most searches, and these need it in memory anyway.
 #[derive(Debug)]
 pub(super) struct MapperCache {
     cache: Cache<ModelKey, Arc<Mapper>, SizeBytes>,
+    oversized: Mutex<Option<(ModelKey, Arc<Mapper>)>>,
 }
 
 #[derive(Clone, Debug)]
@@ -29,12 +35,23 @@ impl MapperCache {
     const EXPECTED_ITEMS: usize = 64;
 
     pub(super) fn new(max_bytes: u64) -> Self {
-        Self { cache: Cache::with_weighter(Self::EXPECTED_ITEMS, max_bytes, SizeBytes) }
+        let mut options = OptionsBuilder::new();
+        // Of several shards, each would have a part of the capacity, and large models would fit into none.
+        options.estimated_items_capacity(Self::EXPECTED_ITEMS).weight_capacity(max_bytes).shards(1);
+        let options = options.build().expect("the sizes are given");
+        let cache = Cache::with_options(options, SizeBytes, DefaultHashBuilder::default(), DefaultLifecycle::default());
+        Self { cache, oversized: Mutex::default() }
     }
 
     /// Puts in a model that has just been compiled.
-    pub(super) fn insert(&self, key: ModelKey, mapper: Arc<Mapper>) {
-        self.cache.insert(key, mapper);
+    pub(super) fn insert(&self, key: &ModelKey, mapper: &Arc<Mapper>) {
+        self.cache.insert(key.clone(), Arc::clone(mapper));
+        self.keep_if_oversized(key, mapper);
+    }
+
+    /// The model with this key, if it is there.
+    pub(super) fn get(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
+        self.cache.get(key)
     }
 
     /// The model with this key; `compile` makes it if it is not there.
@@ -43,6 +60,124 @@ impl MapperCache {
         key: &ModelKey,
         compile: impl Future<Output = Result<Arc<Mapper>, E>>,
     ) -> Result<Arc<Mapper>, E> {
-        self.cache.get_or_insert_async(key, compile).await
+        let get_or_compile = async {
+            match self.oversized(key) {
+                Some(mapper) => Ok(mapper),
+                None => compile.await,
+            }
+        };
+        let mapper = self.cache.get_or_insert_async(key, get_or_compile).await?;
+        self.keep_if_oversized(key, &mapper);
+        Ok(mapper)
+    }
+
+    fn oversized(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
+        let oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner);
+        oversized.as_ref().filter(|(kept, _)| kept == key).map(|(_, mapper)| Arc::clone(mapper))
+    }
+
+    fn keep_if_oversized(&self, key: &ModelKey, mapper: &Arc<Mapper>) {
+        // The cache keeps nothing that exceeds its hot part, most of it.
+        if self.cache.peek(key).is_none() && SizeBytes.weight(key, mapper) > self.cache.capacity() / 2 {
+            let kept = (key.clone(), Arc::clone(mapper));
+            // What it replaces may take long to free, which nobody should wait for with the lock in hand.
+            let _replaced = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).replace(kept);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use serde_json::json;
+
+    use super::*;
+    use crate::interrupt::Uninterrupted;
+    use crate::model::{Definition, Limits, Model};
+
+    fn mapper(side: u32) -> Arc<Mapper> {
+        let model = json!({"dynamics": {"kind": "wumpus", "width": side, "height": side}});
+        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap())
+    }
+
+    fn key(hash: &str) -> ModelKey {
+        ModelKey { hash: hash.to_owned(), is_lazy: false }
+    }
+
+    /// Whether the model had to be compiled.
+    async fn is_compiled(cache: &MapperCache, key: &ModelKey, mapper: &Arc<Mapper>) -> bool {
+        let mut is_compiled = false;
+        let compile = async {
+            is_compiled = true;
+            Ok::<_, Infallible>(Arc::clone(mapper))
+        };
+        cache.get_or_compile(key, compile).await.unwrap();
+        is_compiled
+    }
+
+    #[tokio::test]
+    async fn a_model_larger_than_the_cache_is_kept_until_the_next_such_one() {
+        let (small, large) = (mapper(2), mapper(9));
+        let cache = MapperCache::new(2 * small.size_bytes() as u64);
+        assert!(large.size_bytes() > 2 * small.size_bytes());
+        cache.insert(&key("small"), &small);
+        cache.insert(&key("large"), &large);
+        assert!(!is_compiled(&cache, &key("large"), &large).await);
+        assert!(!is_compiled(&cache, &key("small"), &small).await, "it was not driven out");
+        assert!(is_compiled(&cache, &key("other"), &large).await);
+        assert!(!is_compiled(&cache, &key("other"), &large).await);
+        assert!(is_compiled(&cache, &key("large"), &large).await);
+    }
+
+    #[tokio::test]
+    async fn a_model_that_fills_most_of_the_cache_is_kept_in_it() {
+        let large = mapper(9);
+        let cache = MapperCache::new(large.size_bytes() as u64 * 5 / 4);
+        assert!(is_compiled(&cache, &key("large"), &large).await);
+        assert!(!is_compiled(&cache, &key("large"), &large).await);
+        assert!(cache.oversized(&key("large")).is_none());
+    }
+}
+
+/// Keys of models by name, each with the generation of the table of models that it was read from: known for as long as no
+/// model is registered or deleted.
+#[derive(Debug)]
+pub(super) struct ModelNames {
+    keys: Cache<String, (u64, ModelKey)>,
+}
+
+impl ModelNames {
+    /// Most names that are kept.
+    const MAX_NAMES: usize = 1024;
+
+    pub(super) fn new() -> Self {
+        Self { keys: Cache::new(Self::MAX_NAMES) }
+    }
+}
+
+impl Etude {
+    /// As [`Self::mapper`], without a look at the database if no model was registered or deleted since the last one. The
+    /// database is this process's alone, as far as models go.
+    pub(super) async fn known_mapper(
+        &self,
+        name: &str,
+        pointer: &'static str,
+        place: &Admission,
+    ) -> Result<(String, Arc<Mapper>), ServiceError> {
+        // Before anything is read: what changes meanwhile makes what was read outdated.
+        let generation = self.store.models_generation();
+        if let Some((known, key)) = self.model_names.keys.get(name)
+            && known == generation
+            && let Some(mapper) = self.mappers.get(&key)
+        {
+            return Ok((key.hash, mapper));
+        }
+        let (hash, mapper) = self.mapper(name, pointer, Some(place)).await?;
+        let key = ModelKey { hash: hash.clone(), is_lazy: mapper.model().is_lazy() };
+        self.model_names.keys.insert(name.to_owned(), (generation, key));
+        Ok((hash, mapper))
     }
 }

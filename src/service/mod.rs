@@ -1,19 +1,21 @@
 //! The application: what the service does, whatever it is asked through.
 //!
 //! ```text
-//! http, cli --> Etude --> SearchPool  (parsing of large bodies, compiling, searching: bounded, cancellable, off the async threads)
+//! http, cli --> Etude --> SearchPool  (reading of large bodies, compiling, searching: bounded, cancellable, off the async threads)
 //!                 |-----> MapperCache (models that are ready to be searched)
 //!                 +-----> Store       (what is durable)
 //! ```
 //!
 //! Everything that is spawned is tracked, and ends with [`Etude::close`].
 
+mod batch;
 mod cache;
 mod learner_task;
 mod learners;
 mod models;
 mod name;
 mod owners;
+mod pipe;
 mod policies;
 mod pool;
 mod refiner;
@@ -23,12 +25,14 @@ mod trials;
 use std::path::PathBuf;
 use std::time::Duration;
 
+pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
-pub use models::{ModelAnswer, Registered};
+pub use models::{ModelAnswer, ModelDefinition, ModelText, OpenText, Registered};
 pub use name::{InvalidName, Name};
+pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
 pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
-pub use sessions::{Ended, Observation, Resumed, Session, SessionError};
+pub use sessions::{Ended, Observation, Received, Resumed, Session, SessionError};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 pub use trials::TrialAnswer;
@@ -36,7 +40,8 @@ pub use trials::TrialAnswer;
 use crate::document::{Faults, ParseError, Quoted};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
-use cache::MapperCache;
+use cache::{MapperCache, ModelNames};
+use models::Uploads;
 use owners::Owners;
 use refiner::Refiner;
 use trials::TrialNumbers;
@@ -65,6 +70,12 @@ pub enum ServiceError {
     /// The body is JSON, but not what was asked for.
     #[error("{0}")]
     Faults(#[from] Faults),
+    /// What must be kept of the body while it is read is too large.
+    #[error("{0}")]
+    TooLarge(String),
+    /// The body could not be read to its end.
+    #[error("the body could not be read")]
+    Body(#[source] std::io::Error),
     /// There is nothing of this kind with this name or id.
     #[error("there is no {kind} {}", Quoted(name))]
     Unknown {
@@ -124,10 +135,12 @@ pub struct Etude {
     store: Store,
     pool: SearchPool,
     mappers: MapperCache,
+    model_names: ModelNames,
     refiner: Refiner,
     owners: Owners,
     session_idle_timeout: Duration,
     limits: Limits,
+    uploads: Uploads,
     trial_numbers: TrialNumbers,
     /// Held while rewards are folded.
     learning: tokio::sync::Mutex<()>,
@@ -145,10 +158,12 @@ impl Etude {
             store: Store::open(&settings.database, tasks).await?,
             pool: SearchPool::new(settings.pool, tasks.clone(), abort),
             mappers: MapperCache::new(settings.model_cache_bytes),
+            model_names: ModelNames::new(),
             refiner: Refiner::default(),
             owners: Owners::default(),
             session_idle_timeout: settings.session_idle_timeout,
             limits: settings.limits,
+            uploads: Uploads::default(),
             trial_numbers: TrialNumbers::default(),
             learning: tokio::sync::Mutex::new(()),
         })

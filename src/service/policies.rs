@@ -19,7 +19,8 @@ use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Sta
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
-/// Bodies up to this size are parsed where they arrive, which takes less than a millisecond; larger ones in the pool.
+/// Bodies up to this size are parsed where they arrive, which takes less than a millisecond; larger ones in the pool. Likewise
+/// for the states of an answer.
 const MAX_INLINE_BYTES: usize = 64 * 1024;
 
 /// A policy that was just made and stored.
@@ -45,26 +46,12 @@ impl Etude {
         now: Timestamp,
     ) -> Result<MadePolicy, ServiceError> {
         let place = self.pool.admit()?;
+        let is_small = body.as_ref().len() <= MAX_INLINE_BYTES;
         let document = parse(body, &place).await?;
-        let (envelope, mut faults) = Envelope::read(&document);
+        let (envelope, faults) = Envelope::read(&document, &Request::FIELDS, "demonstration");
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
-        let found = async {
-            let learner = match &envelope.learner {
-                Some(learner) => Some(self.ready(learner, Some("/learner")).await?),
-                None => None,
-            };
-            Ok((learner, self.mapper(&envelope.model, "/model", Some(&place)).await?))
-        };
-        let (learner, (model_hash, mapper)) = match found.await {
-            // What is unknown is then one fault among others.
-            Err(ref error @ ServiceError::Unknown { pointer: Some(pointer), .. }) if !faults.is_empty() => {
-                let name = pointer.trim_start_matches('/');
-                faults.note_at(&Path::Member(&Path::Root, name), error.to_string());
-                return Err(faults.into());
-            }
-            found => found?,
-        };
+        let Named { learner, model_hash, mapper } = self.find(&envelope, faults, &place).await?;
 
         let id = Uuid::now_v7().to_string();
         let stamp = Stamp {
@@ -76,28 +63,46 @@ impl Etude {
             ..Stamp::default()
         };
         let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
+        let is_quick = is_small && is_quick(mapper.model(), &document);
         let job = move |interrupt: &mut dyn Interrupt| {
-            let schema = mapper.model().schema();
-            let base = |faults: &mut Faults| match &learner {
-                None => Some(schema.weights()),
-                Some(Ready { learner, weights, .. }) => {
-                    let learned = learner.weights_for(schema, &weights.distribution.mean);
-                    learned
-                        .map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string()))
-                        .ok()
-                }
-            };
+            let base = |faults: &mut Faults| base_weights(mapper.model(), learner.as_ref(), faults);
             search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)
         };
-        let Searched { policy, row, refinement } = place.run(deadline, job).await??;
+        let searched = if is_quick { place.run_here(deadline, job).await } else { place.run(deadline, job).await };
+        let Searched { policy, row, refinement } = searched??;
         // The disk is no concern of those who wait for a thread.
         drop(place);
         let is_refined = refinement.is_some();
-        self.store.add_policy(row.at(now), refinement).await?;
+        self.store.add_policies(vec![row.at(now)], refinement.into_iter().collect()).await?;
         if is_refined {
             self.refiner.wake();
         }
         Ok(MadePolicy { id, policy })
+    }
+
+    /// Finds what the request names. `faults` are those found so far; what is unknown is one more, if there are any.
+    pub(super) async fn find(
+        &self,
+        envelope: &Envelope,
+        mut faults: Faults,
+        place: &Admission,
+    ) -> Result<Named, ServiceError> {
+        let found = async {
+            let learner = match &envelope.learner {
+                Some(learner) => Some(self.ready(learner, Some("/learner")).await?),
+                None => None,
+            };
+            let (model_hash, mapper) = self.known_mapper(&envelope.model, "/model", place).await?;
+            Ok(Named { learner, model_hash, mapper })
+        };
+        match found.await {
+            Err(ref error @ ServiceError::Unknown { pointer: Some(pointer), .. }) if !faults.is_empty() => {
+                let name = pointer.trim_start_matches('/');
+                faults.note_at(&Path::Member(&Path::Root, name), error.to_string());
+                Err(faults.into())
+            }
+            found => found,
+        }
     }
 
     /// The policy with this id: JSON.
@@ -140,22 +145,29 @@ pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admis
 }
 
 /// What must be known of a request before its model is at hand.
-struct Envelope {
-    model: String,
-    learner: Option<String>,
-    deadline: Option<Duration>,
+pub(super) struct Envelope {
+    pub(super) model: String,
+    pub(super) learner: Option<String>,
+    pub(super) deadline: Option<Duration>,
+}
+
+/// What a request names.
+pub(super) struct Named {
+    pub(super) learner: Option<Ready>,
+    pub(super) model_hash: String,
+    pub(super) mapper: Arc<Mapper>,
 }
 
 impl Envelope {
-    /// Reads what can be read without the model, and gives the names if they could be read. Faults may have been found either
-    /// way.
-    fn read(document: &Value) -> (Option<Self>, Faults) {
+    /// Reads what can be read without the model of a request that may have these `fields` and must have what it is about, and
+    /// gives the names if they could be read. Faults may have been found either way.
+    pub(super) fn read(document: &Value, fields: &[&str], about: &str) -> (Option<Self>, Faults) {
         let mut faults = Faults::default();
         let root = Place::root(document);
-        let Some(object) = root.object(&Request::FIELDS, &mut faults) else { return (None, faults) };
+        let Some(object) = root.object(fields, &mut faults) else { return (None, faults) };
         let model = object.required("model", &mut faults).and_then(|place| place.string(&mut faults));
         let learner = object.optional("learner").map(|place| place.string(&mut faults));
-        object.required("demonstration", &mut faults);
+        object.required(about, &mut faults);
         let options = Request::read_options(&object, &mut faults);
         let names = model.zip(learner.map_or(Some(None), |learner| learner.map(Some)));
         let envelope = names.map(|(model, learner)| Self {
@@ -165,6 +177,22 @@ impl Envelope {
         });
         (envelope, faults)
     }
+}
+
+/// Largest search that runs where its request arrived: observations times states and transitions. One that looks at all of this
+/// takes a millisecond, and most look at a tenth.
+const MAX_INLINE_WORK: usize = 16_384;
+
+/// Whether a request with a small body is answered sooner than another thread would have taken it over. Of what may be in a
+/// request, a finite lookahead and the paper's heuristic can take far longer than the size of the problem tells.
+fn is_quick(model: &Model, document: &Value) -> bool {
+    let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
+    let size = model.graph().n_states() + model.graph().n_transitions();
+    let step_bytes = || serde_json::to_string(&model.describe(0)).map_or(usize::MAX, |text| text.len());
+    document["lookahead"].is_null()
+        && document["heuristic"] != "paper"
+        && n_observations.saturating_mul(size) <= MAX_INLINE_WORK
+        && n_observations.saturating_mul(step_bytes()) <= MAX_INLINE_BYTES
 }
 
 /// What a search gave.
@@ -205,19 +233,36 @@ pub(super) fn search(
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
-    let request = match read_request(mapper.model(), document, fields, base) {
-        Ok(request) => request,
-        Err(faults) => return Ok(Err(faults.into())),
-    };
+    match read_request(mapper.model(), document, fields, base) {
+        Ok(request) => Ok(searched(&follow(mapper, &request, stamp, interrupt)?, document)),
+        Err(faults) => Ok(Err(faults.into())),
+    }
+}
+
+/// Searches, and gives the policy.
+pub(super) fn follow(
+    mapper: &Arc<Mapper>,
+    request: &Request<'_>,
+    stamp: Stamp,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Policy, Cancelled> {
     let started = Instant::now();
     let mapping = request.solve(mapper, interrupt)?;
     let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
-    let policy = Policy::new(stamp, &request.problem, &mapping);
-    Ok(searched(&policy, document))
+    Ok(Policy::new(stamp, &request.problem, &mapping))
 }
 
-fn searched(policy: &Policy, document: &Value) -> Result<Searched, ServiceError> {
+/// The weights from which a request starts: the means of its learner, or the model's own.
+pub(super) fn base_weights(model: &Model, learner: Option<&Ready>, faults: &mut Faults) -> Option<Weights> {
+    let schema = model.schema();
+    let Some(Ready { learner, weights, .. }) = learner else { return Some(schema.weights()) };
+    let learned = learner.weights_for(schema, &weights.distribution.mean);
+    learned.map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string())).ok()
+}
+
+/// Writes the policy that was made for the request in `document`.
+pub(super) fn searched(policy: &Policy, document: &Value) -> Result<Searched, ServiceError> {
     let row = PolicyText::of(policy)?;
     let refinement = (policy.status == Status::Local).then(|| {
         let mut request = document.clone();

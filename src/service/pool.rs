@@ -1,7 +1,8 @@
 //! The bounded pool that everything CPU-bound runs on.
 //!
 //! A job is admitted if fewer than `n_threads + max_waiting` are in the pool, waits for a thread, and runs there. Whoever waits for
-//! a job may go away at any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`].
+//! a job may go away at any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`]. A job that is
+//! over before a change of threads would have paid for itself waits its turn like the others, and then runs where it is.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -59,10 +60,16 @@ impl SearchPool {
         }
     }
 
+    /// How many jobs run at the same time, at most.
+    #[must_use]
+    pub fn n_threads(&self) -> usize {
+        self.settings.n_threads.max(1)
+    }
+
     /// How many jobs are in the pool, waiting or running.
     #[must_use]
     pub fn n_jobs(&self) -> usize {
-        self.settings.n_threads.max(1) + self.settings.max_waiting - self.admitted.available_permits()
+        self.n_threads() + self.settings.max_waiting - self.admitted.available_permits()
     }
 
     /// A place in the pool, for all that a request needs.
@@ -88,6 +95,29 @@ impl SearchPool {
         self.run_admitted(None, None, job).await
     }
 
+    /// Runs `job` beside the threads of the pool, which it must not keep: it waits for others. For callers that are bounded in
+    /// number themselves.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the job was told to stop.
+    pub async fn run_aside<T, F>(&self, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
+        self.run_holding((), None, self.abort.child_token(), job).await
+    }
+
+    /// Waits for a thread.
+    async fn turn(&self) -> Result<OwnedSemaphorePermit, PoolError> {
+        tokio::select! {
+            biased;
+            () = self.abort.cancelled() => Err(PoolError::Stopped),
+            thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped),
+        }
+    }
+
     async fn run_admitted<T, F>(
         &self,
         admitted: Option<Arc<OwnedSemaphorePermit>>,
@@ -99,16 +129,27 @@ impl SearchPool {
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
         let cancel = self.abort.child_token();
+        let thread = self.turn().await?;
+        self.run_holding((admitted, thread), deadline, cancel, job).await
+    }
+
+    /// Runs `job`, and keeps `held` until it has really ended, even if nobody waits for it any more.
+    async fn run_holding<T, F>(
+        &self,
+        held: impl Send + 'static,
+        deadline: Option<Instant>,
+        cancel: CancellationToken,
+        job: F,
+    ) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
         // Dropped with this future: whoever waited is gone.
         let _gone: DropGuard = cancel.clone().drop_guard();
-        let thread = tokio::select! {
-            thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped)?,
-            () = cancel.cancelled() => return Err(PoolError::Stopped),
-        };
         let span = tracing::Span::current();
         let running = self.tasks.spawn_blocking(move || {
-            // Held until the job has really ended, even if nobody waits for it any more.
-            let _held = (admitted, thread);
+            let _held = held;
             let mut interrupt = Watch { cancel, deadline };
             span.in_scope(|| job(&mut interrupt))
         });
@@ -140,6 +181,22 @@ impl Admission {
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
         self.pool.run_admitted(Some(Arc::clone(&self.admitted)), deadline, job).await
+    }
+
+    /// Runs `job`, which takes no longer than a millisecond or so, in place of a thread of the pool: on the one that polls the
+    /// returned future. It is told to finish when `deadline` has passed.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the service ends before it has begun.
+    pub async fn run_here<T>(
+        &self,
+        deadline: Option<Instant>,
+        job: impl FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled>,
+    ) -> Result<T, PoolError> {
+        let _thread = self.pool.turn().await?;
+        let mut interrupt = Watch { cancel: self.pool.abort.clone(), deadline };
+        job(&mut interrupt).map_err(|Cancelled| PoolError::Stopped)
     }
 }
 
@@ -215,6 +272,27 @@ mod tests {
         abort.cancel();
         assert_eq!(running.await.unwrap(), Err(PoolError::Stopped));
         assert_eq!(waiting.await.unwrap(), Err(PoolError::Stopped));
+    }
+
+    #[tokio::test]
+    async fn a_job_that_runs_where_it_is_waits_its_turn() {
+        let (pool, abort) = pool(1, 1);
+        let running = tokio::spawn({
+            let pool = pool.clone();
+            async move { pool.admit()?.run(None, until_cancelled).await }
+        });
+        while pool.n_jobs() == 0 {
+            tokio::task::yield_now().await;
+        }
+        let place = pool.admit().unwrap();
+        assert_eq!(pool.admit().map(drop), Err(PoolError::Busy), "it is counted");
+        let mut waiting = Box::pin(place.run_here(None, |_| Ok(7)));
+        assert!(futures_util::poll!(&mut waiting).is_pending());
+        running.abort();
+        assert_eq!(waiting.await, Ok(7));
+        assert_eq!(place.run_here(Some(Instant::now()), until_cancelled).await, Ok(()));
+        abort.cancel();
+        assert_eq!(place.run_here(None, |_| Ok(7)).await, Err(PoolError::Stopped));
     }
 
     #[tokio::test]

@@ -112,6 +112,15 @@ pub struct Resumed {
     pub policy: Option<Policy>,
 }
 
+/// What became of observations that were received, besides being durable.
+#[derive(Debug)]
+pub enum Received {
+    /// They were mapped at the same time, and commit these steps.
+    Mapped(Vec<CommittedStep>),
+    /// They take longer to be mapped: see [`Session::advance`].
+    Waiting(Vec<Observation>),
+}
+
 /// The end of a session.
 #[derive(Debug)]
 pub struct Ended {
@@ -333,19 +342,20 @@ impl Session {
         self.ownership.taken_over.cancelled().await;
     }
 
-    /// Takes the states from `seq` on, of which those received before are ignored: they are durable when this returns. Gives
-    /// the new ones, for [`Self::advance`].
+    /// Takes the states from `seq` on, of which those received before are ignored: they are durable when this returns. What
+    /// takes less time than the disk is mapped while that writes.
     ///
     /// # Errors
     ///
-    /// If something is wrong with them; then none was taken.
+    /// If something is wrong with them; then none was taken. After [`SessionError::NotOpen`] and
+    /// [`SessionError::Service`] the session is to be dropped.
     pub async fn receive(
         &mut self,
         etude: &Etude,
         seq: u32,
         states: &Place<'_, '_>,
         now: Timestamp,
-    ) -> Result<Vec<Observation>, SessionError> {
+    ) -> Result<Received, SessionError> {
         if self.has_ended() {
             return Err(SessionError::Ended);
         }
@@ -357,7 +367,7 @@ impl Session {
         let n_known = (self.n_received - seq) as usize;
         let new = items.get(n_known..).unwrap_or_default();
         if new.is_empty() {
-            return Ok(Vec::new());
+            return Ok(Received::Mapped(Vec::new()));
         }
         if self.n_received as usize + new.len() > Demonstration::MAX_OBSERVATIONS {
             return Err(SessionError::TooMany);
@@ -375,21 +385,33 @@ impl Session {
         let observations = faults.check(observations.into_iter().collect::<Option<Vec<_>>>())?;
         #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
         let n_states = new.len() as u32;
-        let added = etude
-            .store
-            .add_observations(NewObservations {
-                session_id: self.id.clone(),
-                seq: self.n_received,
-                n_states,
-                states: serde_json::to_string(new).map_err(ServiceError::Write)?,
-                at: now,
-            })
-            .await?;
-        if !added {
+        let adding = etude.store.add_observations(NewObservations {
+            session_id: self.id.clone(),
+            seq: self.n_received,
+            n_states,
+            states: serde_json::to_string(new).map_err(ServiceError::Write)?,
+            at: now,
+        });
+        let mapping = async {
+            if self.is_inline(observations.len()) {
+                self.advance(etude, observations).await.map(Received::Mapped)
+            } else {
+                Ok(Received::Waiting(observations))
+            }
+        };
+        // In this order: the disk is at work before the mapping begins.
+        let (added, mapped) = tokio::join!(biased; adding, mapping);
+        if !added? {
             return Err(SessionError::NotOpen);
         }
         self.n_received += n_states;
-        Ok(observations)
+        mapped
+    }
+
+    /// Whether so many observations are mapped where they arrive.
+    fn is_inline(&self, n_observations: usize) -> bool {
+        let n_layers = n_observations * self.lookahead.map_or(1, |lookahead| lookahead.get() as usize);
+        n_layers.saturating_mul(self.mapper.model().graph().n_states()) <= MAX_INLINE_WORK
     }
 
     /// Maps observations that were received, and gives the steps that they commit.
@@ -403,7 +425,7 @@ impl Session {
         observations: Vec<Observation>,
     ) -> Result<Vec<CommittedStep>, SessionError> {
         let mut online = self.online.take().ok_or(SessionError::NotOpen)?;
-        let n_layers = observations.len() * self.lookahead.map_or(1, |lookahead| lookahead.get() as usize);
+        let is_inline = self.is_inline(observations.len());
         let job = move |interrupt: &mut dyn Interrupt| {
             let mut steps = Vec::new();
             for observation in &observations {
@@ -411,8 +433,7 @@ impl Session {
             }
             Ok((online, steps))
         };
-        let work = n_layers.saturating_mul(self.mapper.model().graph().n_states());
-        let (online, steps) = if work <= MAX_INLINE_WORK {
+        let (online, steps) = if is_inline {
             job(&mut Uninterrupted).map_err(|_| PoolError::Stopped)?
         } else {
             etude.pool.run_patiently(job).await?

@@ -56,7 +56,7 @@ impl Etude {
             object.required("model", &mut faults)?.string(&mut faults).map(str::to_owned)
         });
         let Some(model) = model else { return Err(faults.into()) };
-        let (model_hash, mapper) = match self.mapper(&model, "/model", Some(&place)).await {
+        let (model_hash, mapper) = match self.known_mapper(&model, "/model", &place).await {
             Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
             found => found?,
         };

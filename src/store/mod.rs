@@ -3,12 +3,15 @@
 //! ```text
 //! service --Write--> queue --> writer (one task, one connection): groups what is waiting into one transaction
 //!    |                            BEGIN IMMEDIATE .. COMMIT (WAL, synchronous = FULL), then answers every waiter
+//!    |                            observations: one row a group in `arrivals`, settled in their table later
 //!    +------ reads ------------> pool of readers (query_only)
 //! ```
 //!
 //! A write that was answered is on disk. Rows become domain types here and nowhere else; times are milliseconds since 1970,
-//! documents are JSON text.
+//! documents are JSON text, in compressed pieces where it is long.
 
+mod arrivals;
+mod definitions;
 mod learners;
 mod models;
 mod policies;
@@ -20,8 +23,10 @@ mod writer;
 use std::path::Path;
 use std::time::Duration;
 
+use definitions::Sweeper;
+pub use definitions::{NewPieces, PIECE_BYTES};
 pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
-pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewModel, PutModel};
+pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
 pub use policies::{NewPolicy, PolicySummaryRow};
 pub use refinements::{NewRefinement, RefinementEnd};
 pub use sessions::{NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus};
@@ -72,6 +77,9 @@ pub enum StoreError {
         #[source]
         source: Box<dyn std::error::Error + Send + Sync>,
     },
+    /// What is read was removed while it was.
+    #[error("it was removed while it was read")]
+    Removed,
     /// The store is shutting down.
     #[error("the store takes no more writes")]
     Closed,
@@ -91,6 +99,8 @@ impl From<sqlx::Error> for StoreError {
 pub struct Store {
     readers: SqlitePool,
     writer: Writer,
+    sweeper: Sweeper,
+    tasks: TaskTracker,
 }
 
 impl Store {
@@ -117,7 +127,10 @@ impl Store {
             .max_connections(N_READERS)
             .connect_with(options.create_if_missing(false).pragma("query_only", "ON"))
             .await?;
-        Ok(Self { readers, writer: Writer::start(connection, tasks) })
+        let left = definitions::left_behind(&readers).await?;
+        let writer = Writer::start(connection, tasks);
+        let sweeper = Sweeper::start(writer.clone(), left, tasks);
+        Ok(Self { readers, writer, sweeper, tasks: tasks.clone() })
     }
 
     /// Takes no more reads or writes. Once the writer has ended, all that was written stands in a single file.
@@ -125,6 +138,11 @@ impl Store {
         // The last connection to be closed folds in the log; that must be the writer's.
         self.readers.close().await;
         self.writer.close();
+    }
+
+    /// Counts up whenever a model was registered or deleted, before whoever did so is told.
+    pub(crate) fn models_generation(&self) -> u64 {
+        self.writer.models_generation()
     }
 
     /// Whether the database answers.
@@ -148,6 +166,8 @@ fn migrator() -> Migrator {
             migration(1, "models and policies", include_str!("../../migrations/0001_models_and_policies.sql")),
             migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
             migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
+            migration(4, "large definitions", include_str!("../../migrations/0004_large_definitions.sql")),
+            migration(5, "arrivals", include_str!("../../migrations/0005_arrivals.sql")),
         ]
         .into(),
         ..Migrator::DEFAULT

@@ -5,6 +5,7 @@ use sqlx::Row;
 use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
 
+use super::definitions::NewPieces;
 use super::writer::{Write, Written};
 use super::{Page, Store, StoreError, corrupt, timestamp};
 use crate::attribute::AttributeDocument;
@@ -48,12 +49,21 @@ pub struct ModelKey {
 }
 
 /// A model to be registered.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub struct NewModel {
     /// What is kept besides the definition.
     pub summary: ModelSummary,
     /// Its canonical text.
-    pub definition: String,
+    pub definition: NewDefinition,
+}
+
+/// The canonical text of a model to be registered.
+#[derive(Debug)]
+pub enum NewDefinition {
+    /// As a whole.
+    Text(String),
+    /// In pieces, all of which are stored.
+    Pieces(NewPieces),
 }
 
 /// A model as it is stored.
@@ -62,7 +72,25 @@ pub struct ModelRow {
     /// What is kept besides the definition.
     pub summary: ModelSummary,
     /// Its canonical text.
-    pub definition: String,
+    pub definition: StoredDefinition,
+}
+
+/// The canonical text of a model as it is stored.
+#[derive(Clone, Debug)]
+pub enum StoredDefinition {
+    /// As a whole.
+    Text(String),
+    /// In pieces, by the id under which [`Store::piece`] gives them.
+    Pieces(i64),
+}
+
+/// What became of a deletion.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum DeleteModel {
+    /// There is no such model.
+    Unknown,
+    /// It is deleted; of a definition in pieces, the id.
+    Deleted(Option<i64>),
 }
 
 /// What became of a registration.
@@ -99,7 +127,13 @@ impl Store {
     /// If the database failed.
     pub async fn delete_model(&self, name: &str) -> Result<bool, StoreError> {
         match self.writer.write(Write::DeleteModel(name.to_owned())).await? {
-            Written::DeleteModel(existed) => Ok(existed),
+            Written::DeleteModel(DeleteModel::Unknown) => Ok(false),
+            Written::DeleteModel(DeleteModel::Deleted(definition_id)) => {
+                if let Some(id) = definition_id {
+                    self.sweeper.sweep(id);
+                }
+                Ok(true)
+            }
             _ => Err(StoreError::Closed),
         }
     }
@@ -112,8 +146,13 @@ impl Store {
     pub async fn model(&self, name: &str) -> Result<Option<ModelRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM models WHERE name = $1").bind(name);
         let row = query.fetch_optional(&self.readers).await?;
-        let read =
-            |row: SqliteRow| Ok(ModelRow { summary: read_summary(&row)?, definition: row.try_get("definition")? });
+        let read = |row: SqliteRow| {
+            let definition = match row.try_get("definition_id")? {
+                Some(id) => StoredDefinition::Pieces(id),
+                None => StoredDefinition::Text(row.try_get("definition")?),
+            };
+            Ok(ModelRow { summary: read_summary(&row)?, definition })
+        };
         row.map(read).transpose()
     }
 
@@ -172,16 +211,22 @@ fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
 
 pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> Result<PutModel, StoreError> {
     let NewModel { summary, definition } = model;
+    let (text, definition_id) = match definition {
+        NewDefinition::Text(text) => (text.as_str(), None),
+        NewDefinition::Pieces(pieces) => ("", Some(pieces.id)),
+    };
     let json = |source: serde_json::Error| corrupt("models", "attributes")(source);
     let count = |count: u64| i64::try_from(count).unwrap_or(i64::MAX);
     let inserted = sqlx::query(
         "INSERT INTO models
-             (name, hash, definition, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9) ON CONFLICT (name) DO NOTHING",
+             (name, hash, definition, definition_id, attributes, actions, n_states, n_transitions, n_unsafe,
+              created_at_ms)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10) ON CONFLICT (name) DO NOTHING",
     )
     .bind(&summary.name)
     .bind(&summary.hash)
-    .bind(definition)
+    .bind(text)
+    .bind(definition_id)
     .bind(serde_json::to_string(&summary.attributes).map_err(json)?)
     .bind(serde_json::to_string(&summary.actions).map_err(json)?)
     .bind(summary.size.map_or(UNKNOWN, |size| count(size.n_states)))
@@ -206,7 +251,8 @@ pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> 
     })
 }
 
-pub(super) async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<bool, StoreError> {
-    let deleted = sqlx::query("DELETE FROM models WHERE name = $1").bind(name).execute(connection).await?;
-    Ok(deleted.rows_affected() > 0)
+pub(super) async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<DeleteModel, StoreError> {
+    let query = sqlx::query_scalar("DELETE FROM models WHERE name = $1 RETURNING definition_id").bind(name);
+    let deleted: Option<Option<i64>> = query.fetch_optional(connection).await?;
+    Ok(deleted.map_or(DeleteModel::Unknown, DeleteModel::Deleted))
 }

@@ -1,7 +1,7 @@
 //! The table of policies.
 
 use jiff::Timestamp;
-use sqlx::{Row, SqliteConnection};
+use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 
 use super::refinements::NewRefinement;
 use super::writer::Write;
@@ -30,13 +30,17 @@ pub struct PolicySummaryRow {
 }
 
 impl Store {
-    /// Stores a policy, and notes that it is to be refined if `refinement` says so.
+    /// Stores policies in this order, all of them or none, and notes which of them are to be refined.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn add_policy(&self, policy: NewPolicy, refinement: Option<NewRefinement>) -> Result<(), StoreError> {
-        self.writer.write(Write::AddPolicy(policy, refinement)).await.map(drop)
+    pub async fn add_policies(
+        &self,
+        policies: Vec<NewPolicy>,
+        refinements: Vec<NewRefinement>,
+    ) -> Result<(), StoreError> {
+        self.writer.write(Write::AddPolicies(policies, refinements)).await.map(drop)
     }
 
     /// The policy with this id: JSON.
@@ -69,12 +73,29 @@ impl Store {
 }
 
 pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -> Result<(), StoreError> {
-    sqlx::query("INSERT INTO policies (id, summary, policy, created_at_ms) VALUES ($1, $2, $3, $4)")
-        .bind(&policy.id)
-        .bind(&policy.summary)
-        .bind(&policy.policy)
-        .bind(policy.created_at.as_millisecond())
-        .execute(connection)
-        .await?;
+    add_all(connection, &[policy]).await
+}
+
+/// Most policies that a statement inserts.
+const MAX_ROWS: usize = 32;
+
+/// Adds policies in this order, several a statement: each statement costs the driver a change of threads. Statements come in a
+/// few lengths, so that they are prepared once.
+pub(super) async fn add_all(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
+    let mut left = policies;
+    while !left.is_empty() {
+        // The largest power of two that fits.
+        let n_rows = 1 << left.len().min(MAX_ROWS).ilog2();
+        let (rows, rest) = left.split_at(n_rows);
+        left = rest;
+        let mut insert = QueryBuilder::<Sqlite>::new("INSERT INTO policies (id, summary, policy, created_at_ms) ");
+        insert.push_values(rows, |mut row, policy| {
+            row.push_bind(&policy.id)
+                .push_bind(&policy.summary)
+                .push_bind(&policy.policy)
+                .push_bind(policy.created_at.as_millisecond());
+        });
+        insert.build().execute(&mut *connection).await?;
+    }
     Ok(())
 }

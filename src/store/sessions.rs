@@ -136,7 +136,7 @@ impl Store {
         self.done(Write::OpenSession(Box::new(session))).await
     }
 
-    /// Adds observations to an open session. Says whether it was open and they came next.
+    /// Adds observations to an open session, durably. Says whether it was open and they came next.
     ///
     /// # Errors
     ///
@@ -170,12 +170,22 @@ impl Store {
         }
     }
 
+    /// Brings observations that have arrived to their table, whoever's they are.
+    async fn settle(&self) -> Result<(), StoreError> {
+        let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM arrivals)");
+        if query.fetch_one(&self.readers).await? {
+            self.writer.write(Write::Settle).await?;
+        }
+        Ok(())
+    }
+
     /// The session with this id.
     ///
     /// # Errors
     ///
     /// If the database failed.
     pub async fn session(&self, id: &str) -> Result<Option<SessionRow>, StoreError> {
+        self.settle().await?;
         let query = sqlx::query("SELECT * FROM sessions WHERE id = $1").bind(id);
         let row = query.fetch_optional(&self.readers).await?;
         row.as_ref().map(read_session).transpose()
@@ -187,6 +197,7 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRow>, StoreError> {
+        self.settle().await?;
         let query = sqlx::query("SELECT * FROM sessions WHERE sequence > $1 ORDER BY sequence LIMIT $2");
         let rows = query.bind(after).bind(i64::from(limit) + 1).fetch_all(&self.readers).await?;
         let sessions = rows.iter().map(read_session).collect::<Result<Vec<_>, _>>()?;
@@ -199,6 +210,7 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn observations(&self, session_id: &str) -> Result<Vec<String>, StoreError> {
+        self.settle().await?;
         let query = sqlx::query_scalar("SELECT states FROM observations WHERE session_id = $1 ORDER BY seq");
         Ok(query.bind(session_id).fetch_all(&self.readers).await?)
     }
@@ -258,7 +270,15 @@ pub(super) async fn open(connection: &mut SqliteConnection, session: &NewSession
     Ok(true)
 }
 
-/// Adds to several sessions, each of them once. Gives for each whether it was open and this was what came next. Two
+/// The open ones among the sessions with these ids (JSON: an array), with how many observations their table has of each.
+pub(super) async fn count_open(connection: &mut SqliteConnection, ids: &str) -> Result<Vec<(String, u32)>, StoreError> {
+    let query = sqlx::query_as(
+        "SELECT id, n_observations FROM sessions WHERE status = 'open' AND id IN (SELECT value FROM json_each($1))",
+    );
+    Ok(query.bind(ids).fetch_all(connection).await?)
+}
+
+/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. Two
 /// statements, however many there are: each one costs the driver a change of threads.
 pub(super) async fn add(
     connection: &mut SqliteConnection,

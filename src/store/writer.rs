@@ -1,21 +1,26 @@
 //! The one writer, which groups commits.
 //!
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies
-//! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves.
+//! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves. Observations,
+//! which are most of it, only arrive with a commit, and are settled in their table later (`arrivals`).
 
-use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use sqlx::{Connection, SqliteConnection};
+use tokio::runtime::Handle;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use jiff::Timestamp;
 
+use super::arrivals::Arrivals;
+use super::models::DeleteModel;
 use super::{
     FailTrial, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement, NewReward, NewSession, NewTrial,
-    PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, WeightsRow, learners, models, policies,
-    refinements, sessions, trials,
+    PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, WeightsRow, definitions, learners, models,
+    policies, refinements, sessions, trials,
 };
 
 /// Most writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
@@ -29,11 +34,20 @@ const MAX_WAITING: usize = 1024;
 pub(super) enum Write {
     PutModel(NewModel),
     DeleteModel(String),
-    AddPolicy(NewPolicy, Option<NewRefinement>),
+    BeginDefinition,
+    AddPiece {
+        definition_id: i64,
+        seq: i64,
+        piece: Vec<u8>,
+    },
+    SweepDefinition(i64),
+    AddPolicies(Vec<NewPolicy>, Vec<NewRefinement>),
     EndRefinement(Box<RefinementEnd>),
     OpenSession(Box<NewSession>),
     AddObservations(NewObservations),
     EndSession(Box<SessionEnd>),
+    /// Brings observations that have arrived to their table.
+    Settle,
     /// Those last active before this time.
     ExpireSessions(Timestamp),
     PutLearner(NewLearner),
@@ -54,8 +68,9 @@ pub(super) enum Write {
 #[derive(Debug)]
 pub(super) enum Written {
     PutModel(PutModel),
-    /// Whether there was one.
-    DeleteModel(bool),
+    DeleteModel(DeleteModel),
+    /// Its id.
+    BeginDefinition(i64),
     /// Whether things were as expected, so that it was done.
     Done(bool),
     PutLearner(PutLearner),
@@ -76,10 +91,11 @@ struct Job {
 }
 
 /// The way to the writer.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub(super) struct Writer {
     queue: mpsc::Sender<Job>,
     closing: CancellationToken,
+    models_generation: Arc<AtomicU64>,
 }
 
 impl Writer {
@@ -87,13 +103,27 @@ impl Writer {
     pub(super) fn start(connection: SqliteConnection, tasks: &TaskTracker) -> Self {
         let (queue, jobs) = mpsc::channel(MAX_WAITING);
         let closing = CancellationToken::new();
-        tasks.spawn(run(connection, jobs, closing.clone()));
-        Self { queue, closing }
+        let models_generation = Arc::new(AtomicU64::new(0));
+        let running = run(connection, jobs, closing.clone(), Arc::clone(&models_generation));
+        // A thread of its own: whatever keeps the others busy, no commit waits for it between two statements.
+        let runtime = Handle::current();
+        tasks.spawn_blocking(move || runtime.block_on(running));
+        Self { queue, closing, models_generation }
+    }
+
+    /// Counts up whenever a model was registered or deleted, before whoever did so is told.
+    pub(super) fn models_generation(&self) -> u64 {
+        self.models_generation.load(Ordering::Acquire)
     }
 
     /// Takes no more writes, and ends once everything waiting has been written.
     pub(super) fn close(&self) {
         self.closing.cancel();
+    }
+
+    /// Completes when no more writes are taken.
+    pub(super) async fn closed(&self) {
+        self.closing.cancelled().await;
     }
 
     /// Writes, and returns once it is on disk. A caller that goes away does not undo its write.
@@ -108,8 +138,14 @@ impl Writer {
     }
 }
 
-async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, closing: CancellationToken) {
+async fn run(
+    mut connection: SqliteConnection,
+    mut jobs: mpsc::Receiver<Job>,
+    closing: CancellationToken,
+    models_generation: Arc<AtomicU64>,
+) {
     let mut group = Vec::with_capacity(MAX_GROUP);
+    let mut arrivals = Arrivals::default();
     loop {
         tokio::select! {
             n_jobs = jobs.recv_many(&mut group, MAX_GROUP) => if n_jobs == 0 { break },
@@ -119,7 +155,13 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
                 continue;
             }
         }
-        match commit(&mut connection, &group).await {
+        let is_of_models = |job: &Job| matches!(job.write, Write::PutModel(_) | Write::DeleteModel(_));
+        let are_models_changed = group.iter().any(is_of_models);
+        let committed = commit(&mut connection, &mut arrivals, &group).await;
+        if are_models_changed {
+            models_generation.fetch_add(1, Ordering::AcqRel);
+        }
+        match committed {
             Ok(written) => {
                 for (job, written) in group.drain(..).zip(written) {
                     // Whoever waited may be gone.
@@ -135,7 +177,10 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
             Err(_) if group.len() > 1 => {
                 // One write must not spoil the others: each gets a transaction and an error of its own.
                 for job in group.drain(..) {
-                    let written = commit(&mut connection, std::slice::from_ref(&job)).await;
+                    let written = commit(&mut connection, &mut arrivals, std::slice::from_ref(&job)).await;
+                    if is_of_models(&job) {
+                        models_generation.fetch_add(1, Ordering::AcqRel);
+                    }
                     let _ = job.answer.send(written.and_then(|mut written| written.pop().ok_or(StoreError::Closed)));
                 }
             }
@@ -146,27 +191,106 @@ async fn run(mut connection: SqliteConnection, mut jobs: mpsc::Receiver<Job>, cl
             }
         }
     }
+    if !arrivals.is_empty()
+        && let Err(error) = settle(&mut connection, &mut arrivals).await
+    {
+        // They are durable where they are.
+        tracing::warn!(error = &error as &dyn std::error::Error, "observations were left for the next start to settle");
+    }
     // Checkpoints the log, so that what is left behind is a single file.
     if let Err(error) = connection.close().await {
         tracing::warn!(error = &error as &dyn std::error::Error, "the database was not closed cleanly");
     }
 }
 
-/// Applies `group` in one transaction: rewards last, all together. Nobody was answered yet, so that any order is one in which
-/// they may have come.
-async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<Written>, StoreError> {
+/// Applies `group`; what was known is forgotten if it cannot be.
+async fn commit(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &[Job],
+) -> Result<Vec<Written>, StoreError> {
+    let observations = group.iter().map(|job| match &job.write {
+        Write::AddObservations(new) => Some(new),
+        _ => None,
+    });
+    let committed = match observations.collect::<Option<Vec<_>>>() {
+        Some(news) if arrivals.is_known() && !arrivals.is_full() => {
+            match add_observations(connection, arrivals, &news).await {
+                Ok(None) => transact(connection, arrivals, group).await,
+                Ok(Some(written)) => Ok(written),
+                Err(error) => Err(error),
+            }
+        }
+        _ => transact(connection, arrivals, group).await,
+    };
+    if committed.is_err() {
+        arrivals.forget();
+    }
+    committed
+}
+
+/// Adds observations in one statement. Gives nothing, and has done nothing, if one of them does not come next as far as is
+/// known, or others have written meanwhile: that takes a closer look.
+async fn add_observations(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    news: &[&NewObservations],
+) -> Result<Option<Vec<Written>>, StoreError> {
+    let accepted = arrivals.accept(connection, news).await?;
+    if accepted.is_next.contains(&false) || !arrivals.add_at_once(connection, &accepted).await? {
+        arrivals.forget();
+        return Ok(None);
+    }
+    Ok(Some(accepted.is_next.into_iter().map(Written::Done).collect()))
+}
+
+/// Applies `group` in one transaction: observations and policies first, rewards last, each all together. Nobody was answered yet, so that
+/// any order is one in which they may have come.
+async fn transact(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &[Job],
+) -> Result<Vec<Written>, StoreError> {
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    let observations = group.iter().filter_map(|job| match &job.write {
+        Write::AddObservations(new) => Some(new),
+        _ => None,
+    });
+    let observations: Vec<_> = observations.collect();
+    let is_read = |job: &Job| matches!(job.write, Write::EndSession(_) | Write::ExpireSessions(_) | Write::Settle);
+    let are_read = group.iter().any(is_read);
+    let mut are_next = Vec::new();
+    // Whoever has nothing to do with observations does not wait for them.
+    if are_read || !observations.is_empty() {
+        arrivals.check(&mut transaction).await?;
+        if !arrivals.is_known() {
+            arrivals.settle(&mut transaction).await?;
+        }
+        let accepted = arrivals.accept(&mut transaction, &observations).await?;
+        arrivals.add(&mut transaction, &accepted).await?;
+        if are_read || arrivals.is_full() {
+            arrivals.settle(&mut transaction).await?;
+        }
+        are_next = accepted.is_next;
+    }
+
+    let mut are_next = are_next.into_iter();
     let mut written = Vec::with_capacity(group.len());
     let mut rewards = Vec::new();
-    let mut added = add_observations(&mut transaction, group).await?;
-    for (n, job) in group.iter().enumerate() {
+    let added_policies = group.iter().filter_map(|job| match &job.write {
+        Write::AddPolicies(added, to_refine) if to_refine.is_empty() => Some(added),
+        _ => None,
+    });
+    policies::add_all(&mut transaction, &added_policies.flatten().collect::<Vec<_>>()).await?;
+    for job in group {
         written.push(match &job.write {
+            Write::AddObservations(_) => are_next.next().map(Written::Done),
             Write::PutReward(reward) => {
                 rewards.push(reward);
                 None
             }
-            Write::AddObservations(_) if let Some(was_next) = added.remove(&n) => Some(Written::Done(was_next)),
-            write => Some(apply(&mut transaction, write).await?),
+            Write::AddPolicies(_, to_refine) if to_refine.is_empty() => Some(Written::Done(true)),
+            write => Some(apply(&mut transaction, arrivals, write).await?),
         });
     }
     if !rewards.is_empty() {
@@ -180,14 +304,31 @@ async fn commit(connection: &mut SqliteConnection, group: &[Job]) -> Result<Vec<
     Ok(written.into_iter().flatten().collect())
 }
 
-/// Applies a single write.
-async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Written, StoreError> {
+/// Brings what has arrived to its table.
+async fn settle(connection: &mut SqliteConnection, arrivals: &mut Arrivals) -> Result<(), StoreError> {
+    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    arrivals.settle(&mut transaction).await?;
+    Ok(transaction.commit().await?)
+}
+
+/// Applies a single write, which is neither of observations nor of a reward.
+async fn apply(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    write: &Write,
+) -> Result<Written, StoreError> {
     Ok(match write {
         Write::PutModel(model) => Written::PutModel(models::put(connection, model).await?),
         Write::DeleteModel(name) => Written::DeleteModel(models::delete(connection, name).await?),
-        Write::AddPolicy(policy, refinement) => {
-            policies::add(connection, policy).await?;
-            if let Some(refinement) = refinement {
+        Write::BeginDefinition => Written::BeginDefinition(definitions::begin(connection).await?),
+        Write::AddPiece { definition_id, seq, piece } => {
+            definitions::add_piece(connection, *definition_id, *seq, piece).await?;
+            Written::Done(true)
+        }
+        Write::SweepDefinition(id) => Written::Done(definitions::sweep_some(connection, *id).await?),
+        Write::AddPolicies(added, to_refine) => {
+            policies::add_all(connection, &added.iter().collect::<Vec<_>>()).await?;
+            for refinement in to_refine {
                 refinements::add(connection, refinement).await?;
             }
             Written::Done(true)
@@ -196,15 +337,24 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
             refinements::end(connection, end).await?;
             Written::Done(true)
         }
-        Write::OpenSession(session) => Written::Done(sessions::open(connection, session).await?),
-        Write::AddObservations(observations) => {
-            Written::Done(sessions::add(connection, &[observations]).await? == [true])
+        Write::OpenSession(session) => {
+            let was_opened = sessions::open(connection, session).await?;
+            if was_opened {
+                arrivals.opened(&session.id);
+            }
+            Written::Done(was_opened)
         }
-        Write::EndSession(end) => Written::Done(sessions::end(connection, end).await?),
+        Write::EndSession(end) => {
+            arrivals.ended(&end.session_id);
+            Written::Done(sessions::end(connection, end).await?)
+        }
         Write::ExpireSessions(before) => {
+            arrivals.expired();
             sessions::expire(connection, *before).await?;
             Written::Done(true)
         }
+        // Was done before.
+        Write::Settle => Written::Done(true),
         Write::PutLearner(learner) => Written::PutLearner(learners::put(connection, learner).await?),
         Write::DeleteLearner(name) => Written::DeleteLearner(learners::delete(connection, name).await?),
         Write::AddWeights { learner, weights } => {
@@ -214,31 +364,6 @@ async fn apply(connection: &mut SqliteConnection, write: &Write) -> Result<Writt
         Write::FailTrial { id, reason } => {
             Written::FailTrial(Box::new(trials::fail(connection, id, reason.as_deref()).await?))
         }
-        Write::PutReward(reward) => {
-            let mut put = trials::reward_all(connection, &[reward]).await?;
-            Written::PutReward(Box::new(put.pop().ok_or(StoreError::Closed)?))
-        }
+        Write::AddObservations(_) | Write::PutReward(_) => unreachable!("applied together with their like"),
     })
-}
-
-/// Adds the observations of a group at once, but for those to a session that the group has already added to: a session was
-/// resumed meanwhile. Gives by index in the group whether they came next. What else a group does to these
-/// sessions was not waited for by their owner, so any order will do.
-async fn add_observations(
-    connection: &mut SqliteConnection,
-    group: &[Job],
-) -> Result<HashMap<usize, bool>, StoreError> {
-    let mut sessions_added = HashSet::new();
-    let (indices, news): (Vec<usize>, Vec<&NewObservations>) = group
-        .iter()
-        .enumerate()
-        .filter_map(|(n, job)| match &job.write {
-            Write::AddObservations(new) => sessions_added.insert(&new.session_id).then_some((n, new)),
-            _ => None,
-        })
-        .unzip();
-    if news.is_empty() {
-        return Ok(HashMap::new());
-    }
-    Ok(indices.into_iter().zip(sessions::add(connection, &news).await?).collect())
 }

@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem};
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
-use crate::service::{Ended, Etude, PoolError, Resumed, ServiceError, Session, SessionError};
+use crate::service::{Ended, Etude, PoolError, Received, Resumed, ServiceError, Session, SessionError};
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
@@ -21,10 +21,26 @@ pub const PROTOCOL: &str = "etude.v1+json";
 pub struct Limits {
     /// Largest frame, in bytes.
     pub frame_bytes: usize,
+    /// How many streams may run at the same time.
+    pub streams: usize,
     /// How long a client may take to read what waits for it.
     pub slow_after: Duration,
     /// How long a connection may stay silent.
     pub idle_after: Duration,
+}
+
+impl From<Limits> for HelloLimits {
+    fn from(Limits { frame_bytes, streams, slow_after, idle_after }: Limits) -> Self {
+        let ms = |time: Duration| u64::try_from(time.as_millis()).unwrap_or(u64::MAX);
+        Self {
+            frame_bytes,
+            message_bytes: frame_bytes,
+            observations: Demonstration::MAX_OBSERVATIONS,
+            streams,
+            idle_timeout_ms: ms(idle_after),
+            slow_reader_timeout_ms: ms(slow_after),
+        }
+    }
 }
 
 /// What came from the client.
@@ -148,7 +164,7 @@ impl Connection<'_> {
         self.send(&ServerFrame::Hello {
             protocol: PROTOCOL,
             server: env!("CARGO_PKG_VERSION"),
-            limits: HelloLimits { frame_bytes: self.limits.frame_bytes, observations: Demonstration::MAX_OBSERVATIONS },
+            limits: HelloLimits::from(self.limits),
         })
         .await?;
         loop {
@@ -214,16 +230,19 @@ impl Connection<'_> {
             (ClientFrame::Observe { seq, frame }, Some(session)) => {
                 let root = Place::root(&frame);
                 let states = Place { value: &frame["states"], path: document::Path::Member(&root.path, "states") };
-                let observations = match session.receive(self.etude, seq, &states, now).await {
-                    Ok(observations) => observations,
+                let received = match session.receive(self.etude, seq, &states, now).await {
+                    Ok(received) => received,
                     Err(error) => return self.go_on_or_end(&error).await,
                 };
-                let received = ServerFrame::Received { seq: session.n_received() };
-                send(self.outgoing, self.limits, &received).await?;
-                if !observations.is_empty() {
-                    let steps = session.advance(self.etude, observations).await.map_err(|error| ends(&error))?;
-                    self.send_steps(&steps).await?;
-                }
+                let frame = ServerFrame::Received { seq: session.n_received() };
+                send(self.outgoing, self.limits, &frame).await?;
+                let steps = match received {
+                    Received::Mapped(steps) => steps,
+                    Received::Waiting(observations) => {
+                        session.advance(self.etude, observations).await.map_err(|error| ends(&error))?
+                    }
+                };
+                self.send_steps(&steps).await?;
                 Ok(None)
             }
             (ClientFrame::End { seq }, Some(session)) => match session.end(self.etude, seq, now).await {

@@ -160,8 +160,16 @@ pub enum ServerFrame<'f> {
 pub struct HelloLimits {
     /// Largest frame, in bytes.
     pub frame_bytes: usize,
+    /// Largest message of a websocket, in bytes: each is one frame of the protocol, however it is fragmented.
+    pub message_bytes: usize,
     /// Most observations of a session.
     pub observations: usize,
+    /// How many streams may run at the same time.
+    pub streams: usize,
+    /// How long nothing may happen in a session before it expires, in milliseconds.
+    pub idle_timeout_ms: u64,
+    /// How long a client may leave unread what waits for it, in milliseconds.
+    pub slow_reader_timeout_ms: u64,
 }
 
 /// A committed step.

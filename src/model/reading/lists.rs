@@ -1,0 +1,170 @@
+//! The long lists of a table in compact form, whatever is wrong with them.
+
+use super::raw::{Distinct, Raw};
+use crate::attribute::Schema;
+use crate::document::{Faults, Path};
+
+/// Most states that can be told apart by an index, with one index to spare.
+pub(super) const MAX_STATES: usize = u32::MAX as usize - 1;
+
+/// Most transitions that can be told apart by an index.
+pub(super) const MAX_TRANSITIONS: usize = u32::MAX as usize - 1;
+
+/// Where the items of a list stand in the document: in one array, or in arrays on several lines.
+#[derive(Debug, Default)]
+pub(in crate::model) struct Places(Vec<Run>);
+
+/// Arrays of `n_each` items on lines that follow one another.
+#[derive(Debug)]
+struct Run {
+    first_item: usize,
+    /// The first line; `None` in a document that is not made of lines.
+    line: Option<u64>,
+    n_lines: u64,
+    n_each: usize,
+    /// Whether the array is a member of the model's dynamics, not of a line of its own.
+    is_in_model: bool,
+}
+
+impl Places {
+    /// Notes where the `n_items` items from `first_item` on stand.
+    pub(super) fn add(&mut self, first_item: usize, n_items: usize, line: Option<u64>, is_in_model: bool) {
+        if n_items == 0 {
+            return;
+        }
+        if let Some(last) = self.0.last_mut()
+            && (last.is_in_model, is_in_model) == (false, false)
+            && last.n_each == n_items
+            && last.line.map(|line| line + last.n_lines) == line
+        {
+            last.n_lines += 1;
+            return;
+        }
+        self.0.push(Run { first_item, line, n_lines: 1, n_each: n_items, is_in_model });
+    }
+
+    /// Follows the path to the item `item` of the list called `list`.
+    pub(in crate::model) fn with_path<R>(&self, list: &str, item: usize, follow: impl FnOnce(&Path<'_>) -> R) -> R {
+        let run = &self.0[self.0.partition_point(|run| run.first_item <= item) - 1];
+        let within = item - run.first_item;
+        let n_lines_before = (within / run.n_each) as u64;
+        let root = run.line.map_or(Path::Root, |line| Path::Line(line + n_lines_before));
+        let dynamics = Path::Member(&root, "dynamics");
+        let parent = if run.is_in_model { &dynamics } else { &root };
+        follow(&Path::Item(&Path::Member(parent, list), within % run.n_each))
+    }
+}
+
+/// Listed states: one row each, of any length and content.
+#[derive(Debug, Default)]
+pub(in crate::model) struct RawStates {
+    /// How many there are. Those beyond the limit are only counted.
+    pub(in crate::model) n_states: usize,
+    /// The distinct values of each column. At most [`Schema::MAX_ATTRIBUTES`].
+    pub(in crate::model) columns: Vec<Distinct>,
+    /// Per row, the number of each value in its column. Shape `[n_states, width]` unless lengths differ.
+    pub(in crate::model) cells: Vec<u32>,
+    /// The length of the first row.
+    pub(in crate::model) width: usize,
+    /// The length of each row, once one is not that of the first; [`Self::NO_ROW`] for what is no array.
+    pub(in crate::model) lens: Option<Vec<u32>>,
+    /// The first of those that are no arrays.
+    pub(in crate::model) no_rows: Vec<Raw>,
+    pub(in crate::model) places: Places,
+}
+
+impl RawStates {
+    pub(in crate::model) const NO_ROW: u32 = u32::MAX;
+
+    /// Ends a row of `len` cells, of which the first [`Schema::MAX_ATTRIBUTES`] were added.
+    pub(super) fn end_row(&mut self, len: usize) {
+        if self.n_states == 0 {
+            self.width = len;
+        }
+        let is_odd = len != self.width || len > Schema::MAX_ATTRIBUTES;
+        if is_odd || self.lens.is_some() {
+            let len = u32::try_from(len).unwrap_or(Self::NO_ROW - 1);
+            self.lens().push(len);
+        }
+        self.n_states += 1;
+    }
+
+    /// Adds what should be a row and is not.
+    pub(super) fn add_no_row(&mut self, found: Raw<&str>) {
+        self.lens().push(Self::NO_ROW);
+        self.n_states += 1;
+        if self.no_rows.len() < Faults::MAX_LISTED {
+            self.no_rows.push(found.owned());
+        }
+    }
+
+    fn lens(&mut self) -> &mut Vec<u32> {
+        #[expect(
+            clippy::cast_possible_truncation,
+            reason = "rows longer than the most attributes are noted as they come"
+        )]
+        self.lens.get_or_insert_with(|| vec![self.width as u32; self.n_states])
+    }
+}
+
+/// What should be the index of a state.
+pub(in crate::model) type RawIndex = Result<u32, Raw>;
+
+/// What is certainly no transition.
+#[derive(Debug)]
+pub(in crate::model) enum NoTransition {
+    /// No array.
+    Other(Raw),
+    /// An array of this many items, other than three.
+    Array(usize),
+    /// One of the three is not of the right kind, or there are more distinct actions than names and indices.
+    Parts(RawIndex, Raw, RawIndex),
+}
+
+/// Listed transitions. Shape `[n_transitions]` by column: 10 bytes each.
+#[derive(Debug, Default)]
+pub(in crate::model) struct RawTransitions {
+    /// How many there are. Those beyond the limit are only counted.
+    pub(in crate::model) n_transitions: usize,
+    /// [`Self::NOWHERE`] for what is no transition.
+    pub(in crate::model) from: Vec<u32>,
+    /// Into `references`.
+    pub(in crate::model) action: Vec<u16>,
+    pub(in crate::model) to: Vec<u32>,
+    /// Distinct ways to refer to an action.
+    pub(in crate::model) references: Distinct,
+    /// The first of what is no transition.
+    pub(in crate::model) odd: Vec<NoTransition>,
+    pub(in crate::model) n_odd: usize,
+    pub(in crate::model) places: Places,
+}
+
+impl RawTransitions {
+    pub(in crate::model) const NOWHERE: u32 = u32::MAX;
+
+    pub(super) fn add(&mut self, from: RawIndex, reference: u32, to: RawIndex) {
+        match (from, u16::try_from(reference), to) {
+            (Ok(from), Ok(reference), Ok(to)) if from != Self::NOWHERE => {
+                self.from.push(from);
+                self.action.push(reference);
+                self.to.push(to);
+                self.n_transitions += 1;
+            }
+            (from, _, to) => {
+                let reference = self.references.values()[reference as usize].clone();
+                self.add_odd(NoTransition::Parts(from, reference, to));
+            }
+        }
+    }
+
+    pub(super) fn add_odd(&mut self, odd: NoTransition) {
+        self.from.push(Self::NOWHERE);
+        self.action.push(0);
+        self.to.push(0);
+        self.n_transitions += 1;
+        self.n_odd += 1;
+        if self.odd.len() < Faults::MAX_LISTED {
+            self.odd.push(odd);
+        }
+    }
+}

@@ -1,0 +1,269 @@
+//! Reading the text of a model, of which there may be gigabytes, in one pass and without a tree of it.
+//!
+//! The long lists of a table, its states and transitions, are taken out as they are met, into compact arrays of what was
+//! found. What is left, the [`Outline`], is small: a JSON value with empty arrays where lists were taken out. What the
+//! cells of the lists ought to be is looked at when all is read, once per *distinct* value; so the members of the text may stand in
+//! any order, and faults come out in the same order whatever that is.
+//!
+//! ```text
+//! JSON, NDJSON, Value --> Reader --> Outline { root, states, transitions } --> definition::of_outline, table::read
+//! ```
+
+mod lists;
+mod raw;
+mod seeds;
+
+use std::io::{self, BufRead};
+
+pub(super) use lists::{NoTransition, RawIndex, RawStates, RawTransitions};
+pub(super) use raw::{Distinct, Raw};
+use seeds::{Position, Seed};
+use serde::de::DeserializeSeed;
+use serde_json::Value;
+
+use super::Limits;
+use crate::document::{self, BEYOND_FLOATS, Faults, ParseError, Path};
+use crate::interrupt::{Cancelled, Meter};
+
+/// How the text of a model is laid out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Format {
+    /// One JSON value.
+    Json,
+    /// A JSON value a line: the model, then objects with more of its `states` and `transitions`.
+    Ndjson,
+}
+
+/// Why a text gives no definition.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// The text is not JSON.
+    #[error(transparent)]
+    Parse(#[from] ParseError),
+    /// It is JSON, but not a model.
+    #[error(transparent)]
+    Faults(#[from] Faults),
+    /// The caller lost interest.
+    #[error(transparent)]
+    Cancelled(#[from] Cancelled),
+    /// What must be kept in memory while it is read is too large.
+    #[error("{0}")]
+    TooLarge(String),
+    /// The text could not be read to its end.
+    #[error("the text could not be read")]
+    Read(#[source] io::Error),
+}
+
+/// A model's document without its long lists.
+#[derive(Debug, Default)]
+pub(super) struct Outline {
+    /// The document; an empty array stands for each list that was taken out.
+    pub(super) root: Value,
+    /// The line that it stands on, in a document of several.
+    pub(super) line: Option<u64>,
+    pub(super) states: Option<RawStates>,
+    pub(super) transitions: Option<RawTransitions>,
+    /// Faults of the lines after the first.
+    pub(super) faults: Faults,
+}
+
+/// Reads outlines.
+pub(super) struct Reader<'m, 'i> {
+    meter: &'m mut Meter<'i>,
+    limits: Limits,
+    states: Option<RawStates>,
+    transitions: Option<RawTransitions>,
+    /// The line that is read, in a document of several.
+    line: Option<u64>,
+    /// About how much memory the values take that are kept as they are.
+    n_held_bytes: usize,
+    max_held_bytes: usize,
+    /// Why an error was raised that is not the text's.
+    stop: Option<Stop>,
+    /// The way to where an error was met, innermost step first.
+    trace: Vec<Step>,
+}
+
+#[derive(Debug)]
+enum Stop {
+    Cancelled,
+    TooLarge(String),
+}
+
+#[derive(Debug)]
+enum Step {
+    Member(String),
+    Item(usize),
+}
+
+/// Most memory for what is neither states nor transitions; a text of 8 MiB needs less, whatever it holds.
+const MAX_HELD_BYTES: usize = 512 << 20;
+
+/// Longest line of NDJSON: it is kept while it is read.
+pub const MAX_LINE_BYTES: usize = 64 << 20;
+
+impl<'m, 'i> Reader<'m, 'i> {
+    pub(super) fn new(limits: Limits, meter: &'m mut Meter<'i>) -> Self {
+        Self {
+            meter,
+            limits: Limits {
+                max_states: limits.max_states.min(lists::MAX_STATES),
+                max_transitions: limits.max_transitions.min(lists::MAX_TRANSITIONS),
+            },
+            states: None,
+            transitions: None,
+            line: None,
+            n_held_bytes: 0,
+            max_held_bytes: MAX_HELD_BYTES,
+            stop: None,
+            trace: Vec::new(),
+        }
+    }
+
+    /// Reads what is in memory already.
+    pub(super) fn read_value(mut self, document: &Value) -> Result<Outline, ReadError> {
+        self.max_held_bytes = usize::MAX;
+        let root = Seed::new(&mut self, Position::Root).deserialize(document);
+        let root = root.map_err(|error| self.explain(error))?;
+        Ok(self.finish(root, Faults::default()))
+    }
+
+    pub(super) fn read_text(self, text: &[u8], format: Format) -> Result<Outline, ReadError> {
+        match format {
+            Format::Json => self.read_json(&mut serde_json::Deserializer::from_slice(text)),
+            Format::Ndjson => self.read_ndjson(text),
+        }
+    }
+
+    pub(super) fn read_from(self, reader: impl BufRead, format: Format) -> Result<Outline, ReadError> {
+        match format {
+            Format::Json => self.read_json(&mut serde_json::Deserializer::from_reader(reader)),
+            Format::Ndjson => self.read_ndjson(reader),
+        }
+    }
+
+    fn read_json<'de, R: serde_json::de::Read<'de>>(
+        mut self,
+        json: &mut serde_json::Deserializer<R>,
+    ) -> Result<Outline, ReadError> {
+        let root = Seed::new(&mut self, Position::Root).deserialize(&mut *json);
+        let root = root.and_then(|root| json.end().map(|()| root)).map_err(|error| self.explain(error))?;
+        Ok(self.finish(root, Faults::default()))
+    }
+
+    fn read_ndjson(mut self, mut reader: impl BufRead) -> Result<Outline, ReadError> {
+        let mut line = Vec::new();
+        let mut root = None;
+        let mut model_line = None;
+        let mut faults = Faults::default();
+        for number in 1u64.. {
+            if !read_line(&mut reader, &mut line, number)? {
+                break;
+            }
+            if line.iter().all(u8::is_ascii_whitespace) {
+                continue;
+            }
+            self.line = Some(number);
+            let position = if root.is_none() { Position::Root } else { Position::Chunk };
+            let mut json = serde_json::Deserializer::from_slice(&line);
+            let read = Seed::new(&mut self, position).deserialize(&mut json);
+            let read = read.and_then(|read| json.end().map(|()| read)).map_err(|error| self.explain(error))?;
+            if root.is_none() {
+                model_line = self.line;
+                root = Some(read);
+            } else {
+                check_chunk(&read, number, &mut faults);
+            }
+        }
+        self.line = model_line;
+        let Some(mut root) = root else {
+            let detail = "EOF while parsing a value".to_owned();
+            return Err(ParseError::Syntax { line: 1, column: 0, detail }.into());
+        };
+        // What came on later lines belongs to the model.
+        if let Some(dynamics) = root.get_mut("dynamics").and_then(Value::as_object_mut) {
+            for (list, is_there) in [("states", self.states.is_some()), ("transitions", self.transitions.is_some())] {
+                if is_there {
+                    let member = dynamics.entry(list).or_insert(Value::Null);
+                    if member.is_null() {
+                        *member = Value::Array(Vec::new());
+                    }
+                }
+            }
+        }
+        Ok(self.finish(root, faults))
+    }
+
+    fn finish(self, root: Value, faults: Faults) -> Outline {
+        Outline { root, line: self.line, states: self.states, transitions: self.transitions, faults }
+    }
+
+    /// What an error means that was raised within a seed.
+    fn explain(&mut self, error: serde_json::Error) -> ReadError {
+        match self.stop.take() {
+            Some(Stop::Cancelled) => return Cancelled.into(),
+            Some(Stop::TooLarge(detail)) => return ReadError::TooLarge(detail),
+            None => {}
+        }
+        if error.is_io() {
+            return ReadError::Read(error.into());
+        }
+        let beyond_floats = || {
+            let mut faults = Faults::default();
+            note_along(&self.trace, &self.line.map_or(Path::Root, Path::Line), &mut faults);
+            faults
+        };
+        match (ParseError::of(&error, beyond_floats), self.line) {
+            // Within a line, all is on its first.
+            (ParseError::Syntax { column, detail, .. }, Some(line)) => {
+                let line = usize::try_from(line).unwrap_or(usize::MAX);
+                ParseError::Syntax { line, column, detail }.into()
+            }
+            (error, _) => error.into(),
+        }
+    }
+}
+
+/// Notes a number beyond floats where `trace` leads to.
+fn note_along(trace: &[Step], path: &Path<'_>, faults: &mut Faults) {
+    match trace.split_last() {
+        None => faults.note_at(path, BEYOND_FLOATS),
+        Some((Step::Member(name), rest)) => note_along(rest, &Path::Member(path, name), faults),
+        Some((Step::Item(index), rest)) => note_along(rest, &Path::Item(path, *index), faults),
+    }
+}
+
+/// Notes what is wrong with a line after the first, besides its lists.
+fn check_chunk(chunk: &Value, line: u64, faults: &mut Faults) {
+    let place = document::Place { value: chunk, path: Path::Line(line) };
+    if let Some(object) = place.object(&["states", "transitions"], faults) {
+        for list in ["states", "transitions"] {
+            object.optional(list).map(|place| place.array(faults).map(drop));
+        }
+    }
+}
+
+/// Reads the next line into `line`; `false` at the end.
+fn read_line(reader: &mut impl BufRead, line: &mut Vec<u8>, number: u64) -> Result<bool, ReadError> {
+    line.clear();
+    loop {
+        let available = match reader.fill_buf() {
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+            available => available.map_err(ReadError::Read)?,
+        };
+        let end = available.iter().position(|byte| *byte == b'\n');
+        let n_taken = end.map_or(available.len(), |end| end + 1);
+        if line.len() + n_taken > MAX_LINE_BYTES {
+            let detail = format!("line {number} has over {MAX_LINE_BYTES} bytes; make several lines of it");
+            return Err(ReadError::TooLarge(detail));
+        }
+        line.extend_from_slice(&available[..n_taken]);
+        reader.consume(n_taken);
+        if end.is_some() || n_taken == 0 {
+            return Ok(!line.is_empty());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,340 @@
+//! Observations on their way into their table.
+//!
+//! An observation is acknowledged once it is on disk; in which table it stands there matters only to who reads it. The
+//! tables keep the observations of each session together, so that a hundred sessions lie on a hundred pages, all of which a
+//! commit would have to write. So a commit adds one row to `arrivals`, with all that came in its group, and now and then
+//! everything there moves on at once: the pages of a session are written once for many of its observations.
+//!
+//! ```text
+//! group --accept--> arrivals (one row a commit: durable) --settle, now and then or before a read--> sessions, observations
+//! ```
+//!
+//! How many observations a session has is known from memory meanwhile. That holds as long as nobody else writes to
+//! the database, of which SQLite tells: then everything is settled, and what was known is forgotten.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::fmt::Write;
+
+use serde::Deserialize;
+use serde_json::value::RawValue;
+use sqlx::SqliteConnection;
+
+use super::sessions::{self, NewObservations};
+use super::{StoreError, corrupt};
+
+/// Arrivals over this are settled with the next commit. Beyond it there is little left to be gained, and the commit that
+/// settles takes longer.
+const MAX_BYTES: usize = 1 << 20;
+
+/// What the writer knows of open sessions and of the table `arrivals`.
+#[derive(Debug, Default)]
+pub(super) struct Arrivals {
+    /// How many observations open sessions have, those in `arrivals` included. Whoever has some there is among them.
+    n_observations: HashMap<String, u32>,
+    /// Size of the table.
+    n_bytes: usize,
+    /// SQLite's number for what others have written. `None` if nothing is known, also not about what the table holds.
+    data_version: Option<i64>,
+}
+
+/// Observations that come next in their sessions.
+#[derive(Debug)]
+pub(super) struct Accepted {
+    /// For each of the group, whether its session was open and it came next.
+    pub(super) is_next: Vec<bool>,
+    /// The row for those that did; `None` if none did.
+    row: Option<String>,
+}
+
+impl Arrivals {
+    /// Whether it is known what the database holds.
+    pub(super) fn is_known(&self) -> bool {
+        self.data_version.is_some()
+    }
+
+    /// Whether it is time to settle.
+    pub(super) fn is_full(&self) -> bool {
+        self.n_bytes >= MAX_BYTES
+    }
+
+    /// Whether something is known to be there.
+    pub(super) fn is_empty(&self) -> bool {
+        self.n_bytes == 0
+    }
+
+    /// Forgets what it knew: of what failed, or was written by others, it cannot be said what is in the database.
+    pub(super) fn forget(&mut self) {
+        *self = Self::default();
+    }
+
+    /// Forgets what it knew if others have written since; within a transaction that writes.
+    pub(super) async fn check(&mut self, connection: &mut SqliteConnection) -> Result<(), StoreError> {
+        if self.is_known() && self.data_version != Some(data_version(connection).await?) {
+            self.forget();
+        }
+        Ok(())
+    }
+
+    /// Takes those of `group` that come next in open sessions.
+    pub(super) async fn accept(
+        &mut self,
+        connection: &mut SqliteConnection,
+        group: &[&NewObservations],
+    ) -> Result<Accepted, StoreError> {
+        let unknown: HashSet<_> = group.iter().map(|new| &new.session_id).collect();
+        let unknown: Vec<_> = unknown.into_iter().filter(|id| !self.n_observations.contains_key(*id)).collect();
+        if !unknown.is_empty() {
+            let ids = serde_json::to_string(&unknown).map_err(corrupt("sessions", "id"))?;
+            self.n_observations.extend(sessions::count_open(connection, &ids).await?);
+        }
+        let mut row = String::new();
+        let mut is_next = Vec::with_capacity(group.len());
+        for new in group {
+            let expected = self.n_observations.get_mut(&new.session_id).filter(|expected| **expected == new.seq);
+            is_next.push(expected.is_some());
+            let Some(expected) = expected else { continue };
+            *expected += new.n_states;
+            let NewObservations { session_id, seq, n_states, states, at } = new;
+            let id = serde_json::to_string(session_id).map_err(corrupt("sessions", "id"))?;
+            let separator = if row.is_empty() { '[' } else { ',' };
+            let written = write!(row, "{separator}[{id},{seq},{n_states},{states},{}]", at.as_millisecond());
+            written.expect("a string takes all that is written to it");
+        }
+        if !row.is_empty() {
+            row.push(']');
+        }
+        Ok(Accepted { is_next, row: Some(row).filter(|row| !row.is_empty()) })
+    }
+
+    /// Adds the row of what was accepted, outside of a transaction: one statement, which is durable when this returns. Says
+    /// whether it was added; it was not if others have written meanwhile.
+    pub(super) async fn add_at_once(
+        &mut self,
+        connection: &mut SqliteConnection,
+        accepted: &Accepted,
+    ) -> Result<bool, StoreError> {
+        let Some(row) = &accepted.row else { return Ok(true) };
+        // The driver changes threads for each statement, and again for BEGIN and COMMIT.
+        let added = sqlx::query(
+            "INSERT INTO arrivals (observations) SELECT $1 WHERE (SELECT data_version FROM pragma_data_version) = $2",
+        )
+        .bind(row)
+        .bind(self.data_version)
+        .execute(connection)
+        .await?;
+        self.n_bytes += row.len();
+        Ok(added.rows_affected() == 1)
+    }
+
+    /// Adds the row of what was accepted, within a transaction.
+    pub(super) async fn add(
+        &mut self,
+        connection: &mut SqliteConnection,
+        accepted: &Accepted,
+    ) -> Result<(), StoreError> {
+        if let Some(row) = &accepted.row {
+            sqlx::query("INSERT INTO arrivals (observations) VALUES ($1)").bind(row).execute(connection).await?;
+            self.n_bytes += row.len();
+        }
+        Ok(())
+    }
+
+    /// Moves everything to where it belongs, within a transaction.
+    pub(super) async fn settle(&mut self, connection: &mut SqliteConnection) -> Result<(), StoreError> {
+        let query = sqlx::query_scalar("SELECT observations FROM arrivals ORDER BY sequence");
+        let rows: Vec<String> = query.fetch_all(&mut *connection).await?;
+        if !rows.is_empty() {
+            let settled = together(&rows)?;
+            let settled: Vec<&NewObservations> = settled.values().collect();
+            let was_next = sessions::add(connection, &settled).await?;
+            for (new, _) in settled.iter().zip(was_next).filter(|(_, was_next)| !was_next) {
+                refused(&new.session_id, new.seq);
+            }
+            sqlx::query("DELETE FROM arrivals").execute(&mut *connection).await?;
+        }
+        self.n_bytes = 0;
+        if self.data_version.is_none() {
+            self.data_version = Some(data_version(connection).await?);
+        }
+        Ok(())
+    }
+
+    /// A session was opened.
+    pub(super) fn opened(&mut self, session_id: &str) {
+        if self.is_known() {
+            self.n_observations.insert(session_id.to_owned(), 0);
+        }
+    }
+
+    /// A session was ended, once everything was settled.
+    pub(super) fn ended(&mut self, session_id: &str) {
+        self.n_observations.remove(session_id);
+    }
+
+    /// Some sessions have expired, once everything was settled.
+    pub(super) fn expired(&mut self) {
+        self.n_observations.clear();
+    }
+}
+
+/// Changes when another connection has written.
+async fn data_version(connection: &mut SqliteConnection) -> Result<i64, StoreError> {
+    Ok(sqlx::query_scalar("SELECT data_version FROM pragma_data_version").fetch_one(connection).await?)
+}
+
+/// An item of a row of `arrivals`.
+#[derive(Deserialize)]
+struct Arrival<'r>(String, u32, u32, #[serde(borrow)] &'r RawValue, i64);
+
+/// Reads rows, and puts what belongs to the same session together, in order.
+fn together(rows: &[String]) -> Result<BTreeMap<String, NewObservations>, StoreError> {
+    const TABLE: &str = "arrivals";
+    let mut by_session = BTreeMap::<String, NewObservations>::new();
+    for row in rows {
+        let arrivals: Vec<Arrival<'_>> = serde_json::from_str(row).map_err(corrupt(TABLE, "observations"))?;
+        for Arrival(session_id, seq, n_states, states, at_ms) in arrivals {
+            let at = super::timestamp(TABLE, "observations", at_ms)?;
+            let states = states.get();
+            match by_session.get_mut(&session_id) {
+                Some(before) if before.seq + before.n_states != seq => refused(&session_id, seq),
+                Some(before) => {
+                    // Both are arrays that are not empty.
+                    before.states.pop();
+                    before.states.push(',');
+                    before.states.push_str(&states[1..]);
+                    before.n_states += n_states;
+                    before.at = at;
+                }
+                None => {
+                    let states = states.to_owned();
+                    by_session.insert(session_id.clone(), NewObservations { session_id, seq, n_states, states, at });
+                }
+            }
+        }
+    }
+    Ok(by_session)
+}
+
+/// What was accepted was next; only a foreign hand in the tables can bring this about.
+fn refused(session_id: &str, seq: u32) {
+    tracing::error!(session = session_id, seq, "stored observations do not follow on those of their session");
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+    use proptest::prelude::*;
+    use tokio_util::task::TaskTracker;
+
+    use crate::store::{NewObservations, NewSession, Store};
+
+    fn session(id: &str) -> NewSession {
+        NewSession {
+            id: id.to_owned(),
+            model: "m".to_owned(),
+            model_hash: "0".to_owned(),
+            weights: vec![1.0],
+            lookahead: Some(8),
+            start: None,
+            learner: None,
+            weights_version: None,
+            trial: None,
+            created_at: Timestamp::UNIX_EPOCH,
+        }
+    }
+
+    fn observations(id: &str, seq: u32, states: &[u32]) -> NewObservations {
+        NewObservations {
+            session_id: id.to_owned(),
+            seq,
+            n_states: u32::try_from(states.len()).unwrap(),
+            states: serde_json::to_string(states).unwrap(),
+            at: Timestamp::UNIX_EPOCH,
+        }
+    }
+
+    async fn stored(store: &Store, id: &str) -> Vec<u32> {
+        let rows = store.observations(id).await.unwrap();
+        rows.iter().flat_map(|row| serde_json::from_str::<Vec<u32>>(row).unwrap()).collect()
+    }
+
+    /// Something that one of two processes does with one of two sessions.
+    #[derive(Clone, Copy, Debug)]
+    enum Action {
+        /// Adds so many states at a sequence number that is off by so much.
+        Add {
+            n_states: u32,
+            off_by: i32,
+        },
+        Read,
+        Expire,
+    }
+
+    fn actions() -> impl Strategy<Value = Vec<(usize, usize, Action)>> {
+        let add = (1..4_u32, prop_oneof![4 => Just(0), 1 => -2..3])
+            .prop_map(|(n_states, off_by)| Action::Add { n_states, off_by });
+        let action = prop_oneof![12 => add, 2 => Just(Action::Read), 1 => Just(Action::Expire)];
+        proptest::collection::vec((0..2_usize, 0..2_usize, action), 1..40)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(24))]
+
+        /// As when a process is started while the one before still ends.
+        #[test]
+        fn two_processes_on_one_database_accept_what_is_next_and_lose_and_double_nothing(actions in actions()) {
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+            runtime.block_on(async {
+                let directory = tempfile::tempdir().unwrap();
+                let path = directory.path().join("etude.db");
+                let tasks = TaskTracker::new();
+                let stores = [Store::open(&path, &tasks).await.unwrap(), Store::open(&path, &tasks).await.unwrap()];
+                let ids = ["a", "b"];
+                for (store, id) in stores.iter().zip(ids) {
+                    assert!(store.open_session(session(id)).await.unwrap());
+                }
+                let mut expected = [Vec::new(), Vec::new()];
+                let mut is_open = true;
+                for (store, which, action) in actions {
+                    let (store, id, expected) = (&stores[store], ids[which], &mut expected[which]);
+                    let n_expected = u32::try_from(expected.len()).unwrap();
+                    match action {
+                        Action::Add { n_states, off_by } => {
+                            let seq = n_expected.saturating_add_signed(off_by);
+                            let states: Vec<u32> = (seq..seq + n_states).collect();
+                            let was_next = store.add_observations(observations(id, seq, &states)).await.unwrap();
+                            prop_assert_eq!(was_next, is_open && seq == n_expected);
+                            if was_next {
+                                expected.extend(states);
+                            }
+                        }
+                        Action::Read => {
+                            prop_assert_eq!(&stored(store, id).await, &*expected);
+                            let row = store.session(id).await.unwrap().unwrap();
+                            prop_assert_eq!(row.n_observations as usize, expected.len());
+                        }
+                        // Few sessions expire in the middle of something, so this is the end of both or of none.
+                        Action::Expire if n_expected > 20 => {
+                            store.expire_sessions(Timestamp::MAX).await.unwrap();
+                            is_open = false;
+                            break;
+                        }
+                        Action::Expire => store.expire_sessions(Timestamp::UNIX_EPOCH).await.unwrap(),
+                    }
+                }
+                // Dropped, not closed: whoever comes next finds all of it.
+                drop(stores);
+                tasks.close();
+                let store = Store::open(&path, &TaskTracker::new()).await.unwrap();
+                for (id, expected) in ids.iter().zip(&expected) {
+                    let expected = if is_open { expected.as_slice() } else { &[] };
+                    prop_assert_eq!(&stored(&store, id).await, expected);
+                    let seq = u32::try_from(expected.len()).unwrap();
+                    let was_next = store.add_observations(observations(id, seq, &[seq])).await.unwrap();
+                    prop_assert_eq!(was_next, is_open);
+                }
+                Ok(())
+            })?;
+        }
+    }
+}

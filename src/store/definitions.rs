@@ -1,0 +1,310 @@
+//! The tables of definitions that are too large for a column.
+//!
+//! ```text
+//! begin -> piece, piece, ..            each in a transaction of its own: nobody waits for long
+//!       -> put_model                   makes them a model's, all at once
+//!       -> dropped, or the model deleted, or the program killed: the sweeper removes the pieces, some at a time
+//! ```
+
+use sqlx::query::QueryScalar;
+use sqlx::sqlite::SqliteArguments;
+use sqlx::{Sqlite, SqliteConnection, SqlitePool};
+use tokio::sync::mpsc;
+use tokio_util::task::TaskTracker;
+
+use super::writer::{Write, Writer, Written};
+use super::{Store, StoreError, corrupt};
+
+/// Most text of a piece, in bytes. What is written at once is a fraction of it.
+pub const PIECE_BYTES: usize = 4 << 20;
+
+/// Pieces that are removed in one transaction.
+const N_SWEPT_AT_ONCE: i64 = 8;
+
+/// How hard pieces are compressed: so that it keeps up with the writing of JSON.
+const COMPRESSION_LEVEL: i32 = 1;
+
+/// A definition that is stored piece by piece, and is no model's yet. What was stored of it is removed when this is dropped.
+#[derive(Debug)]
+pub struct NewPieces {
+    pub(super) id: i64,
+    n_pieces: i64,
+    sweeper: Sweeper,
+}
+
+impl Drop for NewPieces {
+    fn drop(&mut self) {
+        // If it has become a model's, the sweeper finds that.
+        self.sweeper.sweep(self.id);
+    }
+}
+
+/// The way to the task that removes definitions that are no model's.
+#[derive(Clone, Debug)]
+pub(super) struct Sweeper(mpsc::UnboundedSender<i64>);
+
+impl Sweeper {
+    /// Starts the task in `tasks`, with `left`, which an earlier run has left behind. It ends when the writer takes no more.
+    pub(super) fn start(writer: Writer, left: Vec<i64>, tasks: &TaskTracker) -> Self {
+        let (queue, mut ids) = mpsc::unbounded_channel();
+        tasks.spawn(async move {
+            for id in left {
+                if sweep(&writer, id).await.is_err() {
+                    return;
+                }
+            }
+            loop {
+                tokio::select! {
+                    id = ids.recv() => match id {
+                        Some(id) if sweep(&writer, id).await.is_ok() => {}
+                        _ => return,
+                    },
+                    () = writer.closed() => return,
+                }
+            }
+        });
+        Self(queue)
+    }
+
+    /// Removes the definition `id` some time soon, unless it is a model's.
+    pub(super) fn sweep(&self, id: i64) {
+        // If the task has ended, the next run finds what is left.
+        let _ = self.0.send(id);
+    }
+}
+
+/// Fails only if the writer is closed.
+async fn sweep(writer: &Writer, id: i64) -> Result<(), StoreError> {
+    loop {
+        match writer.write(Write::SweepDefinition(id)).await {
+            Ok(Written::Done(true)) => return Ok(()),
+            Ok(_) => {}
+            Err(StoreError::Closed) => return Err(StoreError::Closed),
+            Err(error) => {
+                tracing::warn!(error = &error as &dyn std::error::Error, id, "a definition is left behind for now");
+                return Ok(());
+            }
+        }
+    }
+}
+
+impl Store {
+    /// Begins to store a definition in pieces.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn begin_pieces(&self) -> Result<NewPieces, StoreError> {
+        match self.writer.write(Write::BeginDefinition).await? {
+            Written::BeginDefinition(id) => Ok(NewPieces { id, n_pieces: 0, sweeper: self.sweeper.clone() }),
+            _ => Err(StoreError::Closed),
+        }
+    }
+
+    /// Stores the next piece of a definition: text of at most [`PIECE_BYTES`].
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn add_piece(&self, definition: &mut NewPieces, text: Vec<u8>) -> Result<(), StoreError> {
+        let compress = move || zstd::bulk::compress(&text, COMPRESSION_LEVEL);
+        let compressed = self.tasks.spawn_blocking(compress).await.map_err(std::io::Error::other).flatten();
+        let piece = compressed.map_err(corrupt("definition_pieces", "piece"))?;
+        let (definition_id, seq) = (definition.id, definition.n_pieces);
+        definition.n_pieces += 1;
+        self.writer.write(Write::AddPiece { definition_id, seq, piece }).await.map(drop)
+    }
+
+    /// The text of the piece `seq` of the definition `definition_id`; `None` after the last one.
+    ///
+    /// # Errors
+    ///
+    /// [`StoreError::Removed`] if the definition is no model's any more, or if the database failed.
+    pub async fn piece(&self, definition_id: i64, seq: i64) -> Result<Option<Vec<u8>>, StoreError> {
+        let query = sqlx::query_scalar("SELECT piece FROM definition_pieces WHERE definition_id = $1 AND seq = $2");
+        let query = query.bind(definition_id).bind(seq);
+        let Some(piece): Option<Vec<u8>> = query.fetch_optional(&self.readers).await? else {
+            // Pieces are only ever removed once the model is.
+            let is_there = is_a_models(definition_id).fetch_one(&self.readers).await?;
+            return if is_there { Ok(None) } else { Err(StoreError::Removed) };
+        };
+        let decompress = move || zstd::bulk::decompress(&piece, PIECE_BYTES);
+        let text = self.tasks.spawn_blocking(decompress).await.map_err(std::io::Error::other).flatten();
+        text.map(Some).map_err(corrupt("definition_pieces", "piece"))
+    }
+}
+
+pub(super) async fn begin(connection: &mut SqliteConnection) -> Result<i64, StoreError> {
+    let inserted = sqlx::query("INSERT INTO definitions DEFAULT VALUES").execute(connection).await?;
+    Ok(inserted.last_insert_rowid())
+}
+
+pub(super) async fn add_piece(
+    connection: &mut SqliteConnection,
+    definition_id: i64,
+    seq: i64,
+    piece: &[u8],
+) -> Result<(), StoreError> {
+    sqlx::query("INSERT INTO definition_pieces (definition_id, seq, piece) VALUES ($1, $2, $3)")
+        .bind(definition_id)
+        .bind(seq)
+        .bind(piece)
+        .execute(connection)
+        .await?;
+    Ok(())
+}
+
+fn is_a_models<'q>(definition_id: i64) -> QueryScalar<'q, Sqlite, bool, SqliteArguments> {
+    sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM models WHERE definition_id = $1)").bind(definition_id)
+}
+
+/// Removes some pieces of a definition, unless it is a model's. Says whether nothing is left to be done.
+pub(super) async fn sweep_some(connection: &mut SqliteConnection, definition_id: i64) -> Result<bool, StoreError> {
+    if is_a_models(definition_id).fetch_one(&mut *connection).await? {
+        return Ok(true);
+    }
+    let removed = sqlx::query(
+        "DELETE FROM definition_pieces WHERE definition_id = $1 AND seq IN
+             (SELECT seq FROM definition_pieces WHERE definition_id = $1 ORDER BY seq DESC LIMIT $2)",
+    )
+    .bind(definition_id)
+    .bind(N_SWEPT_AT_ONCE)
+    .execute(&mut *connection)
+    .await?;
+    if removed.rows_affected() > 0 {
+        return Ok(false);
+    }
+    sqlx::query("DELETE FROM definitions WHERE id = $1").bind(definition_id).execute(connection).await?;
+    Ok(true)
+}
+
+/// The definitions that are no model's.
+pub(super) async fn left_behind(readers: &SqlitePool) -> Result<Vec<i64>, StoreError> {
+    let query = sqlx::query_scalar(
+        "SELECT id FROM definitions WHERE NOT EXISTS (SELECT 1 FROM models WHERE definition_id = definitions.id)",
+    );
+    Ok(query.fetch_all(readers).await?)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use jiff::Timestamp;
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::store::{ModelSize, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
+
+    async fn open(directory: &Path) -> (Store, TaskTracker) {
+        let tasks = TaskTracker::new();
+        (Store::open(&directory.join("etude.db"), &tasks).await.unwrap(), tasks)
+    }
+
+    async fn close(store: Store, tasks: TaskTracker) {
+        store.close().await;
+        tasks.close();
+        tasks.wait().await;
+    }
+
+    /// How many definitions and pieces there are, whoever they belong to.
+    async fn counts(store: &Store) -> (i64, i64) {
+        let count = |table| sqlx::query_scalar(table).fetch_one(&store.readers);
+        let definitions = count("SELECT count(*) FROM definitions").await.unwrap();
+        (definitions, count("SELECT count(*) FROM definition_pieces").await.unwrap())
+    }
+
+    async fn until_counts_are(store: &Store, expected: (i64, i64)) {
+        while counts(store).await != expected {
+            tokio::task::yield_now().await;
+        }
+    }
+
+    async fn stored(store: &Store, pieces: &[&str]) -> NewPieces {
+        let mut definition = store.begin_pieces().await.unwrap();
+        for piece in pieces {
+            store.add_piece(&mut definition, piece.as_bytes().to_vec()).await.unwrap();
+        }
+        definition
+    }
+
+    fn model(name: &str, pieces: NewPieces) -> NewModel {
+        let summary = ModelSummary {
+            name: name.to_owned(),
+            hash: "hash".to_owned(),
+            attributes: Vec::new(),
+            actions: Vec::new(),
+            size: Some(ModelSize { n_states: 1, n_transitions: 0 }),
+            n_unsafe: 0,
+            created_at: Timestamp::UNIX_EPOCH,
+        };
+        NewModel { summary, definition: NewDefinition::Pieces(pieces) }
+    }
+
+    async fn text(store: &Store, name: &str) -> Result<String, StoreError> {
+        let StoredDefinition::Pieces(id) = store.model(name).await?.unwrap().definition else { panic!("in pieces") };
+        let mut text = Vec::new();
+        for seq in 0.. {
+            let Some(piece) = store.piece(id, seq).await? else { break };
+            text.extend(piece);
+        }
+        Ok(String::from_utf8(text).unwrap())
+    }
+
+    #[tokio::test]
+    async fn pieces_become_a_models_all_at_once_and_are_read_back() {
+        let directory = tempfile::tempdir().unwrap();
+        let (store, tasks) = open(directory.path()).await;
+        let pieces = stored(&store, &["one, ", "two, ", "three"]).await;
+        assert!(store.model("m").await.unwrap().is_none());
+        let put = store.put_model(model("m", pieces)).await.unwrap();
+        assert!(matches!(put, PutModel::Created(_)));
+        assert_eq!(text(&store, "m").await.unwrap(), "one, two, three");
+        // The same again keeps what is there, and nothing else.
+        let again = stored(&store, &["one, two, three"]).await;
+        assert!(matches!(store.put_model(model("m", again)).await.unwrap(), PutModel::Unchanged(_)));
+        until_counts_are(&store, (1, 3)).await;
+        close(store, tasks).await;
+        let (store, tasks) = open(directory.path()).await;
+        assert_eq!(text(&store, "m").await.unwrap(), "one, two, three");
+        close(store, tasks).await;
+    }
+
+    #[tokio::test]
+    async fn what_a_crash_leaves_behind_is_no_model_and_is_removed_at_the_next_start() {
+        let directory = tempfile::tempdir().unwrap();
+        let (store, tasks) = open(directory.path()).await;
+        let kept = stored(&store, &["kept"]).await;
+        store.put_model(model("kept", kept)).await.unwrap();
+        let many: Vec<String> = (0..20).map(|n| n.to_string()).collect();
+        let many: Vec<&str> = many.iter().map(String::as_str).collect();
+        // A killed program drops nothing.
+        std::mem::forget(stored(&store, &many).await);
+        assert_eq!(counts(&store).await, (2, 21));
+        close(store, tasks).await;
+        let (store, tasks) = open(directory.path()).await;
+        let names: Vec<_> = store.models(None, 10).await.unwrap().items.into_iter().map(|model| model.name).collect();
+        assert_eq!(names, ["kept"]);
+        until_counts_are(&store, (1, 1)).await;
+        assert_eq!(text(&store, "kept").await.unwrap(), "kept");
+        close(store, tasks).await;
+    }
+
+    #[tokio::test]
+    async fn what_is_not_finished_or_deleted_is_removed() {
+        let directory = tempfile::tempdir().unwrap();
+        let (store, tasks) = open(directory.path()).await;
+        drop(stored(&store, &["unfinished"]).await);
+        until_counts_are(&store, (0, 0)).await;
+        let deleted = stored(&store, &["one, ", "two"]).await;
+        store.put_model(model("m", deleted)).await.unwrap();
+        let StoredDefinition::Pieces(id) = store.model("m").await.unwrap().unwrap().definition else {
+            panic!("pieces")
+        };
+        assert!(store.delete_model("m").await.unwrap());
+        until_counts_are(&store, (0, 0)).await;
+        // Whoever still reads it is told, instead of taking a part for the whole.
+        assert!(matches!(store.piece(id, 1).await, Err(StoreError::Removed)));
+        close(store, tasks).await;
+    }
+}

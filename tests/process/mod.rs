@@ -1,0 +1,52 @@
+//! A service in a process of its own.
+
+#![allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its part of this module")]
+
+use std::io::{BufRead, BufReader};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+
+use tokio::sync::mpsc;
+
+/// A service in a process of its own.
+pub(crate) struct Process {
+    child: Child,
+    pub(crate) address: String,
+    log: mpsc::UnboundedReceiver<String>,
+}
+
+impl Process {
+    pub(crate) fn start(database: &Path) -> Self {
+        Self::start_with(&["--listen", "127.0.0.1:0"], database)
+    }
+
+    pub(crate) fn start_with(flags: &[&str], database: &Path) -> Self {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
+        command.args(["serve", "--log-format", "text"]).args(flags).arg("--database").arg(database);
+        command.env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG");
+        let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
+        let listening = lines.find(|line| line.contains("listening on http://")).expect("the service starts");
+        let address = listening.split("http://").nth(1).unwrap().split(['"', ' ']).next().unwrap().to_owned();
+        let (sender, log) = mpsc::unbounded_channel();
+        // Nobody may listen any more.
+        std::thread::spawn(move || lines.for_each(|line| drop(sender.send(line))));
+        Self { child, address, log }
+    }
+
+    /// Completes once a line of the log has all of `parts`.
+    pub(crate) async fn has_logged(&mut self, parts: &[&str]) {
+        loop {
+            let line = self.log.recv().await.expect("the service runs");
+            if parts.iter().all(|part| line.contains(part)) {
+                return;
+            }
+        }
+    }
+
+    /// SIGKILL: no handler runs, nothing is flushed.
+    pub(crate) fn kill(mut self) {
+        self.child.kill().unwrap();
+        self.child.wait().unwrap();
+    }
+}
