@@ -2,6 +2,7 @@
 
 #![expect(
     clippy::unwrap_used,
+    clippy::too_many_lines,
     clippy::cast_possible_truncation,
     reason = "tests may panic, and are read top to bottom"
 )]

@@ -360,4 +360,35 @@ mod tests {
         assert_eq!(kept(50), [(false, 0), (true, 2)]);
         assert_eq!(kept(1), [(false, 0), (false, 0)]);
     }
+
+    #[test]
+    fn operators_allow_all_that_transitions_do_in_groups_of_any_attributes() {
+        let definition = json!({"dynamics": {
+            "kind": "wumpus", "width": 4, "height": 3, "pits": [[3, 2]], "wumpi": [[2, 0], [0, 2]],
+            "gold": [[1, 0], [1, 0], [2, 0]], "arrows": 2,
+        }});
+        let definition = Definition::read(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let Definition::Wumpus(cave) = definition else { panic!("a cave") };
+        let partitions: [&[&[usize]]; 3] =
+            [&[&[0, 1, 2], &[3, 8, 9], &[4, 6, 7], &[5]], &[&[0, 3], &[1, 4], &[2, 5]], &[&[0, 1], &[2, 4, 6], &[3]]];
+        for partition in partitions {
+            let groups: Vec<Group> = partition.iter().map(|positions| Group::new(&model, positions)).collect();
+            let (mut known, mut lazy) = (Ways::of(&groups, MAX_EDGES), Ways::of(&groups, MAX_EDGES));
+            for (from, transition) in model.graph().iter() {
+                let [row, row_after] = [from, transition.to].map(|state| model.states().row(state));
+                known.add_transition(transition.action, row, row_after);
+            }
+            cave.operators().for_each(|operator| lazy.add_operator(&operator));
+            let of = |ways: &Ways<'_>, group: usize| -> FxHashSet<(ClassIdx, ClassIdx, ActionIdx, Vec<u16>)> {
+                let edges = ways.edges[group].iter().flatten();
+                let set = |edge: &ProjectedEdge| ways.change_sets.sets[edge.change_set as usize].clone();
+                edges.map(|edge| (edge.from, edge.to, edge.action, set(edge))).collect()
+            };
+            for group in 0..groups.len() {
+                let (known, lazy) = (of(&known, group), of(&lazy, group));
+                assert!(!known.is_empty() && known.is_subset(&lazy), "{:?} of {partition:?}", partition[group]);
+            }
+        }
+    }
 }
