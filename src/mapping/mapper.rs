@@ -15,7 +15,7 @@ use super::heuristic::projection::Projections;
 use super::heuristic::{Blind, Heuristic, HeuristicName};
 use super::search::best_first::{self, Buffers};
 use super::search::{Found, Move, astar};
-use crate::interrupt::{Cancelled, Interrupt};
+use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
 use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
 
 /// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
@@ -138,6 +138,20 @@ impl Mapper {
         self.model.size_bytes() + self.projections.size_bytes()
     }
 
+    /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the
+    /// search by default. Consistent; 0 at the last observation. For other searches, and to look at.
+    ///
+    /// # Panics
+    ///
+    /// If `problem` is of another model; the function, if the observation is not of the problem, or the state has no number in the
+    /// model, as all but the start of one that is searched lazily.
+    pub fn lower_bounds<'p>(&'p self, problem: &'p Problem<'p>) -> impl Fn(u32, StateIdx) -> f64 + 'p {
+        self.check(problem);
+        let projected = Projected::solve(&self.projections, problem, &mut Uninterrupted).ok().flatten();
+        let projected = projected.expect("nothing interrupts");
+        move |observation, state| projected.cost_to_go(observation as usize, self.model.states().row(state))
+    }
+
     /// The cheapest mapping of `problem`, which must be of this mapper's model; the best one found if the budget runs out or
     /// `interrupt` says to finish. Deterministic but for where `interrupt` cuts it off.
     ///
@@ -154,7 +168,7 @@ impl Mapper {
         settings: Settings,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
-        assert!(std::ptr::eq(problem.model, &raw const self.model), "the problem must be of this mapper's model");
+        self.check(problem);
         let Some(cave) = self.model.unexplored() else {
             return self.map_in(&mut Whole::of(&self.model), problem, settings, interrupt);
         };
@@ -200,6 +214,10 @@ impl Mapper {
                 }
             }
         }
+    }
+
+    fn check(&self, problem: &Problem<'_>) {
+        assert!(std::ptr::eq(problem.model, &raw const self.model), "the problem must be of this mapper's model");
     }
 
     fn best_first<S: Space>(
