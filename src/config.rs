@@ -35,7 +35,7 @@ pub struct ServeConfig {
     /// Largest model, once it is decompressed.
     #[arg(long, env = "ETUDE_MAX_MODEL_TEXT_BYTES", default_value_t = 512 * 1024 * 1024, value_name = "BYTES")]
     pub max_model_text_bytes: u64,
-    /// Most states of a model.
+    /// Most states of a model; a wumpus world of more is searched lazily.
     #[arg(long, env = "ETUDE_MAX_STATES", default_value_t = model::Limits::DEFAULT.max_states, value_name = "N")]
     pub max_states: usize,
     /// Most transitions of a model.

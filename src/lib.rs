@@ -20,7 +20,7 @@
 //! | [`document`] | reading JSON with all its faults, each with its pointer |
 //! | [`interrupt`] | how a long computation is stopped from outside |
 //! | [`attribute`] | attributes of states: kinds, values, weights, distance |
-//! | [`model`] | what a body can do: `table` and `wumpus` dynamics, compiled to one state graph |
+//! | [`model`] | what a body can do: `table` and `wumpus` dynamics, compiled to one state graph, or left to searches |
 //! | [`mapping`] | the cheapest way to follow a demonstration: problem, search, heuristics, policy |
 //! | [`learning`] | which attributes matter: a weight distribution, drawn from and learned from rewards |
 //! | [`world`] | simulators that execute a policy and give its reward |

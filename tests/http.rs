@@ -371,8 +371,59 @@ async fn a_body_over_the_limit_is_refused_announced_or_not() {
     let mut model = model;
     model["dynamics"]["states"] = hundred_and_one.into();
     assert_eq!(pointers(&small.put("/v1/models/m", &model).await.1), ["/dynamics/states"]);
-    let cave = json!({"dynamics": {"kind": "wumpus", "width": 9, "height": 9}});
-    assert_eq!(pointers(&small.put("/v1/models/m", &cave).await.1), ["/dynamics"]);
+}
+
+#[tokio::test]
+async fn a_world_over_the_limit_is_searched_lazily_and_stays_so() {
+    let limited: &[&str] = &["--max-states", "100"];
+    let service = Service::start(limited).await;
+    // Three pieces of gold in a row, in any of 2600 states with one arrow or none.
+    let cave = json!({"dynamics": {"kind": "wumpus", "width": 9, "height": 9, "gold": [[1, 0], [2, 0], [3, 0]]}});
+    let (status, model) = service.put("/v1/models/large", &cave).await;
+    assert_eq!(status, 201);
+    assert_eq!(
+        model["counts"],
+        json!({"attributes": 9, "actions": 6, "states": null, "transitions": null, "unsafe": 0})
+    );
+    assert_eq!(service.put("/v1/models/large", &cave).await.0, 200);
+    assert_eq!(service.get("/v1/models/large").await.1["counts"], model["counts"]);
+    assert_eq!(service.get("/v1/models").await.1["items"], json!([model]));
+
+    let seen = |x: i64, gold: i64| json!({"x": x, "y": 0, "heading": "east", "gold": gold});
+    let demonstration = json!([seen(0, 0), seen(1, 0), seen(1, 1), seen(2, 1)]);
+    let request = |options: Value| {
+        let mut request = json!({"model": "large", "demonstration": demonstration});
+        request.as_object_mut().unwrap().extend(options.as_object().unwrap().clone());
+        request
+    };
+    let (status, policy) = service.post("/v1/policies", &request(json!({}))).await;
+    assert_eq!(status, 201, "{policy}");
+    assert_eq!((&policy["status"], &policy["actions"]), (&json!("optimal"), &json!(["forward", "grab", "forward"])));
+    let numbers: Vec<&Value> = policy["steps"].as_array().unwrap().iter().map(|step| &step["state_index"]).collect();
+    assert_eq!(numbers, [0, 1, 2, 3]);
+    let path = format!("/v1/policies/{}", policy["id"].as_str().unwrap());
+    assert_eq!(service.get(&path).await.1["steps"], policy["steps"]);
+
+    // What needs all states is refused, and says so.
+    for (options, pointer) in [(json!({"lookahead": 3}), "/lookahead"), (json!({"start": 7}), "/start")] {
+        let (status, problem) = service.post("/v1/policies", &request(options)).await;
+        assert_eq!((status, pointers(&problem)), (422, vec![pointer]), "{problem}");
+    }
+
+    // Under another limit, what was accepted is still what it was found to be.
+    let service = Service::start_in(service.stop().await, &[]).await;
+    assert_eq!(service.get("/v1/models/large").await.1["counts"], model["counts"]);
+    let (_, again) = service.post("/v1/policies", &request(json!({}))).await;
+    assert_eq!(again["steps"], policy["steps"]);
+    let (_, known) = service.put("/v1/models/known", &cave).await;
+    assert_eq!(known["hash"], model["hash"]);
+    assert!(known["counts"]["states"].as_u64().unwrap() > 100, "{known}");
+    let (status, policy) = service.post("/v1/policies", &request(json!({"model": "known", "lookahead": 3}))).await;
+    assert_eq!((status, &policy["actions"]), (201, &again["actions"]));
+    let service = Service::start_in(service.stop().await, limited).await;
+    let (status, policy) = service.post("/v1/policies", &request(json!({"model": "known", "lookahead": 3}))).await;
+    assert_eq!((status, &policy["actions"]), (201, &again["actions"]));
+    service.stop().await;
 }
 
 /// Writes bytes to the service and reads until it closes.

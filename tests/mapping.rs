@@ -16,14 +16,9 @@ use etude::attribute::Scalar;
 use etude::document::{Faults, Place};
 use etude::interrupt::{Cancelled, Signal, Uninterrupted};
 use etude::mapping::{Grouping, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status};
-use etude::model::Act;
-use problems::{close, example, mapper, problem};
+use problems::{cave, close, example, mapper, problem, solve, walked};
 use proptest::prelude::*;
 use serde_json::{Value, json};
-
-fn solve(mapper: &Mapper, request: &Value) -> Policy {
-    solve_grouped(mapper, request, Grouping::default())
-}
 
 fn solve_grouped(mapper: &Mapper, request: &Value, grouping: Grouping) -> Policy {
     let mut faults = Faults::default();
@@ -141,30 +136,6 @@ proptest! {
     }
 }
 
-/// A cave with up to three wumpi, pits and pieces of gold, a body, and a walk of a full body in the same cave.
-fn cave() -> impl Strategy<Value = (Value, Vec<usize>)> {
-    let cells = |most| prop::collection::vec((0u16..4, 0u16..3), 0..=most);
-    let body = prop::sample::subsequence(Act::ALL.to_vec(), 1..=6);
-    let walk = prop::collection::vec(0usize..6, 0..12);
-    let start = (0u16..4, 0u16..3, 0usize..4);
-    (cells(2), cells(3), cells(3), body, walk, start, 0u8..3).prop_map(
-        |(pits, wumpi, gold, body, walk, start, arrows)| {
-            let (x, y, heading) = start;
-            let away = |cells: Vec<(u16, u16)>| cells.into_iter().filter(|cell| *cell != (x, y)).collect::<Vec<_>>();
-            let actions: Vec<Value> = body.iter().map(|act| json!({"name": act.name(), "cost": 0.3})).collect();
-            let heading = ["east", "north", "west", "south"][heading];
-            let model = json!({
-                "actions": actions,
-                "dynamics": {
-                    "kind": "wumpus", "width": 4, "height": 3, "pits": away(pits), "wumpi": away(wumpi), "gold": gold,
-                    "start": {"x": x, "y": y, "heading": heading}, "arrows": arrows,
-                },
-            });
-            (model, walk)
-        },
-    )
-}
-
 proptest! {
     #![proptest_config(ProptestConfig { cases: 150, failure_persistence: None, ..ProptestConfig::default() })]
 
@@ -177,19 +148,7 @@ proptest! {
         prop_assert!(a.graph().iter().eq(b.graph().iter()));
         prop_assert!((0..a.states().len()).all(|state| a.describe(state) == b.describe(state)));
 
-        // The demonstrator has every action and walks as it likes, death excluded by the table.
-        let mut full = model.clone();
-        full["actions"] = Act::ALL.iter().map(|act| json!({"name": act.name(), "cost": 0.3})).collect();
-        let full = oracle::wumpus::as_table(&full);
-        let mut at = json!(0);
-        let mut demonstration = vec![full["dynamics"]["states"][0].clone()];
-        for act in walk {
-            let transitions = full["dynamics"]["transitions"].as_array().unwrap();
-            let taken = transitions.iter().find(|t| t[0] == at && t[1] == Act::ALL[act].name());
-            at = taken.map_or(at, |t| t[2].clone());
-            demonstration.push(full["dynamics"]["states"][at.as_u64().unwrap() as usize].clone());
-        }
-        let demonstration = Value::from(demonstration);
+        let demonstration = walked(&model, &walk);
         let optimum = oracle::optimal_cost(&table, &demonstration, &json!({}), None);
         for grouping in [Grouping::WhenItPays, Grouping::Widest] {
             let request = json!({"model": "m", "demonstration": demonstration});

@@ -262,6 +262,19 @@ async fn what_was_received_is_ignored_and_what_is_missing_is_asked_for() {
 }
 
 #[tokio::test]
+async fn a_world_that_is_searched_lazily_is_not_streamed() {
+    let service = Service::start(&["--max-states", "10"]).await;
+    let cave = json!({"dynamics": {"kind": "wumpus", "width": 9, "height": 9}});
+    assert_eq!(service.put("/v1/models/large", &cave).await.0, 201);
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "open", "model": "large"})).await;
+    let error = client.receive().await;
+    assert_eq!(error["problem"]["type"], "/problems/invalid", "{error}");
+    assert_eq!(error["problem"]["errors"][0]["pointer"], "/model", "{error}");
+    assert_eq!(client.closed().await, 4400);
+}
+
+#[tokio::test]
 async fn whatever_cannot_be_understood_has_its_answer() {
     let (service, _) = figure_4().await;
     let text = |frame: Value| Message::text(frame.to_string());

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use etude::document::{Faults, Place};
 use etude::interrupt::Uninterrupted;
 use etude::mapping::{Demonstration, Mapper, Problem, Settings};
-use etude::model::{Definition, Format, Limits, Model};
+use etude::model::{Definition, Format, Limits, Model, Origin};
 use serde_json::{Value, json};
 
 use crate::{Spread, shown, time_often};
@@ -90,7 +90,7 @@ fn problem(mapper: &Mapper, n_observations: u64) -> Problem<'_> {
     let mut faults = Faults::default();
     let read = Demonstration::read(model.schema(), &Place::root(&demonstration), &mut faults);
     let demonstration = faults.check(read).expect("the demonstration is of the belt");
-    Problem::new(model, demonstration, model.schema().weights(), Some(0))
+    Problem::new(model, demonstration, model.schema().weights(), Some(Origin::State(0)))
 }
 
 /// Writes the belt as it is read.

@@ -56,7 +56,9 @@ enum HeuristicArg {
 
 impl Map {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
-        let (definition, model) = read_model(&self.model)?;
+        // A lookahead needs all states.
+        let limits = if self.lookahead.is_some() { Limits::NONE } else { Limits::DEFAULT };
+        let (definition, model) = read_model(&self.model, limits)?;
         let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
 
         let request = self.request()?;
@@ -127,15 +129,14 @@ fn as_micros(duration: Duration) -> u64 {
     u64::try_from(duration.as_micros()).unwrap_or(u64::MAX)
 }
 
-/// Reads and compiles a model. There is no limit but memory: nobody else is served.
-pub(super) fn read_model(path: &Path) -> Result<(Definition, Model), CliError> {
+/// Reads and compiles a model. There is no limit to tables but memory: nobody else is served.
+pub(super) fn read_model(path: &Path, limits: Limits) -> Result<(Definition, Model), CliError> {
     let model_error = |error| match error {
         CompileError::Faults(faults) => CliError::Faults { what: path.display().to_string(), faults },
         CompileError::Cancelled(cancelled) => cancelled.into(),
     };
-    let limits = Limits::NONE;
-    let definition = Definition::read(&read_json(path)?, limits, &mut Uninterrupted).map_err(model_error)?;
-    let model = Model::compile(&definition, limits, &mut Uninterrupted).map_err(model_error)?;
+    let definition = Definition::read(&read_json(path)?, Limits::NONE, &mut Uninterrupted).map_err(model_error)?;
+    let model = Model::compile(&definition, limits, &mut Uninterrupted)?;
     Ok((definition, model))
 }
 

@@ -24,6 +24,7 @@ use crate::attribute::{ByAttribute, Scalar};
 use crate::document::{self, Faults, ParseError, Place};
 use crate::interrupt::Uninterrupted;
 use crate::mapping::{Cost, Demonstration, Mapper, MoveKind, OnlineMapping, Status};
+use crate::model::Limits;
 use crate::stream::frames::ServerFrame;
 
 /// Lines that were read ahead.
@@ -71,7 +72,7 @@ impl Stream {
     }
 
     fn run_here(&self, printer: &mut Printer<'_, impl Write>) -> Result<(), CliError> {
-        let (_, model) = read_model(&self.model)?;
+        let (_, model) = read_model(&self.model, Limits::NONE)?;
         let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
         let schema = mapper.model().schema();
         let request = Value::Object(self.options());
@@ -79,7 +80,7 @@ impl Stream {
         let object = Place::root(&request).open_object(&mut faults);
         let opening = object.as_ref().map(|object| {
             let weights = object.optional("weights").map(|place| schema.read_weights(&place, &mut faults));
-            let start = object.optional("start").map(|place| mapper.model().read_start(&place, &mut faults));
+            let start = object.optional("start").map(|place| mapper.model().read_start(&place, &mut faults)?.state());
             (weights.flatten().unwrap_or_else(|| schema.weights()), start.flatten())
         });
         let what = "the options".to_owned();

@@ -52,10 +52,11 @@ struct Counts {
     attributes: usize,
     /// Actions.
     actions: usize,
-    /// States; of a wumpus world, those that the body can reach.
-    states: u64,
-    /// Transitions.
-    transitions: u64,
+    /// States; of a wumpus world, those that the body can reach. `null` if there are more of these than the limit: such a world is
+    /// searched lazily, each search finds and numbers the states that it comes to.
+    states: Option<u64>,
+    /// Transitions; `null` if the states are.
+    transitions: Option<u64>,
     /// States that must never be entered.
     #[serde(rename = "unsafe")]
     n_unsafe: u64,
@@ -69,8 +70,8 @@ impl From<ModelSummary> for ModelBody {
             counts: Counts {
                 attributes: summary.attributes.len(),
                 actions: summary.actions.len(),
-                states: summary.n_states,
-                transitions: summary.n_transitions,
+                states: summary.size.map(|size| size.n_states),
+                transitions: summary.size.map(|size| size.n_transitions),
                 n_unsafe: summary.n_unsafe,
             },
             attributes: summary.attributes,

@@ -4,7 +4,7 @@ use super::Problem;
 use super::heuristic::Heuristic;
 use super::search::{Move, MoveKind, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
-use crate::model::StateIdx;
+use crate::model::{Space, StateIdx};
 
 /// Whether a completion may act without advancing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -52,8 +52,9 @@ impl<'i> Allowance<'i> {
 /// # Errors
 ///
 /// [`Cancelled`] if the interrupt of `allowance` said so.
-pub(super) fn complete<H: Heuristic>(
+pub(super) fn complete<S: Space, H: Heuristic>(
     problem: &Problem<'_>,
+    space: &mut S,
     heuristic: &H,
     extras: Extras,
     mut path: Vec<Move>,
@@ -63,14 +64,15 @@ pub(super) fn complete<H: Heuristic>(
     let (mut i, mut state) = (end.observation as usize, end.state);
     let mut seen = vec![state];
     while i < problem.last() {
-        let n_looks = 1 + 2 * problem.model.graph().successors(state).len() as u64;
+        space.explore(state);
+        let n_looks = 1 + 2 * space.successors(state).len() as u64;
         if !allowance.spend(n_looks * heuristic.work(i))? {
             i += 1;
             path.push(skip_to(i, state));
             continue;
         }
         let may_linger = extras == Extras::Allowed && seen.len() <= MAX_EXTRAS;
-        let (step, next) = best_move(problem, heuristic, i, state, may_linger.then_some(&seen));
+        let (step, next) = best_move(problem, space, heuristic, i, state, may_linger.then_some(&seen));
         i = next;
         state = step.state;
         if step.kind != MoveKind::Extra {
@@ -90,20 +92,23 @@ fn skip_to(i: usize, state: StateIdx) -> Move {
 
 /// The move out of `(i, state)` of least cost plus estimate, the first found among equals, and the observation it leads
 /// to. Extra actions are looked at if `seen` is given, and may not lead to the states in it.
-fn best_move<H: Heuristic>(
+fn best_move<S: Space, H: Heuristic>(
     problem: &Problem<'_>,
+    space: &S,
     heuristic: &H,
     i: usize,
     state: StateIdx,
     seen: Option<&Vec<StateIdx>>,
 ) -> (Move, usize) {
-    let distance = |i: usize, state| problem.distances.distance(i, state);
-    let estimate = |i: usize, state, cost: f64| cost + distance(i, state) + heuristic.cost_to_go(i, state);
+    let estimate = |i: usize, state, cost: f64| {
+        let row = space.row(state);
+        cost + problem.distances.distance(i, row) + heuristic.cost_to_go(i, row)
+    };
     #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
     let step = |kind, action, i: usize, state| Move { kind, action, observation: i as u32, state };
 
     let mut best = (estimate(i + 1, state, 0.0), skip_to(i + 1, state), i + 1);
-    for transition in problem.model.graph().successors(state) {
+    for transition in space.successors(state) {
         let (action, to) = (transition.action, transition.to);
         let cost = problem.model.action(action).cost;
         let advanced = estimate(i + 1, to, cost);

@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::{Move, Problem};
+use crate::model::Space;
 
 /// What a mapping costs: `C = C_a + C_s`. Dimensionless; finite, at least 0.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
@@ -39,12 +40,12 @@ impl CostSum {
     }
 }
 
-/// The cost of `moves`.
-pub(super) fn cost_of(problem: &Problem<'_>, moves: &[Move]) -> Cost {
+/// The cost of `moves` in `space`.
+pub(super) fn cost_of(problem: &Problem<'_>, space: &impl Space, moves: &[Move]) -> Cost {
     let mut sum = CostSum::default();
     moves.iter().fold(Cost::default(), |_, step| {
         let action_cost = step.action.map_or(0.0, |action| problem.model.action(action).cost);
-        sum.add(action_cost, problem.distances.distance(step.observation as usize, step.state))
+        sum.add(action_cost, problem.distances.distance(step.observation as usize, space.row(step.state)))
     })
 }
 

@@ -13,7 +13,6 @@ use crate::model::{StateIdx, States};
 /// computed once per pair of distinct values.
 #[derive(Debug)]
 pub(crate) struct Distances<'m> {
-    states: &'m States,
     /// In schema order, in which distances are summed.
     active: Vec<ActiveAttribute<'m>>,
 }
@@ -57,20 +56,18 @@ impl<'m> Distances<'m> {
             }
             active
         });
-        Self { states, active: active.filter(|active| !active.observed.is_empty()).collect() }
+        Self { active: active.filter(|active| !active.observed.is_empty()).collect() }
     }
 
-    /// `D(o_i, s)`. Finite, at least 0.
+    /// `D(o_i, s)`, given the row of `s`. Finite, at least 0.
     #[inline]
-    pub(crate) fn distance(&self, observation: usize, state: StateIdx) -> f64 {
-        let row = self.states.row(state);
+    pub(crate) fn distance(&self, observation: usize, row: &[u32]) -> f64 {
         // Not `sum`, of which nothing is -0.
         self.active.iter().fold(0.0, |sum, active| sum + active.term(observation, row[active.position]))
     }
 
-    /// The terms of `D(o_i, s)`, in schema order; attributes that take no part are left out.
-    pub(crate) fn terms(&self, observation: usize, state: StateIdx) -> impl Iterator<Item = (usize, f64)> {
-        let row = self.states.row(state);
+    /// The terms of `D(o_i, s)`, given the row of `s`, in schema order; attributes that take no part are left out.
+    pub(crate) fn terms(&self, observation: usize, row: &[u32]) -> impl Iterator<Item = (usize, f64)> {
         self.active.iter().map(move |active| (active.position, active.term(observation, row[active.position])))
     }
 

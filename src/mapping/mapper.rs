@@ -2,6 +2,7 @@
 
 use std::sync::{Mutex, PoisonError};
 
+use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -15,20 +16,32 @@ use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
 use super::search::best_first::{self, Buffers};
 use super::search::{Found, Move, astar};
 use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
-use crate::model::{Model, StateIdx};
+use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
 
 /// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
     /// Most nodes expanded.
     pub max_expansions: u64,
-    /// Most nodes kept in memory, about 64 bytes each.
+    /// Most nodes kept in memory, about 64 bytes each. If the model is searched lazily, the states that are found count too, by
+    /// their size.
     pub max_nodes: usize,
 }
 
 impl Budget {
     /// Any number of expansions, within 16 million nodes: about 1 GB.
     pub const DEFAULT: Self = Self { max_expansions: u64::MAX, max_nodes: 16_000_000 };
+}
+
+impl Budget {
+    /// How much memory a node takes, in bytes.
+    const NODE_BYTES: usize = 64;
+
+    /// Whether there is no more memory: for `n_nodes`, and what was found in `space`.
+    #[inline]
+    pub(super) fn is_full(self, n_nodes: usize, space: &impl Space) -> bool {
+        n_nodes + space.found_bytes() / Self::NODE_BYTES >= self.max_nodes
+    }
 }
 
 impl Default for Budget {
@@ -90,6 +103,9 @@ pub struct Mapping {
     pub n_expanded: u64,
     /// Successors looked at.
     pub n_generated: u64,
+    /// The states of the moves, in the order in which they are first passed, if the model is searched lazily; else they are those
+    /// of the model.
+    pub states: Option<States>,
 }
 
 /// A model, and what is computed once per model to search it.
@@ -129,12 +145,14 @@ impl Mapper {
     ///
     /// # Panics
     ///
-    /// If `problem` is of another model; the function, if the observation or the state is not of the problem.
+    /// If `problem` is of another model; the function, if the observation is not of the problem, or the state has no number in the
+    /// model, as all but the start of one that is searched lazily.
     pub fn lower_bounds<'p>(&'p self, problem: &'p Problem<'p>) -> impl Fn(u32, StateIdx) -> f64 + 'p {
         self.check(problem);
-        let projected = Projected::solve(&self.projections, problem, &mut Uninterrupted).ok().flatten();
+        let projected =
+            Projected::solve(&self.projections, problem, Grouping::WhenItPays, &mut Uninterrupted).ok().flatten();
         let projected = projected.expect("nothing interrupts");
-        move |observation, state| projected.cost_to_go(observation as usize, state)
+        move |observation, state| projected.cost_to_go(observation as usize, self.model.states().row(state))
     }
 
     /// The cheapest mapping of `problem`, which must be of this mapper's model; the best one found if the budget runs out or
@@ -154,6 +172,22 @@ impl Mapper {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
         self.check(problem);
+        let Some(cave) = self.model.unexplored() else {
+            return self.map_in(&mut Whole::of(&self.model), problem, settings, interrupt);
+        };
+        let mut explored = Explored::new(cave, problem.cave_start.unwrap_or_else(|| cave.first_state()));
+        let mut mapping = self.map_in(&mut explored, problem, settings, interrupt)?;
+        mapping.states = Some(explored.keep(&renumber(&mut mapping.moves)));
+        Ok(mapping)
+    }
+
+    fn map_in<S: Space>(
+        &self,
+        space: &mut S,
+        problem: &Problem<'_>,
+        settings: Settings,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
         let Settings { budget, upper_bound, .. } = settings;
         // Sums in another order may be a little larger; a little room costs nothing.
         let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
@@ -161,26 +195,26 @@ impl Mapper {
             HeuristicName::Default => {
                 let projected = Projected::solve(&self.projections, problem, settings.grouping, interrupt)?;
                 if let Some(mut projected) = projected {
-                    return self.best_first(problem, &mut projected, budget, most_f, interrupt);
+                    return self.best_first(space, problem, &mut projected, budget, most_f, interrupt);
                 }
                 // No time for the estimate, so none for a search either.
                 let budget = Budget { max_expansions: 0, ..budget };
-                self.best_first(problem, &mut Projected::blind(problem), budget, most_f, interrupt)
+                self.best_first(space, problem, &mut Projected::blind(problem), budget, most_f, interrupt)
             }
             HeuristicName::None => {
-                let found = astar::search(problem, &Blind, budget, most_f, interrupt)?;
-                conclude(problem, &Blind, found, interrupt)
+                let found = astar::search(problem, space, &Blind, budget, most_f, interrupt)?;
+                conclude(problem, space, &Blind, found, interrupt)
             }
             HeuristicName::Paper => {
-                let found = astar::search(problem, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
+                let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
-                let first = problem.distances.distance(0, problem.start);
+                let first = problem.distances.distance(0, space.row(problem.start));
                 match Projected::solve(&self.projections, problem, settings.grouping, interrupt)? {
                     Some(projected) => {
-                        let least_f = first + projected.cost_to_go(0, problem.start);
-                        conclude(problem, &projected, Found { least_f, ..found }, interrupt)
+                        let least_f = first + projected.cost_to_go(0, space.row(problem.start));
+                        conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
                     }
-                    None => conclude(problem, &Blind, Found { least_f: first, ..found }, interrupt),
+                    None => conclude(problem, space, &Blind, Found { least_f: first, ..found }, interrupt),
                 }
             }
         }
@@ -190,8 +224,9 @@ impl Mapper {
         assert!(std::ptr::eq(problem.model, &raw const self.model), "the problem must be of this mapper's model");
     }
 
-    fn best_first(
+    fn best_first<S: Space>(
         &self,
+        space: &mut S,
         problem: &Problem<'_>,
         projected: &mut Projected<'_>,
         budget: Budget,
@@ -200,12 +235,28 @@ impl Mapper {
     ) -> Result<Mapping, Cancelled> {
         let kept = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop();
         let mut buffers = kept.unwrap_or_default();
-        let found = best_first::search(problem, projected, budget, most_f, &mut buffers, interrupt)?;
+        let found = best_first::search(problem, space, projected, budget, most_f, &mut buffers, interrupt)?;
         if buffers.are_small() {
             self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
         }
-        conclude(problem, projected, found, interrupt)
+        conclude(problem, space, projected, found, interrupt)
     }
+}
+
+/// Numbers the states of `moves` anew, in the order in which they are first passed. Gives their former numbers, by the new ones.
+fn renumber(moves: &mut [Move]) -> Vec<StateIdx> {
+    let mut former = Vec::new();
+    let mut numbers: FxHashMap<StateIdx, StateIdx> = FxHashMap::default();
+    for step in moves {
+        #[expect(clippy::cast_possible_truncation, reason = "no more than there were")]
+        let next = former.len() as StateIdx;
+        let number = *numbers.entry(step.state).or_insert(next);
+        if number == next {
+            former.push(step.state);
+        }
+        step.state = number;
+    }
+    former
 }
 
 /// How much more than an upper bound a mapping may cost, relatively: more than sums of 100,000 terms differ by rounding.
@@ -215,8 +266,9 @@ const SLACK: f64 = 1e-9;
 const ROUNDING: f64 = 1e-12;
 
 /// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than its `least_f`.
-fn conclude<H: Heuristic>(
+fn conclude<S: Space, H: Heuristic>(
     problem: &Problem<'_>,
+    space: &mut S,
     heuristic: &H,
     found: Found,
     interrupt: &mut dyn Interrupt,
@@ -227,8 +279,8 @@ fn conclude<H: Heuristic>(
     let mut costed = Vec::new();
     for path in paths {
         for extras in ways {
-            let moves = complete(problem, heuristic, *extras, path.clone(), &mut allowance)?;
-            costed.push((cost_of(problem, &moves), moves));
+            let moves = complete(problem, space, heuristic, *extras, path.clone(), &mut allowance)?;
+            costed.push((cost_of(problem, space, &moves), moves));
         }
     }
     let best = costed.into_iter().min_by(|(cost, _), (other, _)| cost.total.total_cmp(&other.total));
@@ -241,5 +293,6 @@ fn conclude<H: Heuristic>(
         lower_bound: Some(if is_optimal { cost.total } else { lower_bound }),
         n_expanded,
         n_generated,
+        states: None,
     })
 }

@@ -9,7 +9,7 @@ use super::cost::{Cost, CostSum};
 use super::{Mapping, Move, MoveKind, Problem, Status};
 use crate::attribute::{ByAttribute, Scalar};
 use crate::document::{Faults, Place};
-use crate::model::Model;
+use crate::model::{Model, States};
 
 /// What produced a policy, as far as its problem and mapping do not tell.
 #[derive(Clone, Debug, Default)]
@@ -147,7 +147,7 @@ pub struct Step {
     /// The imitator's state after the step.
     #[schema(value_type = BTreeMap<String, Scalar>)]
     pub state: ByAttribute<Scalar>,
-    /// The index of that state in the model.
+    /// The index of that state in the model; in this policy, if the model is searched lazily.
     pub state_index: u32,
     /// Cost of the action.
     pub action_cost: f64,
@@ -244,9 +244,10 @@ impl Policy {
 
 fn steps(problem: &Problem<'_>, mapping: &Mapping) -> Vec<Step> {
     let mut writer = StepWriter::default();
+    let states = mapping.states.as_ref().unwrap_or(problem.model.states());
     let steps = mapping.moves.iter().map(|step| {
-        let terms = problem.distances.terms(step.observation as usize, step.state);
-        writer.write(problem.model, step, terms)
+        let terms = problem.distances.terms(step.observation as usize, states.row(step.state));
+        writer.write(problem.model, states, step, terms)
     });
     steps.collect()
 }
@@ -260,8 +261,14 @@ pub(super) struct StepWriter {
 }
 
 impl StepWriter {
-    /// The next step, given the terms of its distance.
-    pub(super) fn write(&mut self, model: &Model, step: &Move, terms: impl Iterator<Item = (usize, f64)>) -> Step {
+    /// The next step, given the terms of its distance; `states` are those that it is numbered in.
+    pub(super) fn write(
+        &mut self,
+        model: &Model,
+        states: &States,
+        step: &Move,
+        terms: impl Iterator<Item = (usize, f64)>,
+    ) -> Step {
         let schema = model.schema();
         let action_cost = step.action.map_or(0.0, |action| model.action(action).cost);
         let mut distance = 0.0;
@@ -277,7 +284,7 @@ impl StepWriter {
             observation: step.observation,
             kind: step.kind,
             action: step.action.map(|action| model.action_name(action)),
-            state: model.describe(step.state),
+            state: model.describe_one_of(states, step.state),
             state_index: step.state,
             action_cost,
             distance,

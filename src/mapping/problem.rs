@@ -3,7 +3,7 @@
 use super::Demonstration;
 use super::distances::Distances;
 use crate::attribute::Weights;
-use crate::model::{Model, Start, StateIdx};
+use crate::model::{CaveState, Model, Origin, Start, StateIdx};
 
 /// A demonstration to be followed by a body, under given weights, from a given start.
 #[derive(Debug)]
@@ -13,6 +13,8 @@ pub struct Problem<'m> {
     pub(crate) weights: Weights,
     /// `s_0`.
     pub(crate) start: StateIdx,
+    /// What `s_0` is, if it is a state without a number in a model that is searched lazily.
+    pub(crate) cave_start: Option<CaveState>,
     pub(crate) distances: Distances<'m>,
 }
 
@@ -20,10 +22,15 @@ impl<'m> Problem<'m> {
     /// A problem. `start` overrides the model's; without either, `s_0` is the candidate closest to `o_0`, the lowest
     /// index among equals.
     #[must_use]
-    pub fn new(model: &'m Model, demonstration: Demonstration, weights: Weights, start: Option<StateIdx>) -> Self {
+    pub fn new(model: &'m Model, demonstration: Demonstration, weights: Weights, start: Option<Origin>) -> Self {
         let distances = Distances::new(model.schema(), model.states(), &demonstration, &weights);
-        let start = start.unwrap_or_else(|| choose_start(model, |state| distances.distance(0, state)));
-        Self { model, demonstration, weights, start, distances }
+        let (start, cave_start) = match start {
+            None => (choose_start(model, |state| distances.distance(0, model.states().row(state))), None),
+            Some(Origin::State(state)) => (state, None),
+            // A search that finds its states numbers them from the start on.
+            Some(Origin::Cave(state)) => (0, Some(state)),
+        };
+        Self { model, demonstration, weights, start, cave_start, distances }
     }
 
     /// The demonstration.
@@ -38,7 +45,7 @@ impl<'m> Problem<'m> {
         &self.weights
     }
 
-    /// Where the imitator starts, `s_0`.
+    /// Where the imitator starts, `s_0`; always 0 if the model is searched lazily.
     #[must_use]
     pub fn start(&self) -> StateIdx {
         self.start

@@ -77,6 +77,7 @@ impl<'m> Request<'m> {
             None => Some(None),
         };
         let options = Self::read_options(object, faults);
+        Self::check_lookahead(model, object, faults);
         let mut weights = base(faults)?;
         for (position, weight) in named? {
             weights.set(position, weight);
@@ -108,6 +109,13 @@ impl<'m> Request<'m> {
         }
         let (_, mapping) = online.end().expect("a demonstration is never empty");
         Ok(mapping)
+    }
+
+    /// Notes a lookahead that the model does not allow.
+    pub(crate) fn check_lookahead(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
+        if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {
+            faults.note(&place, "this world is searched lazily, which needs the whole demonstration: leave this out");
+        }
     }
 
     /// Reads what does not depend on the model.
@@ -177,7 +185,8 @@ pub struct RequestDocument {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub learner: Option<String>,
     /// How many observations past the current one a decision may wait for; `null`: all. With a number, the policy is what a
-    /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`).
+    /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`). Not for a world that is
+    /// searched lazily.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 1, maximum = 100_000)]
     pub lookahead: Option<u32>,
@@ -212,7 +221,8 @@ pub enum ObservationDocument {
 #[schema(as = Observed)]
 pub struct ObservedDocument(pub Option<Scalar>);
 
-/// A state: its index, or attribute values that exactly one state has.
+/// A state: its index, or attribute values that exactly one state has. In a world that is searched lazily, all attribute values but that
+/// of `gold`, which may be left out; there, only the start has an index, 0.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
 #[serde(untagged)]
 pub enum StartReference {

@@ -2,7 +2,7 @@
 //!
 //! A [`Definition`] is what a client registers: attributes, actions with costs, and dynamics of one of the
 //! kinds below. It is compiled into a [`Model`], whose [`Graph`] is the same whatever the source, and which searches
-//! run on.
+//! run on. A wumpus world of too many states is left unexplored: a search then finds those that it comes to ([`Space`]).
 //!
 //! ```text
 //! JSON --Definition::parse--> Definition { Table | Cave } --Model::compile--> Model { schema, actions, states, graph, start }
@@ -14,8 +14,11 @@
 
 mod action;
 mod definition;
+mod explored;
 mod graph;
+mod operator;
 mod reading;
+mod space;
 mod states;
 mod table;
 mod wumpus;
@@ -25,8 +28,11 @@ use std::sync::Arc;
 pub use action::{Action, ActionDocument, ActionIdx};
 pub(crate) use definition::hex;
 pub use definition::{Definition, DefinitionDocument, DynamicsDocument, hash_of};
+pub(crate) use explored::Explored;
 pub use graph::{Graph, Transition};
+pub(crate) use operator::Operator;
 pub use reading::{Format, MAX_LINE_BYTES, ReadError};
+pub(crate) use space::{Space, Whole};
 pub use states::{StateIdx, States};
 pub use table::{ActionReference, StartDocument, Table, TableDocument, TransitionDocument};
 pub use wumpus::{Act, Cave, CaveState, Cell, CellDocument, Heading, PoseDocument, WumpusDocument};
@@ -38,7 +44,8 @@ use crate::interrupt::{Cancelled, Interrupt};
 /// What a model may at most be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Most states; those of a wumpus world are counted as they are reached.
+    /// Most states; those of a wumpus world are counted as they are reached, and if there are more, they are left to
+    /// searches.
     pub max_states: usize,
     /// Most transitions of a table.
     pub max_transitions: usize,
@@ -60,6 +67,26 @@ pub enum CompileError {
     /// The caller lost interest.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
+}
+
+/// Where a request says that the imitator starts.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Origin {
+    /// In this state.
+    State(StateIdx),
+    /// In this state of a model that is searched lazily.
+    Cave(CaveState),
+}
+
+impl Origin {
+    /// The state, if it has a number in its model.
+    #[must_use]
+    pub fn state(self) -> Option<StateIdx> {
+        match self {
+            Self::State(state) => Some(state),
+            Self::Cave(_) => None,
+        }
+    }
 }
 
 /// Where the imitator may start.
@@ -84,20 +111,18 @@ pub struct Model {
     n_transitions: usize,
     is_unsafe: Vec<bool>,
     n_unsafe: usize,
+    /// The world, if its states are not known.
+    unexplored: Option<Cave>,
 }
 
 impl Model {
-    /// Compiles `definition`.
+    /// Compiles `definition`. A wumpus world of more than `limits.max_states` reachable states becomes a model that is searched
+    /// lazily.
     ///
     /// # Errors
     ///
-    /// [`CompileError::Faults`] if a wumpus world has more than `limits.max_states` reachable states,
-    /// [`CompileError::Cancelled`] if `interrupt` said so.
-    pub fn compile(
-        definition: &Definition,
-        limits: Limits,
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<Self, CompileError> {
+    /// [`Cancelled`] if `interrupt` said so.
+    pub fn compile(definition: &Definition, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
         match definition {
             Definition::Table(table) => Ok(table.compile()),
             Definition::Wumpus(cave) => cave.compile(limits, interrupt),
@@ -114,6 +139,18 @@ impl Model {
     #[must_use]
     pub fn actions(&self) -> &[Action] {
         &self.actions
+    }
+
+    /// Whether each search finds the states that it comes to, and numbers them on its own, as there are too many to know them
+    /// all. Of such a model, [`Self::states`] has only the start, and [`Self::graph`] nothing.
+    #[must_use]
+    pub fn is_lazy(&self) -> bool {
+        self.unexplored.is_some()
+    }
+
+    /// The world, if it is searched lazily.
+    pub(crate) fn unexplored(&self) -> Option<&Cave> {
+        self.unexplored.as_ref()
     }
 
     /// The states.
@@ -155,7 +192,12 @@ impl Model {
     /// The values of `state`, as they are written outside.
     #[must_use]
     pub fn describe(&self, state: StateIdx) -> ByAttribute<Scalar> {
-        let values = self.states.values(state);
+        self.describe_one_of(&self.states, state)
+    }
+
+    /// The values of one of `states`, which have this model's attributes, as they are written outside.
+    pub(crate) fn describe_one_of(&self, states: &States, state: StateIdx) -> ByAttribute<Scalar> {
+        let values = states.values(state);
         let written =
             self.schema.attributes().iter().zip(values).map(|(attribute, value)| attribute.write_value(value));
         self.schema.by_attribute(written)
@@ -168,8 +210,19 @@ impl Model {
         start + self.states.size_bytes() + self.graph.size_bytes() + self.is_unsafe.len()
     }
 
-    /// Reads the start of a request: a state's index, or an object of attribute values that exactly one state has.
-    pub fn read_start(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<StateIdx> {
+    /// Reads the start of a request: a state's index, or an object of attribute values that exactly one state has. Of a model that is
+    /// searched lazily, only the start has an index, 0, and an object must give all attributes (`gold` may be left out).
+    pub fn read_start(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Origin> {
+        match &self.unexplored {
+            None => self.read_known(place, faults).map(Origin::State),
+            Some(cave) if place.value.is_object() => cave.read_state(&self.schema, place, faults).map(Origin::Cave),
+            Some(_) if place.value == 0 => Some(Origin::State(0)),
+            Some(_) => place
+                .mismatch("attribute values: this world is searched lazily, and its states have no numbers", faults),
+        }
+    }
+
+    fn read_known(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<StateIdx> {
         let state = if place.value.is_object() {
             let wanted = self.read_wanted(place, faults)?;
             let mut found = (0..self.states.len()).filter(|state| self.has_values(*state, &wanted));

@@ -8,7 +8,7 @@ pub type StateIdx = u32;
 /// The states of a model. Each attribute's distinct values are kept once, in its *domain*, and a state is a row
 /// of indices into the domains, so that a distance can be looked up per (observation, value) instead of computed per
 /// state. Several states may have the same values.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct States {
     /// Distinct values by attribute. Shape `[n_attributes][domain size]`.
     domains: Vec<Vec<Value>>,
@@ -21,6 +21,12 @@ impl States {
     pub(super) fn new(domains: Vec<Vec<Value>>, rows: Vec<u32>) -> Self {
         debug_assert!(rows.len().is_multiple_of(domains.len()), "whole rows");
         Self { domains, rows }
+    }
+
+    /// Adds a state, by its row.
+    pub(super) fn push(&mut self, row: impl Iterator<Item = u32>) {
+        self.rows.extend(row);
+        debug_assert!(self.rows.len().is_multiple_of(self.domains.len()), "a whole row");
     }
 
     /// How many states there are.

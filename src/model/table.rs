@@ -74,6 +74,7 @@ impl Table {
             n_transitions: self.edges.len(),
             n_unsafe: self.unsafe_states.len(),
             is_unsafe,
+            unexplored: None,
         }
     }
 

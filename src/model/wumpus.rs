@@ -4,16 +4,17 @@
 //! to the wall and kills the first live wumpus in line. Gold is taken piece by piece, and the cave is left by climbing
 //! out of the start cell.
 //!
-//! [`Cave`] holds the rules ([`Cave::after`]), free of any body; [`Cave::compile`] explores what a body can reach by them. An
-//! action without effect is not a transition, and neither is one into death.
+//! [`Cave`] holds the rules ([`Cave::after`]), free of any body; [`Cave::compile`] explores what a body can reach by them
+//! ([`Explored`]), or leaves that to searches if it is too much.
 
+use std::ops::Range;
 use std::sync::Arc;
 
-use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::{Action, ActionIdx, CompileError, Graph, Limits, Model, Start, StateIdx, States, Transition};
+use super::explored::Explored;
+use super::{Action, Graph, Limits, Model, Space, Start, StateIdx, States};
 use crate::attribute::{Attribute, Cycle, Kind, Labels, Schema, Value};
 use crate::document::{Faults, Object, Path, Place, Quoted};
 use crate::interrupt::{Cancelled, Interrupt, Meter};
@@ -50,6 +51,16 @@ impl Heading {
     fn turned(self, quarters: usize) -> Self {
         Self::ALL[(self as usize + quarters) % Self::ALL.len()]
     }
+}
+
+/// Where the attributes of a state stand; wumpi and pieces of gold come after these.
+pub(super) mod position {
+    pub(in crate::model) const X: usize = 0;
+    pub(in crate::model) const Y: usize = 1;
+    pub(in crate::model) const HEADING: usize = 2;
+    pub(in crate::model) const GOLD: usize = 3;
+    pub(in crate::model) const ARROWS: usize = 4;
+    pub(in crate::model) const OUTSIDE: usize = 5;
 }
 
 /// A cell of the grid: `(x, y)`.
@@ -204,10 +215,15 @@ impl Cave {
     /// Whether the agent is dead in `state`: in a pit, or with a live wumpus.
     #[must_use]
     pub fn is_deadly(&self, state: &CaveState) -> bool {
-        self.is_pit[cell_index(state.cell, self.width)] || first_in(&self.wumpi, state.cell, state.alive).is_some()
+        self.is_pit(state.cell) || first_in(&self.wumpi, state.cell, state.alive).is_some()
     }
 
-    fn ahead(&self, (x, y): Cell, heading: Heading) -> Option<Cell> {
+    pub(super) fn is_pit(&self, cell: Cell) -> bool {
+        self.is_pit[cell_index(cell, self.width)]
+    }
+
+    /// The cell next to this one, if that is in the grid.
+    pub(super) fn ahead(&self, (x, y): Cell, heading: Heading) -> Option<Cell> {
         let (x, y) = match heading {
             Heading::East => (x.checked_add(1)?, y),
             Heading::North => (x, y.checked_add(1)?),
@@ -239,7 +255,7 @@ impl Cave {
     }
 
     /// Values by attribute; [`Self::row`] gives indices into these. A boolean's index is its value.
-    fn domains(&self) -> Vec<Vec<Value>> {
+    pub(super) fn domains(&self) -> Vec<Vec<Value>> {
         let count = |n: u16| (0..n).map(|n| Value::Number(f64::from(n))).collect::<Vec<_>>();
         #[expect(clippy::cast_possible_truncation, reason = "at most MAX_THINGS")]
         let n_gold = self.gold.len() as u16;
@@ -256,7 +272,7 @@ impl Cave {
     }
 
     /// The state as indices into [`Self::domains`].
-    fn row(&self, state: &CaveState) -> impl Iterator<Item = u32> {
+    pub(super) fn row(&self, state: &CaveState) -> impl Iterator<Item = u32> {
         #[expect(clippy::cast_possible_truncation, reason = "at most MAX_THINGS")]
         let n_gold = self.gold.len() as u32;
         let (x, y) = state.cell;
@@ -266,51 +282,108 @@ impl Cave {
         counts.into_iter().chain(bits(state.alive, self.wumpi.len())).chain(bits(state.lying, self.gold.len()))
     }
 
-    /// Explores, breadth first, every state that the body reaches from the start. States are numbered as they are found.
-    pub(super) fn compile(&self, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, CompileError> {
+    /// Explores, breadth first, every state that the body reaches from the start. States are numbered as they are found. If that are
+    /// more than `limits` allow, they are left to searches.
+    pub(super) fn compile(&self, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Cancelled> {
         /// How many successors are made between two looks at the interrupt. One may take the flight of an arrow past every
         /// wumpus: tens of microseconds.
         const POLL_EVERY: u64 = 256;
         let mut meter = Meter::new(interrupt, POLL_EVERY);
-        let acts: Vec<Act> = self.actions.iter().filter_map(|action| Act::named(&action.name)).collect();
-        let first = self.first_state();
-        let mut found: Vec<CaveState> = vec![first];
-        let mut indices: FxHashMap<CaveState, StateIdx> = FxHashMap::from_iter([(first, 0)]);
-        let mut edges = Vec::new();
+        let mut explored = Explored::new(self, self.first_state());
         let mut from = 0;
-        while let Some(state) = found.get(from).copied() {
-            meter.spend_or_cancel(acts.len() as u64)?;
-            for (action, act) in acts.iter().enumerate() {
-                let next = self.after(state, *act);
-                if next == state || self.is_deadly(&next) {
-                    continue;
-                }
-                #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
-                let to = *indices.entry(next).or_insert_with(|| {
-                    found.push(next);
-                    (found.len() - 1) as StateIdx
-                });
-                #[expect(clippy::cast_possible_truncation, reason = "at most six actions, and states as above")]
-                edges.push((from as StateIdx, Transition { action: action as ActionIdx, to }));
+        while from < explored.n_found() {
+            if explored.n_found() > limits.max_states {
+                return Ok(self.unexplored());
             }
-            if found.len() > limits.max_states {
-                let detail =
-                    format!("more than {} states can be reached; a smaller world is needed", limits.max_states);
-                return Err(Faults::one("/dynamics", detail).into());
-            }
+            meter.spend_or_cancel(explored.n_acts())?;
+            #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
+            explored.explore(from as StateIdx);
             from += 1;
         }
-        let rows = found.iter().flat_map(|state| self.row(state)).collect();
-        Ok(Model {
+        let (states, graph) = explored.into_parts();
+        Ok(self.model(states, graph, None))
+    }
+
+    /// The model of which nothing but the start is known.
+    fn unexplored(&self) -> Model {
+        let states = States::new(self.domains(), self.row(&self.first_state()).collect());
+        self.model(states, Graph::new(1, std::iter::empty()), Some(self.clone()))
+    }
+
+    fn model(&self, states: States, graph: Graph, unexplored: Option<Self>) -> Model {
+        Model {
             schema: self.schema(),
             actions: self.actions.clone(),
-            n_transitions: edges.len(),
-            graph: Graph::new(found.len(), edges.iter().copied()),
-            states: Arc::new(States::new(self.domains(), rows)),
+            n_transitions: graph.n_transitions(),
+            states: Arc::new(states),
+            graph,
             start: Start::State(0),
             is_unsafe: Vec::new(),
             n_unsafe: 0,
-        })
+            unexplored,
+        }
+    }
+
+    /// Reads the start of a request: every attribute of a state but `gold`, which follows from the pieces. Whether the body could come
+    /// to it is not asked.
+    pub(super) fn read_state(&self, schema: &Schema, place: &Place<'_, '_>, faults: &mut Faults) -> Option<CaveState> {
+        let n_before = faults.count();
+        let wanted = schema.read_observation(place, faults)?;
+        if faults.count() != n_before {
+            return None;
+        }
+        let attributes = schema.attributes().iter().zip(&wanted).enumerate();
+        let missing = attributes.filter(|(at, (_, value))| *at != position::GOLD && value.is_none());
+        if let Some((_, (attribute, _))) = missing.into_iter().next() {
+            let detail = format!(
+                "the states of this world are found as it is searched, so all attributes of one are needed; {} is missing",
+                Quoted(&attribute.name)
+            );
+            faults.note(place, detail);
+            return None;
+        }
+        let state = self.state_of(&wanted);
+        if state.is_none() {
+            faults.note(place, "no state of the model has these values");
+        }
+        state
+    }
+
+    /// The state with these values, if there may be one; the one of [`position::GOLD`] may be missing.
+    fn state_of(&self, wanted: &[Option<Value>]) -> Option<CaveState> {
+        let domains = self.domains();
+        let index = |at: usize| domains[at].iter().position(|value| Some(value) == wanted[at].as_ref());
+        let word = |positions: Range<usize>| {
+            let bits = positions.zip(0..).map(|(at, bit)| Some((index(at)? as u64) << bit));
+            bits.sum::<Option<u64>>()
+        };
+        let state = CaveState {
+            cell: (index(position::X)?.try_into().ok()?, index(position::Y)?.try_into().ok()?),
+            heading: Heading::ALL[index(position::HEADING)?],
+            arrows: index(position::ARROWS)?.try_into().ok()?,
+            outside: index(position::OUTSIDE)? == 1,
+            alive: word(self.wumpus_positions())?,
+            lying: word(self.gold_positions())?,
+        };
+        let n_taken = self.gold.len() - state.lying.count_ones() as usize;
+        let n_killed = self.wumpi.len() - state.alive.count_ones() as usize;
+        let is_consistent = (wanted[position::GOLD].is_none() || index(position::GOLD) == Some(n_taken))
+            && n_killed <= usize::from(self.arrows - state.arrows)
+            && (!state.outside || state.cell == self.start.0)
+            && !self.is_deadly(&state);
+        is_consistent.then_some(state)
+    }
+
+    /// Positions of the attributes `wumpus_1`, `wumpus_2`, ..
+    pub(super) fn wumpus_positions(&self) -> Range<usize> {
+        let first = position::OUTSIDE + 1;
+        first..first + self.wumpi.len()
+    }
+
+    /// Positions of the attributes `gold_1`, `gold_2`, ..
+    pub(super) fn gold_positions(&self) -> Range<usize> {
+        let first = self.wumpus_positions().end;
+        first..first + self.gold.len()
     }
 
     /// Reads the world, with a body of all six actions.

@@ -27,7 +27,7 @@ use crate::attribute::Weights;
 use crate::document::{Faults, Object, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::{HeuristicName, Mapper, ObservationDocument, Policy, Request, Stamp, StartReference};
-use crate::model::Model;
+use crate::model::{Model, Origin};
 
 /// Most items of a batch: as large a data set as most, while an answer full of short policies stays at some ten megabytes.
 pub const MAX_BATCH_ITEMS: usize = 10_000;
@@ -241,6 +241,7 @@ fn read_shared(
         None => Some(None),
     };
     let options = Request::read_options(object, faults);
+    Request::check_lookahead(model, object, faults);
     let mut weights = base(faults)?;
     for (position, weight) in named? {
         weights.set(position, weight);
@@ -250,7 +251,7 @@ fn read_shared(
     for name in SHARED_OPTIONS {
         let value = match start {
             // Values would be looked up among all states, for every item.
-            Some(start) if name == "start" => Some(start.into()),
+            Some(Origin::State(start)) if name == "start" => Some(start.into()),
             _ => object.optional(name).map(|place| place.value.clone()),
         };
         shared.extend(value.map(|value| (name.to_owned(), value)));

@@ -8,6 +8,7 @@ use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
 use super::pool::Admission;
 use super::{Etude, ServiceError};
 use crate::mapping::Mapper;
+use crate::store::ModelKey;
 
 /// Compiled models by the hash of their content, the least useful evicted. Concurrent requests for a model that is not
 /// there compile it once.
@@ -16,15 +17,15 @@ use crate::mapping::Mapper;
 /// most searches, and these need it in memory anyway.
 #[derive(Debug)]
 pub(super) struct MapperCache {
-    cache: Cache<String, Arc<Mapper>, SizeBytes>,
-    oversized: Mutex<Option<(String, Arc<Mapper>)>>,
+    cache: Cache<ModelKey, Arc<Mapper>, SizeBytes>,
+    oversized: Mutex<Option<(ModelKey, Arc<Mapper>)>>,
 }
 
 #[derive(Clone, Debug)]
 struct SizeBytes;
 
-impl Weighter<String, Arc<Mapper>> for SizeBytes {
-    fn weight(&self, _: &String, mapper: &Arc<Mapper>) -> u64 {
+impl Weighter<ModelKey, Arc<Mapper>> for SizeBytes {
+    fn weight(&self, _: &ModelKey, mapper: &Arc<Mapper>) -> u64 {
         mapper.size_bytes() as u64 + 1
     }
 }
@@ -43,42 +44,42 @@ impl MapperCache {
     }
 
     /// Puts in a model that has just been compiled.
-    pub(super) fn insert(&self, hash: &str, mapper: &Arc<Mapper>) {
-        self.cache.insert(hash.to_owned(), Arc::clone(mapper));
-        self.keep_if_oversized(hash, mapper);
+    pub(super) fn insert(&self, key: &ModelKey, mapper: &Arc<Mapper>) {
+        self.cache.insert(key.clone(), Arc::clone(mapper));
+        self.keep_if_oversized(key, mapper);
     }
 
-    /// The model with this hash, if it is there.
-    pub(super) fn get(&self, hash: &str) -> Option<Arc<Mapper>> {
-        self.cache.get(hash)
+    /// The model with this key, if it is there.
+    pub(super) fn get(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
+        self.cache.get(key)
     }
 
-    /// The model with this hash; `compile` makes it if it is not there.
+    /// The model with this key; `compile` makes it if it is not there.
     pub(super) async fn get_or_compile<E>(
         &self,
-        hash: &str,
+        key: &ModelKey,
         compile: impl Future<Output = Result<Arc<Mapper>, E>>,
     ) -> Result<Arc<Mapper>, E> {
         let get_or_compile = async {
-            match self.oversized(hash) {
+            match self.oversized(key) {
                 Some(mapper) => Ok(mapper),
                 None => compile.await,
             }
         };
-        let mapper = self.cache.get_or_insert_async(hash, get_or_compile).await?;
-        self.keep_if_oversized(hash, &mapper);
+        let mapper = self.cache.get_or_insert_async(key, get_or_compile).await?;
+        self.keep_if_oversized(key, &mapper);
         Ok(mapper)
     }
 
-    fn oversized(&self, hash: &str) -> Option<Arc<Mapper>> {
+    fn oversized(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
         let oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner);
-        oversized.as_ref().filter(|(kept, _)| kept == hash).map(|(_, mapper)| Arc::clone(mapper))
+        oversized.as_ref().filter(|(kept, _)| kept == key).map(|(_, mapper)| Arc::clone(mapper))
     }
 
-    fn keep_if_oversized(&self, hash: &str, mapper: &Arc<Mapper>) {
+    fn keep_if_oversized(&self, key: &ModelKey, mapper: &Arc<Mapper>) {
         // The cache keeps nothing that exceeds its hot part, most of it.
-        if self.cache.peek(hash).is_none() && SizeBytes.weight(&String::new(), mapper) > self.cache.capacity() / 2 {
-            let kept = (hash.to_owned(), Arc::clone(mapper));
+        if self.cache.peek(key).is_none() && SizeBytes.weight(key, mapper) > self.cache.capacity() / 2 {
+            let kept = (key.clone(), Arc::clone(mapper));
             // What it replaces may take long to free, which nobody should wait for with the lock in hand.
             let _replaced = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).replace(kept);
         }
@@ -102,14 +103,18 @@ mod tests {
         Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap())
     }
 
+    fn key(hash: &str) -> ModelKey {
+        ModelKey { hash: hash.to_owned(), is_lazy: false }
+    }
+
     /// Whether the model had to be compiled.
-    async fn is_compiled(cache: &MapperCache, hash: &str, mapper: &Arc<Mapper>) -> bool {
+    async fn is_compiled(cache: &MapperCache, key: &ModelKey, mapper: &Arc<Mapper>) -> bool {
         let mut is_compiled = false;
         let compile = async {
             is_compiled = true;
             Ok::<_, Infallible>(Arc::clone(mapper))
         };
-        cache.get_or_compile(hash, compile).await.unwrap();
+        cache.get_or_compile(key, compile).await.unwrap();
         is_compiled
     }
 
@@ -118,30 +123,30 @@ mod tests {
         let (small, large) = (mapper(2), mapper(9));
         let cache = MapperCache::new(2 * small.size_bytes() as u64);
         assert!(large.size_bytes() > 2 * small.size_bytes());
-        cache.insert("small", &small);
-        cache.insert("large", &large);
-        assert!(!is_compiled(&cache, "large", &large).await);
-        assert!(!is_compiled(&cache, "small", &small).await, "it was not driven out");
-        assert!(is_compiled(&cache, "other", &large).await);
-        assert!(!is_compiled(&cache, "other", &large).await);
-        assert!(is_compiled(&cache, "large", &large).await);
+        cache.insert(&key("small"), &small);
+        cache.insert(&key("large"), &large);
+        assert!(!is_compiled(&cache, &key("large"), &large).await);
+        assert!(!is_compiled(&cache, &key("small"), &small).await, "it was not driven out");
+        assert!(is_compiled(&cache, &key("other"), &large).await);
+        assert!(!is_compiled(&cache, &key("other"), &large).await);
+        assert!(is_compiled(&cache, &key("large"), &large).await);
     }
 
     #[tokio::test]
     async fn a_model_that_fills_most_of_the_cache_is_kept_in_it() {
         let large = mapper(9);
         let cache = MapperCache::new(large.size_bytes() as u64 * 5 / 4);
-        assert!(is_compiled(&cache, "large", &large).await);
-        assert!(!is_compiled(&cache, "large", &large).await);
-        assert!(cache.oversized("large").is_none());
+        assert!(is_compiled(&cache, &key("large"), &large).await);
+        assert!(!is_compiled(&cache, &key("large"), &large).await);
+        assert!(cache.oversized(&key("large")).is_none());
     }
 }
 
-/// Hashes of models by name, each with the generation of the table of models that it was read from: known for as long as no
+/// Keys of models by name, each with the generation of the table of models that it was read from: known for as long as no
 /// model is registered or deleted.
 #[derive(Debug)]
 pub(super) struct ModelNames {
-    hashes: Cache<String, (u64, Arc<str>)>,
+    keys: Cache<String, (u64, ModelKey)>,
 }
 
 impl ModelNames {
@@ -149,7 +154,7 @@ impl ModelNames {
     const MAX_NAMES: usize = 1024;
 
     pub(super) fn new() -> Self {
-        Self { hashes: Cache::new(Self::MAX_NAMES) }
+        Self { keys: Cache::new(Self::MAX_NAMES) }
     }
 }
 
@@ -164,14 +169,15 @@ impl Etude {
     ) -> Result<(String, Arc<Mapper>), ServiceError> {
         // Before anything is read: what changes meanwhile makes what was read outdated.
         let generation = self.store.models_generation();
-        if let Some((known, hash)) = self.model_names.hashes.get(name)
+        if let Some((known, key)) = self.model_names.keys.get(name)
             && known == generation
-            && let Some(mapper) = self.mappers.get(&hash)
+            && let Some(mapper) = self.mappers.get(&key)
         {
-            return Ok((hash.to_string(), mapper));
+            return Ok((key.hash, mapper));
         }
         let (hash, mapper) = self.mapper(name, pointer, Some(place)).await?;
-        self.model_names.hashes.insert(name.to_owned(), (generation, hash.as_str().into()));
+        let key = ModelKey { hash: hash.clone(), is_lazy: mapper.model().is_lazy() };
+        self.model_names.keys.insert(name.to_owned(), (generation, key));
         Ok((hash, mapper))
     }
 }

@@ -14,9 +14,10 @@ use super::{Etude, Name, PipeWriter, PoolError, ServiceError, pipe};
 use crate::attribute::AttributeDocument;
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::Mapper;
-use crate::model::{ActionDocument, CompileError, Definition, Format, Limits, Model, ReadError, hex};
+use crate::model::{ActionDocument, Definition, Format, Limits, Model, ReadError, hex};
 use crate::store::{
-    ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, PutModel, StoreError, StoredDefinition,
+    ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, PutModel, StoreError,
+    StoredDefinition,
 };
 
 /// A model and its definition, as registered.
@@ -109,7 +110,7 @@ impl Etude {
     ) -> Result<(Registered, ModelSummary), ServiceError> {
         let limits = self.limits;
         // Where something is registered already, nothing is stored; what it is then depends on the hash.
-        let existing = self.store.model_hash(name.as_str()).await?;
+        let existing = self.store.model_key(name.as_str()).await?;
         let (writer, pieces) = definition_writer(existing.is_none());
         let prepare = move |read: Result<Definition, ReadError>, interrupt: &mut dyn Interrupt| {
             prepare(read?, writer, limits, interrupt)
@@ -136,13 +137,15 @@ impl Etude {
             hash,
             attributes,
             actions,
-            n_states: model.graph().n_states() as u64,
-            n_transitions: model.n_transitions() as u64,
+            size: (!model.is_lazy()).then(|| ModelSize {
+                n_states: model.graph().n_states() as u64,
+                n_transitions: model.n_transitions() as u64,
+            }),
             n_unsafe: model.n_unsafe() as u64,
             // As exact as it is stored.
             created_at: now.round(Unit::Millisecond).unwrap_or(now),
         };
-        let hash = summary.hash.clone();
+        let key = ModelKey { hash: summary.hash.clone(), is_lazy: model.is_lazy() };
         let put = match (text, stored) {
             (Some(text), _) => {
                 let definition = NewDefinition::Text(text);
@@ -153,7 +156,7 @@ impl Etude {
                 self.store.put_model(NewModel { summary, definition }).await?
             }
             (None, None) => match self.store.model(name.as_str()).await? {
-                Some(existing) if existing.summary.hash == hash => PutModel::Unchanged(existing.summary),
+                Some(existing) if existing.summary.hash == key.hash => PutModel::Unchanged(existing.summary),
                 Some(existing) => PutModel::Conflict { existing_hash: existing.summary.hash },
                 // It was deleted meanwhile.
                 None => return Err(PoolError::Busy.into()),
@@ -166,7 +169,7 @@ impl Etude {
                 return Err(ServiceError::Conflict { kind: "model", name: name.to_string(), existing_hash });
             }
         };
-        self.mappers.insert(&hash, &Arc::new(mapper));
+        self.mappers.insert(&key, &Arc::new(mapper));
         Ok((registered, summary))
     }
 
@@ -236,7 +239,8 @@ impl Etude {
         place: Option<&Admission>,
     ) -> Result<(String, Arc<Mapper>), ServiceError> {
         let unknown = || unknown(name, Some(pointer));
-        let hash = self.store.model_hash(name).await?.ok_or_else(unknown)?;
+        let key = self.store.model_key(name).await?.ok_or_else(unknown)?;
+        let (hash, is_lazy) = (key.hash.clone(), key.is_lazy);
         let compile = async {
             // Deleted and registered anew in between, it has another hash; then the next request finds that.
             let row = self.store.model(name).await?.filter(|row| row.summary.hash == hash).ok_or_else(unknown)?;
@@ -247,10 +251,12 @@ impl Etude {
                     (ModelText::Packed(Box::new(|| Ok(Box::new(reader)))), Some(self.feed(id, to_reader)))
                 }
             };
+            // What it was found to be when it was registered, whatever the limit is now.
+            let limits = if is_lazy { Limits { max_states: 0, ..Limits::NONE } } else { Limits::NONE };
             let job = move |interrupt: &mut dyn Interrupt| {
                 let definition = text.read(Format::Json, Limits::NONE, interrupt);
                 Ok(match definition {
-                    Ok(definition) => compile(definition, Limits::NONE, interrupt),
+                    Ok(definition) => compile(definition, limits, interrupt),
                     Err(error) => Err(error.into()),
                 })
             };
@@ -274,7 +280,7 @@ impl Etude {
             };
             Ok::<_, ServiceError>(Arc::new(mapper))
         };
-        let mapper = self.mappers.get_or_compile(&hash, compile).await?;
+        let mapper = self.mappers.get_or_compile(&key, compile).await?;
         Ok((hash, mapper))
     }
 
@@ -327,7 +333,7 @@ fn prepare(
     limits: Limits,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Prepared, ServiceError> {
-    let model = Model::compile(&definition, limits, interrupt).map_err(uncompiled)?;
+    let model = Model::compile(&definition, limits, interrupt).map_err(|Cancelled| PoolError::Stopped)?;
     definition.write(&mut writer).map_err(|error| ServiceError::Write(serde_json::Error::io(error)))?;
     let (hash, text) = writer.finish()?;
     drop(definition);
@@ -339,16 +345,9 @@ fn prepare(
 
 /// Compiles a model.
 fn compile(definition: Definition, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Mapper, ServiceError> {
-    let model = Model::compile(&definition, limits, interrupt).map_err(uncompiled)?;
+    let model = Model::compile(&definition, limits, interrupt).map_err(|Cancelled| PoolError::Stopped)?;
     drop(definition);
     Ok(Mapper::new(model, interrupt).map_err(|Cancelled| PoolError::Stopped)?)
-}
-
-fn uncompiled(error: CompileError) -> ServiceError {
-    match error {
-        CompileError::Faults(faults) => faults.into(),
-        CompileError::Cancelled(Cancelled) => PoolError::Stopped.into(),
-    }
 }
 
 /// A writer of canonical text, and the pieces that come of it: if `is_stored` and it is longer than one.

@@ -22,6 +22,7 @@ use crate::interrupt::{Interrupt, Uninterrupted};
 use crate::mapping::{
     CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, read_lookahead,
 };
+use crate::model::Origin;
 use crate::store::{
     NewObservations, NewRefinement, NewSession, Page, SessionEnd, SessionRow, SessionStatus, StoreError,
 };
@@ -214,7 +215,8 @@ impl Etude {
             return Err(SessionError::NotOpen);
         }
         let (hash, mapper) = self.mapper(&row.model, "/model", None).await?;
-        if hash != row.model_hash {
+        // Registered anew, the same world may have become too large to be known in full.
+        if hash != row.model_hash || mapper.model().is_lazy() {
             let name = format!("{} with hash {}", row.model, row.model_hash);
             return Err(ServiceError::Unknown { kind: "model", name, pointer: None }.into());
         }
@@ -504,7 +506,7 @@ fn conclude(
     let started = Instant::now();
     let (steps, mapping) = online.end().ok_or(SessionError::Empty)?;
     let demonstration = Demonstration::of(read_stored(mapper, texts)?).ok_or(SessionError::Empty)?;
-    let problem = Problem::new(mapper.model(), demonstration, weights, start);
+    let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
     let policy = Policy::new(stamp, &problem, &mapping);
@@ -587,6 +589,10 @@ struct Opening {
 impl Opening {
     fn read(mapper: &Mapper, learner: Option<&Ready>, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
         let model = mapper.model();
+        if model.is_lazy() {
+            let detail = "this world is searched lazily, which needs the whole demonstration: ask for a policy instead";
+            faults.note_at(&Path::Member(&Path::Root, "model"), detail);
+        }
         let base = match learner {
             None => Some(model.schema().weights()),
             Some(Ready { learner, weights, .. }) => {
@@ -612,7 +618,7 @@ impl Opening {
             (None, false) => Some(NonZeroU32::new(DEFAULT_LOOKAHEAD)),
         };
         let start = match object.optional("start") {
-            Some(place) => model.read_start(&place, faults).map(Some),
+            Some(place) => model.read_start(&place, faults).map(Origin::state),
             None => Some(None),
         };
         Some(Self { weights: weights?, lookahead: lookahead?, start: start? })

@@ -194,7 +194,7 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::store::{ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
+    use crate::store::{ModelSize, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
 
     async fn open(directory: &Path) -> (Store, TaskTracker) {
         let tasks = TaskTracker::new();
@@ -234,8 +234,7 @@ mod tests {
             hash: "hash".to_owned(),
             attributes: Vec::new(),
             actions: Vec::new(),
-            n_states: 1,
-            n_transitions: 0,
+            size: Some(ModelSize { n_states: 1, n_transitions: 0 }),
             n_unsafe: 0,
             created_at: Timestamp::UNIX_EPOCH,
         };

@@ -26,7 +26,7 @@ use std::time::Duration;
 use definitions::Sweeper;
 pub use definitions::{NewPieces, PIECE_BYTES};
 pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
-pub use models::{ModelRow, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
+pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
 pub use policies::{NewPolicy, PolicySummaryRow};
 pub use refinements::{NewRefinement, RefinementEnd};
 pub use sessions::{NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus};

@@ -22,14 +22,30 @@ pub struct ModelSummary {
     pub attributes: Vec<AttributeDocument>,
     /// The actions of the body, in order.
     pub actions: Vec<ActionDocument>,
-    /// How many states it has.
-    pub n_states: u64,
-    /// How many transitions it has.
-    pub n_transitions: u64,
+    /// How many states and transitions it has; `None` if it is searched lazily.
+    pub size: Option<ModelSize>,
     /// How many of its states are unsafe.
     pub n_unsafe: u64,
     /// When it was registered.
     pub created_at: Timestamp,
+}
+
+/// How large a model is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ModelSize {
+    /// How many states it has.
+    pub n_states: u64,
+    /// How many transitions it has.
+    pub n_transitions: u64,
+}
+
+/// What tells models that are ready to be searched apart.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub struct ModelKey {
+    /// SHA-256 of its canonical text.
+    pub hash: String,
+    /// Whether it is searched lazily. A world was found to be that, or not, by the limit when it was registered.
+    pub is_lazy: bool,
 }
 
 /// A model to be registered.
@@ -140,14 +156,18 @@ impl Store {
         row.map(read).transpose()
     }
 
-    /// The hash of the model called `name`.
+    /// What the model called `name` is known by.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn model_hash(&self, name: &str) -> Result<Option<String>, StoreError> {
-        let query = sqlx::query_scalar("SELECT hash FROM models WHERE name = $1").bind(name);
-        Ok(query.fetch_optional(&self.readers).await?)
+    pub async fn model_key(&self, name: &str) -> Result<Option<ModelKey>, StoreError> {
+        let query = sqlx::query("SELECT hash, n_states FROM models WHERE name = $1").bind(name);
+        let row = query.fetch_optional(&self.readers).await?;
+        let read = |row: SqliteRow| {
+            Ok(ModelKey { hash: row.try_get("hash")?, is_lazy: row.try_get::<i64, _>("n_states")? == UNKNOWN })
+        };
+        row.map(read).transpose()
     }
 
     /// At most `limit` models in the order of their names, from the first after `after`.
@@ -167,6 +187,9 @@ impl Store {
     }
 }
 
+/// Stands for a number of states that is not known. No model has so few.
+const UNKNOWN: i64 = 0;
+
 fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
     const TABLE: &str = "models";
     let count = |column: &'static str| -> Result<u64, StoreError> {
@@ -177,8 +200,10 @@ fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
         hash: row.try_get("hash")?,
         attributes: serde_json::from_str(row.try_get("attributes")?).map_err(corrupt(TABLE, "attributes"))?,
         actions: serde_json::from_str(row.try_get("actions")?).map_err(corrupt(TABLE, "actions"))?,
-        n_states: count("n_states")?,
-        n_transitions: count("n_transitions")?,
+        size: match row.try_get::<i64, _>("n_states")? {
+            UNKNOWN => None,
+            _ => Some(ModelSize { n_states: count("n_states")?, n_transitions: count("n_transitions")? }),
+        },
         n_unsafe: count("n_unsafe")?,
         created_at: timestamp(TABLE, "created_at_ms", row.try_get("created_at_ms")?)?,
     })
@@ -204,8 +229,8 @@ pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> 
     .bind(definition_id)
     .bind(serde_json::to_string(&summary.attributes).map_err(json)?)
     .bind(serde_json::to_string(&summary.actions).map_err(json)?)
-    .bind(count(summary.n_states))
-    .bind(count(summary.n_transitions))
+    .bind(summary.size.map_or(UNKNOWN, |size| count(size.n_states)))
+    .bind(summary.size.map_or(UNKNOWN, |size| count(size.n_transitions)))
     .bind(count(summary.n_unsafe))
     .bind(summary.created_at.as_millisecond())
     .execute(&mut *connection)

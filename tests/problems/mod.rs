@@ -2,9 +2,10 @@
 
 #![allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its part of this module")]
 
+use etude::document::{Faults, Place};
 use etude::interrupt::Uninterrupted;
-use etude::mapping::Mapper;
-use etude::model::{Definition, Limits, Model};
+use etude::mapping::{Mapper, Policy, Request, Stamp};
+use etude::model::{Act, Definition, Limits, Model};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
@@ -14,9 +15,23 @@ pub(crate) fn example(path: &str) -> Value {
 }
 
 pub(crate) fn mapper(model: &Value) -> Mapper {
+    mapper_within(Limits::DEFAULT, model)
+}
+
+/// A mapper of a model, of which at most as many states may be known as `limits` say.
+pub(crate) fn mapper_within(limits: Limits, model: &Value) -> Mapper {
     let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    let model = Model::compile(&definition, limits, &mut Uninterrupted).unwrap();
     Mapper::new(model, &mut Uninterrupted).unwrap()
+}
+
+pub(crate) fn solve(mapper: &Mapper, request: &Value) -> Policy {
+    let mut faults = Faults::default();
+    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let read = Request::read(mapper.model(), &object, &mut faults);
+    let request = faults.check(read).unwrap();
+    let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();
+    Policy::new(Stamp::default(), &request.problem, &mapping)
 }
 
 pub(crate) fn close(a: f64, b: f64) -> bool {
@@ -118,4 +133,44 @@ fn build(
             {"kind": "table", "states": states, "transitions": transitions, "start": start, "unsafe": unsafe_states},
     });
     (model, demonstration, weights, request_start)
+}
+
+/// A cave with up to three wumpi, pits and pieces of gold, a body, and a walk of a full body in the same cave.
+pub(crate) fn cave() -> impl Strategy<Value = (Value, Vec<usize>)> {
+    let cells = |most| prop::collection::vec((0u16..4, 0u16..3), 0..=most);
+    let body = prop::sample::subsequence(Act::ALL.to_vec(), 1..=6);
+    let walk = prop::collection::vec(0usize..6, 0..12);
+    let start = (0u16..4, 0u16..3, 0usize..4);
+    (cells(2), cells(3), cells(3), body, walk, start, 0u8..3).prop_map(
+        |(pits, wumpi, gold, body, walk, start, arrows)| {
+            let (x, y, heading) = start;
+            let away = |cells: Vec<(u16, u16)>| cells.into_iter().filter(|cell| *cell != (x, y)).collect::<Vec<_>>();
+            let actions: Vec<Value> = body.iter().map(|act| json!({"name": act.name(), "cost": 0.3})).collect();
+            let heading = ["east", "north", "west", "south"][heading];
+            let model = json!({
+                "actions": actions,
+                "dynamics": {
+                    "kind": "wumpus", "width": 4, "height": 3, "pits": away(pits), "wumpi": away(wumpi), "gold": gold,
+                    "start": {"x": x, "y": y, "heading": heading}, "arrows": arrows,
+                },
+            });
+            (model, walk)
+        },
+    )
+}
+
+/// What is seen of a demonstrator in the cave `model` who has every action and does what `walk` says, where it can and lives.
+pub(crate) fn walked(model: &Value, walk: &[usize]) -> Value {
+    let mut full = model.clone();
+    full["actions"] = Act::ALL.iter().map(|act| json!({"name": act.name(), "cost": 0.3})).collect();
+    let full = super::oracle::wumpus::as_table(&full);
+    let mut at = json!(0);
+    let mut demonstration = vec![full["dynamics"]["states"][0].clone()];
+    for act in walk {
+        let transitions = full["dynamics"]["transitions"].as_array().unwrap();
+        let taken = transitions.iter().find(|t| t[0] == at && t[1] == Act::ALL[*act].name());
+        at = taken.map_or(at, |t| t[2].clone());
+        demonstration.push(full["dynamics"]["states"][at.as_u64().unwrap() as usize].clone());
+    }
+    demonstration.into()
 }

@@ -15,16 +15,14 @@ pub(super) mod projection;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::model::StateIdx;
-
 /// An estimate of the cost from a node to the end of the demonstration.
 ///
 /// *Admissible*: never above the least cost of a completion; a search with it finds the optimum. *Consistent*: along no
 /// move does it fall by more than the move's cost; a search with it expands no node twice.
 pub(super) trait Heuristic {
-    /// Estimated cost from `(observation, state)` to the end. At least 0; infinite only for nodes that cannot be on a
-    /// mapping cheaper than one that is known, else 0 at the last observation.
-    fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64;
+    /// Estimated cost from the node of `observation` and the state with this row to the end. At least 0; infinite only for nodes
+    /// that cannot be on a mapping cheaper than one that is known, else 0 at the last observation.
+    fn cost_to_go(&self, observation: usize, row: &[u32]) -> f64;
 
     /// How much work an estimate for a node at `observation` is, in looks at a distance. At least 1.
     fn work(&self, _observation: usize) -> u64 {
@@ -38,7 +36,7 @@ pub(super) struct Blind;
 
 impl Heuristic for Blind {
     #[inline]
-    fn cost_to_go(&self, _: usize, _: StateIdx) -> f64 {
+    fn cost_to_go(&self, _: usize, _: &[u32]) -> f64 {
         0.0
     }
 }

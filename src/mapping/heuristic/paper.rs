@@ -2,7 +2,6 @@
 
 use super::Heuristic;
 use crate::mapping::Problem;
-use crate::model::StateIdx;
 
 /// For a node `(i, s)`, let `j > i` be the observation still ahead that is closest to `s` (the earliest among equals). `C_HC`
 /// removes the terms of `D(o_j, s)` that are not 0 one by one, largest first, adding what remains after each removal
@@ -21,11 +20,11 @@ impl<'p> Paper<'p> {
 }
 
 impl Heuristic for Paper<'_> {
-    fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64 {
+    fn cost_to_go(&self, observation: usize, row: &[u32]) -> f64 {
         let (distances, last) = (&self.problem.distances, self.problem.last());
-        let ahead = (observation + 1..=last).map(|j| (distances.distance(j, state), j));
+        let ahead = (observation + 1..=last).map(|j| (distances.distance(j, row), j));
         let Some((_, j)) = ahead.min_by(|(d, _), (other, _)| d.total_cmp(other)) else { return 0.0 };
-        let mut terms: Vec<f64> = distances.terms(j, state).map(|(_, term)| term).filter(|term| *term > 0.0).collect();
+        let mut terms: Vec<f64> = distances.terms(j, row).map(|(_, term)| term).filter(|term| *term > 0.0).collect();
         terms.sort_unstable_by(|a, b| b.total_cmp(a));
         let mut remaining: f64 = terms.iter().sum();
         let mut estimate = 0.0;

@@ -8,7 +8,6 @@ use super::{Grouping, Heuristic};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
 use crate::mapping::open_list::CheapestFirst;
-use crate::model::{StateIdx, States};
 
 /// What a node `(i, s)` costs: what is paid on arriving, and what must still be paid after.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -26,7 +25,6 @@ pub(in crate::mapping) struct Estimate {
 #[derive(Debug)]
 pub(crate) struct Projected<'p> {
     problem: &'p Problem<'p>,
-    states: &'p States,
     columns: Vec<Column<'p>>,
     /// Entries per observation.
     width: usize,
@@ -147,6 +145,8 @@ impl<'p> Projected<'p> {
             }
         }
         let due = match grouping {
+            // Groups are chosen by looking at states and transitions.
+            _ if problem.model.is_lazy() => u64::MAX,
             Grouping::Widest => 0,
             Grouping::WhenItPays => MIN_EXPANSIONS.max(problem.model.graph().n_transitions() as u64),
         };
@@ -159,7 +159,6 @@ impl<'p> Projected<'p> {
         let untabled = (0..problem.model.schema().len()).filter(|position| problem.distances.is_active(*position));
         Self {
             problem,
-            states: problem.model.states(),
             columns: Vec::new(),
             width: 0,
             entries: Vec::new(),
@@ -292,7 +291,7 @@ impl<'p> Projected<'p> {
         let width = self.width;
         let mut costs = vec![f64::INFINITY; self.entries.len()];
         let mut optima = Vec::new();
-        let start = self.states.row(self.problem.start);
+        let start = self.problem.model.states().row(self.problem.start);
         let mut open = BinaryHeap::new();
         for (number, Column { group, position, offset }) in self.columns.iter().enumerate() {
             let n_classes = group.n_classes();
@@ -351,7 +350,7 @@ impl<'p> Projected<'p> {
 
     /// Writes the terms of an observation, and the least of them. What no action changes stays as it was at the start.
     fn write_terms(&mut self, i: usize) {
-        let start = self.states.row(self.problem.start);
+        let start = self.problem.model.states().row(self.problem.start);
         let row = &mut self.entries[i * self.width..][..self.width];
         let mut least_distance = 0.0;
         for Column { group, position, offset } in &self.columns {
@@ -366,7 +365,7 @@ impl<'p> Projected<'p> {
             least_distance += least;
         }
         for position in &self.untabled {
-            if self.states.domain(*position).len() == 1 {
+            if self.problem.model.states().domain(*position).len() == 1 {
                 least_distance += self.problem.distances.term(*position, i, 0);
             }
         }
@@ -460,10 +459,10 @@ pub(in crate::mapping) struct EstimatesAt<'p> {
 }
 
 impl EstimatesAt<'_> {
+    /// What the node of the state with this row costs.
     #[inline]
-    pub(in crate::mapping) fn of(&self, state: StateIdx) -> Estimate {
+    pub(in crate::mapping) fn of(&self, values: &[u32]) -> Estimate {
         let projected = self.projected;
-        let values = projected.states.row(state);
         let mut sum = Estimate::default();
         let mut add = |entry: Estimate| {
             sum.distance += entry.distance;
@@ -484,8 +483,8 @@ impl EstimatesAt<'_> {
 
 impl Heuristic for Projected<'_> {
     #[inline]
-    fn cost_to_go(&self, observation: usize, state: StateIdx) -> f64 {
-        self.at(observation).of(state).cost_to_go
+    fn cost_to_go(&self, observation: usize, row: &[u32]) -> f64 {
+        self.at(observation).of(row).cost_to_go
     }
 }
 
@@ -634,7 +633,7 @@ mod tests {
     use crate::document::{Faults, Place};
     use crate::interrupt::Uninterrupted;
     use crate::mapping::Request;
-    use crate::model::{Definition, Limits, Model};
+    use crate::model::{Definition, Limits, Model, StateIdx};
 
     /// A model of up to 12 states and three attributes, of which some weigh nothing, and a demonstration.
     fn model_and_demonstration() -> impl Strategy<Value = (Value, Value)> {
@@ -664,6 +663,10 @@ mod tests {
         })
     }
 
+    fn distance(problem: &Problem<'_>, i: usize, state: StateIdx) -> f64 {
+        problem.distances.distance(i, problem.model.states().row(state))
+    }
+
     /// The moves out of a node, with what they cost.
     fn moves(problem: &Problem<'_>, i: usize, state: StateIdx) -> Vec<(usize, StateIdx, f64)> {
         let mut moves = vec![(i + 1, state, 0.0)];
@@ -672,7 +675,7 @@ mod tests {
             moves.extend([(i + 1, transition.to, cost), (i, transition.to, cost)]);
         }
         moves.retain(|(i, _, _)| *i <= problem.last());
-        moves.into_iter().map(|(i, state, cost)| (i, state, cost + problem.distances.distance(i, state))).collect()
+        moves.into_iter().map(|(i, state, cost)| (i, state, cost + distance(problem, i, state))).collect()
     }
 
     fn nodes(problem: &Problem<'_>) -> Vec<(usize, StateIdx)> {
@@ -683,7 +686,7 @@ mod tests {
     fn least_costs(problem: &Problem<'_>) -> [Vec<Vec<f64>>; 2] {
         let unknown = vec![vec![f64::INFINITY; problem.model.states().len() as usize]; problem.last() + 1];
         let (mut from_start, mut to_end) = (unknown.clone(), unknown);
-        from_start[0][problem.start as usize] = problem.distances.distance(0, problem.start);
+        from_start[0][problem.start as usize] = distance(problem, 0, problem.start);
         to_end[problem.last()].fill(0.0);
         loop {
             let mut has_changed = false;
@@ -748,15 +751,15 @@ mod tests {
                     prop_assert_eq!(projected.deepen(limit, 0, &mut meter), Ok(Deepened::Yes));
                 }
                 for (number, (i, state)) in nodes(&problem).into_iter().enumerate() {
-                    let estimate = projected.at(i).of(state);
-                    prop_assert!((estimate.distance - problem.distances.distance(i, state)).abs() <= close);
+                    let estimate = projected.at(i).of(problem.model.states().row(state));
+                    prop_assert!((estimate.distance - distance(&problem, i, state)).abs() <= close);
                     let h = estimate.cost_to_go;
                     let through = from_start[i][state as usize] + to_end[i][state as usize];
                     if !is_deep || through < limit {
                         prop_assert!(h <= to_end[i][state as usize] + close, "admissible at ({i}, {state})");
                     }
                     for (next, to, cost) in moves(&problem, i, state) {
-                        let next_h = projected.at(next).of(to).cost_to_go;
+                        let next_h = projected.at(next).of(problem.model.states().row(to)).cost_to_go;
                         prop_assert!(h == f64::INFINITY || h <= cost + next_h + close, "consistent at ({i}, {state})");
                     }
                     if is_deep {

@@ -31,7 +31,7 @@ use super::grouping::{self, Partition};
 use super::projected::Estimate;
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
-use crate::model::{ActionIdx, Model};
+use crate::model::{ActionIdx, Model, Operator};
 
 /// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
 #[derive(Debug)]
@@ -96,7 +96,7 @@ pub(super) struct ProjectedEdge {
 const MAX_EDGES: usize = 1 << 24;
 
 impl Projections {
-    /// Projects `model` on each of its attributes that varies.
+    /// Projects `model` on each of its attributes that varies; a model that is searched lazily, by its operators.
     ///
     /// # Errors
     ///
@@ -114,34 +114,22 @@ impl Projections {
         let alone = (0..model.schema().len()).filter(varies).map(|attribute| Group::new(model, &[attribute]));
         let mut groups: Vec<Group> = alone.collect();
 
-        let mut change_sets = ChangeSets::default();
-        // `None` for a group that is left out.
-        let mut edges: Vec<Option<FxHashSet<(ClassIdx, ProjectedEdge)>>> =
-            vec![Some(FxHashSet::default()); groups.len()];
-        let mut n_edges = 0;
-        let mut changed = Vec::new();
-        for (from, transition) in model.graph().iter() {
-            meter.spend_or_cancel(groups.len() as u64)?;
-            let (row, row_after) = (states.row(from), states.row(transition.to));
-            let is_changed = |group: &Group| group.positions().any(|at| row[at] != row_after[at]);
-            let kept = groups.iter().zip(&edges).zip(0u16..).filter(|((_, edges), _)| edges.is_some());
-            changed.clear();
-            changed.extend(kept.filter(|((group, _), _)| is_changed(group)).map(|(_, number)| number));
-            let change_set = change_sets.number_of(&changed);
-            for number in &changed {
-                let group = &groups[usize::from(*number)];
-                #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
-                let [from, to] = [row, row_after].map(|row| group.class_of(row) as ClassIdx);
-                let edge = ProjectedEdge { from, kind: change_set * 2, action: transition.action };
-                let is_new = edges[usize::from(*number)].as_mut().is_some_and(|edges| edges.insert((to, edge)));
-                n_edges += usize::from(is_new);
+        let mut ways = Ways::of(&groups, max_edges);
+        match model.unexplored() {
+            None => {
+                for (from, transition) in model.graph().iter() {
+                    meter.spend_or_cancel(groups.len() as u64)?;
+                    ways.add_transition(transition.action, states.row(from), states.row(transition.to));
+                }
             }
-            if n_edges > max_edges || change_sets.n_entries > max_edges {
-                leave_out_larger_half(&mut edges);
-                change_sets.rebuild(&mut edges);
-                n_edges = edges.iter().flatten().map(FxHashSet::len).sum();
+            Some(cave) => {
+                for operator in cave.operators() {
+                    meter.spend_or_cancel(groups.len() as u64)?;
+                    ways.add_operator(&operator);
+                }
             }
         }
+        let Ways { edges, change_sets, .. } = ways;
         for (group, edges) in groups.iter_mut().zip(edges) {
             group.is_kept = edges.is_some();
             let edges: Vec<(ClassIdx, ProjectedEdge)> = edges.into_iter().flatten().collect();
@@ -273,6 +261,73 @@ impl Interrupt for Stopper<'_> {
     }
 }
 
+/// Distinct ways to change classes, of all groups.
+struct Ways<'g> {
+    groups: &'g [Group],
+    /// By group; `None` for one that is left out.
+    edges: Vec<Option<FxHashSet<(ClassIdx, ProjectedEdge)>>>,
+    n_edges: usize,
+    max_edges: usize,
+    change_sets: ChangeSets,
+    /// The groups that change, of those that are kept.
+    changed: Vec<u16>,
+}
+
+impl<'g> Ways<'g> {
+    fn of(groups: &'g [Group], max_edges: usize) -> Self {
+        let edges = vec![Some(FxHashSet::default()); groups.len()];
+        Self { groups, edges, n_edges: 0, max_edges, change_sets: ChangeSets::default(), changed: Vec::new() }
+    }
+
+    /// Adds what a transition between states with these rows changes.
+    fn add_transition(&mut self, action: ActionIdx, row: &[u32], row_after: &[u32]) {
+        let change_set = self.change_set(|group| group.positions().any(|at| row[at] != row_after[at]));
+        let groups = self.groups;
+        for n in 0..self.changed.len() {
+            let group = &groups[usize::from(self.changed[n])];
+            #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+            let [from, to] = [row, row_after].map(|row| group.class_of(row) as ClassIdx);
+            self.insert(n, to, ProjectedEdge { from, kind: change_set * 2, action });
+        }
+        self.make_room();
+    }
+
+    /// Adds what any transition that is like `operator` may change.
+    fn add_operator(&mut self, operator: &Operator) {
+        let change_set = self.change_set(|group| operator.changed.iter().any(|(at, _, _)| group.has(*at)));
+        let groups = self.groups;
+        for n in 0..self.changed.len() {
+            for (from, to) in groups[usize::from(self.changed[n])].classes_of(operator) {
+                self.insert(n, to, ProjectedEdge { from, kind: change_set * 2, action: operator.action });
+            }
+        }
+        self.make_room();
+    }
+
+    /// Finds the groups that change, and numbers the set of them.
+    fn change_set(&mut self, is_changed: impl Fn(&Group) -> bool) -> u32 {
+        let kept = self.groups.iter().zip(&self.edges).zip(0u16..).filter(|((_, edges), _)| edges.is_some());
+        self.changed.clear();
+        self.changed.extend(kept.filter(|((group, _), _)| is_changed(group)).map(|(_, number)| number));
+        self.change_sets.number_of(&self.changed)
+    }
+
+    /// Adds an edge of the `n`-th group that changes.
+    fn insert(&mut self, n: usize, to: ClassIdx, edge: ProjectedEdge) {
+        let edges = &mut self.edges[usize::from(self.changed[n])];
+        let is_new = edges.as_mut().is_some_and(|edges| edges.insert((to, edge)));
+        self.n_edges += usize::from(is_new);
+    }
+
+    fn make_room(&mut self) {
+        if self.n_edges > self.max_edges || self.change_sets.n_entries > self.max_edges {
+            leave_out_larger_half(&mut self.edges);
+            self.change_sets.rebuild(&mut self.edges);
+            self.n_edges = self.edges.iter().flatten().map(FxHashSet::len).sum();
+        }
+    }
+}
+
 /// Leaves out half of the groups that are kept, those with the most edges; the later ones among equals.
 fn leave_out_larger_half(edges: &mut [Option<FxHashSet<(ClassIdx, ProjectedEdge)>>]) {
     let kept = edges.iter().enumerate().filter_map(|(number, edges)| Some((edges.as_ref()?.len(), number)));
@@ -382,6 +437,25 @@ impl Group {
         Ok(())
     }
 
+    /// The classes from and to which `operator` changes, whatever the values of which it says nothing.
+    fn classes_of(&self, operator: &Operator) -> Vec<(ClassIdx, ClassIdx)> {
+        let mut classes = vec![(0, 0)];
+        for Digit { position, stride, n_values } in &self.digits {
+            let kept = operator.kept.iter().find(|(at, _)| at == position).map(|(_, value)| (*value, *value));
+            let changed = operator.changed.iter().find(|(at, _, _)| at == position).map(|(_, from, to)| (*from, *to));
+            #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+            let (stride, n_values) = (*stride as ClassIdx, *n_values as u32);
+            let values: Vec<(u32, u32)> = match kept.or(changed) {
+                Some(values) => vec![values],
+                None => (0..n_values).map(|value| (value, value)).collect(),
+            };
+            let with =
+                |(from, to): (u32, u32), class: &(ClassIdx, ClassIdx)| (class.0 + from * stride, class.1 + to * stride);
+            classes = values.iter().flat_map(|values| classes.iter().map(|class| with(*values, class))).collect();
+        }
+        classes
+    }
+
     /// The class of a state with these domain indices, shape `[n_attributes]`.
     #[inline]
     pub(super) fn class_of(&self, values: &[u32]) -> usize {
@@ -472,5 +546,36 @@ mod tests {
         assert_eq!(kept(MAX_EDGES), [(true, 99), (true, 2)]);
         assert_eq!(kept(50), [(false, 0), (true, 2)]);
         assert_eq!(kept(1), [(false, 0), (false, 0)]);
+    }
+
+    #[test]
+    fn operators_allow_all_that_transitions_do_in_groups_of_any_attributes() {
+        let definition = json!({"dynamics": {
+            "kind": "wumpus", "width": 4, "height": 3, "pits": [[3, 2]], "wumpi": [[2, 0], [0, 2]],
+            "gold": [[1, 0], [1, 0], [2, 0]], "arrows": 2,
+        }});
+        let definition = Definition::read(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let Definition::Wumpus(cave) = definition else { panic!("a cave") };
+        let partitions: [&[&[usize]]; 3] =
+            [&[&[0, 1, 2], &[3, 8, 9], &[4, 6, 7], &[5]], &[&[0, 3], &[1, 4], &[2, 5]], &[&[0, 1], &[2, 4, 6], &[3]]];
+        for partition in partitions {
+            let groups: Vec<Group> = partition.iter().map(|positions| Group::new(&model, positions)).collect();
+            let (mut known, mut lazy) = (Ways::of(&groups, MAX_EDGES), Ways::of(&groups, MAX_EDGES));
+            for (from, transition) in model.graph().iter() {
+                let [row, row_after] = [from, transition.to].map(|state| model.states().row(state));
+                known.add_transition(transition.action, row, row_after);
+            }
+            cave.operators().for_each(|operator| lazy.add_operator(&operator));
+            let of = |ways: &Ways<'_>, group: usize| -> FxHashSet<(ClassIdx, ClassIdx, ActionIdx, Vec<u16>)> {
+                let edges = ways.edges[group].iter().flatten();
+                let set = |edge: &ProjectedEdge| ways.change_sets.sets[edge.kind as usize / 2].clone();
+                edges.map(|(to, edge)| (edge.from, *to, edge.action, set(edge))).collect()
+            };
+            for group in 0..groups.len() {
+                let (known, lazy) = (of(&known, group), of(&lazy, group));
+                assert!(!known.is_empty() && known.is_subset(&lazy), "{:?} of {partition:?}", partition[group]);
+            }
+        }
     }
 }

@@ -105,8 +105,13 @@ const MAX_KEPT: u64 = 1 << 21;
 impl OnlineMapping {
     /// A mapping of a demonstration of which nothing has come yet. `start` overrides the model's; `lookahead` is how many
     /// observations past the current one a decision may wait for, `None` for all.
+    ///
+    /// # Panics
+    ///
+    /// If the model is searched lazily: each layer looks at all states.
     #[must_use]
     pub fn new(mapper: Arc<Mapper>, weights: Weights, start: Option<StateIdx>, lookahead: Option<NonZeroU32>) -> Self {
+        assert!(!mapper.model().is_lazy(), "each layer needs all states");
         let model = mapper.model();
         let n_layers = lookahead.map_or(u64::MAX, |lookahead| 1 + u64::from(lookahead.get()));
         let keeps = n_layers.saturating_mul(u64::from(model.states().len())) <= MAX_KEPT;
@@ -195,7 +200,8 @@ impl OnlineMapping {
         let graph = self.mapper.model().graph();
         let n_expanded = u64::from(self.n_observed) * graph.n_states() as u64;
         let n_generated = u64::from(self.n_observed) * graph.n_transitions() as u64;
-        let mapping = Mapping { moves: self.moves, cost: self.cost, status, lower_bound, n_expanded, n_generated };
+        let mapping =
+            Mapping { moves: self.moves, cost: self.cost, status, lower_bound, n_expanded, n_generated, states: None };
         Some((committed, mapping))
     }
 
@@ -242,7 +248,7 @@ impl OnlineMapping {
             self.root_cost += layer.observed.distance(model.states(), step.state);
         }
         let terms = layer.observed.terms(model.states(), step.state);
-        let written = writer.write(model, &step, terms);
+        let written = writer.write(model, model.states(), &step, terms);
         self.cost = writer.cost();
         self.writer = writer;
         self.moves.push(step);

@@ -9,7 +9,7 @@ use super::{Found, Move, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::heuristic::Heuristic;
 use crate::mapping::{Budget, Problem};
-use crate::model::{ActionIdx, StateIdx};
+use crate::model::{ActionIdx, Space, StateIdx};
 
 /// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows, among those of at most `most_f`, of which
 /// there must be one. A node is expanded again if a cheaper
@@ -18,23 +18,25 @@ use crate::model::{ActionIdx, StateIdx};
 /// # Errors
 ///
 /// [`Cancelled`] if `interrupt` said so.
-pub(in crate::mapping) fn search<H: Heuristic>(
+pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
     problem: &Problem<'_>,
+    space: &mut S,
     heuristic: &H,
     budget: Budget,
     most_f: f64,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
     let last = problem.last();
-    let (graph, actions) = (problem.model.graph(), problem.model.actions());
-    let mut nodes = Nodes::new(problem.demonstration.len(), graph.n_states());
+    let actions = problem.model.actions();
+    let mut nodes = Nodes::new(problem.demonstration.len(), space.n_states());
     let mut open = BinaryHeap::new();
     let (mut n_expanded, mut n_generated) = (0, 0);
     let mut meter = Meter::new(interrupt, POLL_EVERY);
 
-    let g = problem.distances.distance(0, problem.start);
+    let row = space.row(problem.start);
+    let g = problem.distances.distance(0, row);
     let first = nodes.reach(Way { observation: 0, state: problem.start, g, action: NO_ACTION, parent: 0 });
-    open.extend(first.map(|id| Open { f: g + heuristic.cost_to_go(0, problem.start), g, observation: 0, id }));
+    open.extend(first.map(|id| Open { f: g + heuristic.cost_to_go(0, row), g, observation: 0, id }));
     // The farthest expanded node, and among those the most promising: where a search out of budget goes on greedily.
     let mut farthest = Open { f: f64::INFINITY, g, observation: 0, id: 0 };
 
@@ -53,7 +55,7 @@ pub(in crate::mapping) fn search<H: Heuristic>(
             let paths = [entry.id, farthest.id, 0].map(|id| nodes.path(id)).to_vec();
             Ok(Found { paths, is_complete: false, least_f: entry.f, n_expanded, n_generated })
         };
-        let is_spent = n_expanded >= budget.max_expansions || nodes.len() >= budget.max_nodes;
+        let is_spent = n_expanded >= budget.max_expansions || budget.is_full(nodes.len(), space);
         match meter.spend(1) {
             Signal::Cancel => return Err(Cancelled),
             Signal::Continue if !is_spent => {}
@@ -65,7 +67,8 @@ pub(in crate::mapping) fn search<H: Heuristic>(
         }
 
         let skip = (i + 1, state, 0.0, NO_ACTION);
-        let moves = graph.successors(state).iter().flat_map(|transition| {
+        space.explore(state);
+        let moves = space.successors(state).iter().flat_map(|transition| {
             let cost = actions[usize::from(transition.action)].cost;
             [i + 1, i].map(|i| (i, transition.to, cost, transition.action))
         });
@@ -76,11 +79,12 @@ pub(in crate::mapping) fn search<H: Heuristic>(
                 Signal::Cancel => return Err(Cancelled),
             }
             n_generated += 1;
-            let g = node.g + cost + problem.distances.distance(i, state);
+            let row = space.row(state);
+            let g = node.g + cost + problem.distances.distance(i, row);
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
             let observation = i as u32;
             if let Some(id) = nodes.reach(Way { observation, state, g, action, parent: entry.id }) {
-                let f = g + heuristic.cost_to_go(i, state);
+                let f = g + heuristic.cost_to_go(i, row);
                 if f <= most_f {
                     open.push(Open { f, g, observation, id });
                 }
@@ -109,12 +113,13 @@ type NodeId = u32;
 struct Nodes {
     ways: Vec<Way>,
     index: NodeIndex,
-    n_states: usize,
+    /// How many keys each observation has.
+    n_keys: usize,
 }
 
 /// Finds the id of a node.
 enum NodeIndex {
-    /// By `i * n_states + s`, plus 1; 0 for none. Zeroed pages cost nothing until they are touched.
+    /// By `i * n_keys + s`, plus 1; 0 for none. Zeroed pages cost nothing until they are touched.
     Dense(Vec<NodeId>),
     /// For problems of which a dense index would be too large.
     Sparse(FxHashMap<u64, NodeId>),
@@ -124,14 +129,15 @@ enum NodeIndex {
 const MAX_DENSE_INDEX: usize = 1 << 26;
 
 impl Nodes {
-    fn new(n_observations: usize, n_states: usize) -> Self {
-        let n_nodes = n_observations.saturating_mul(n_states);
+    fn new(n_observations: usize, n_states: Option<usize>) -> Self {
+        let n_keys = n_states.unwrap_or(1 << StateIdx::BITS);
+        let n_nodes = n_observations.saturating_mul(n_keys);
         let index = if n_nodes <= MAX_DENSE_INDEX {
             NodeIndex::Dense(vec![0; n_nodes])
         } else {
             NodeIndex::Sparse(FxHashMap::default())
         };
-        Self { ways: Vec::new(), index, n_states }
+        Self { ways: Vec::new(), index, n_keys }
     }
 
     fn len(&self) -> usize {
@@ -147,7 +153,7 @@ impl Nodes {
     fn reach(&mut self, way: Way) -> Option<NodeId> {
         #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
         let next = self.ways.len() as NodeId;
-        let key = way.observation as usize * self.n_states + way.state as usize;
+        let key = way.observation as usize * self.n_keys + way.state as usize;
         let id = match &mut self.index {
             NodeIndex::Dense(ids) => {
                 let id = ids[key];

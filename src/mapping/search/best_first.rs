@@ -23,7 +23,7 @@ use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::heuristic::projected::{Deepened, Projected};
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::{Budget, Problem};
-use crate::model::Transition;
+use crate::model::{Space, Transition};
 
 /// How many times as wide each probe is as the one before.
 const PROBE_WIDENING: u64 = 8;
@@ -54,20 +54,22 @@ impl Buffers {
 /// # Errors
 ///
 /// [`Cancelled`] if `interrupt` said so.
-pub(in crate::mapping) fn search(
+pub(in crate::mapping) fn search<S: Space>(
     problem: &Problem<'_>,
+    space: &mut S,
     projected: &mut Projected<'_>,
     budget: Budget,
     most: f64,
     buffers: &mut Buffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
-    buffers.nodes.clear(problem.demonstration.len().saturating_mul(problem.model.graph().n_states()));
+    buffers.nodes.clear(problem.demonstration.len().saturating_mul(space.n_states().unwrap_or(usize::MAX)));
     let start = Arrival { observation: 0, state: problem.start, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
     // The start is kept whatever it costs: it is what is left to complete if there is no budget at all.
-    let first = buffers.nodes.offer(start, &projected.at(0), f64::INFINITY).unwrap_or(NO_NODE);
+    let first = buffers.nodes.offer(start, space, &projected.at(0), f64::INFINITY).unwrap_or(NO_NODE);
     let mut search = Search {
         problem,
+        space,
         projected,
         budget,
         buffers,
@@ -96,8 +98,9 @@ enum End {
     CutShort,
 }
 
-struct Search<'s, 'p> {
+struct Search<'s, 'p, S> {
     problem: &'s Problem<'s>,
+    space: &'s mut S,
     projected: &'s mut Projected<'p>,
     budget: Budget,
     buffers: &'s mut Buffers,
@@ -110,7 +113,7 @@ struct Search<'s, 'p> {
     meter: Meter<'s>,
 }
 
-impl Search<'_, '_> {
+impl<S: Space> Search<'_, '_, S> {
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
     fn probe(&mut self, width: u64) -> Result<End, Cancelled> {
@@ -212,7 +215,7 @@ impl Search<'_, '_> {
         #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
         for id in 0..self.buffers.nodes.len() as NodeId {
             let Node { observation, state, .. } = self.buffers.nodes.get(id);
-            self.buffers.nodes.estimate(id, self.projected.at(observation as usize).of(state));
+            self.buffers.nodes.estimate(id, self.projected.at(observation as usize).of(self.space.row(state)));
         }
         self.probe(1)
     }
@@ -237,9 +240,11 @@ impl Search<'_, '_> {
     /// Counts the expansion of a node that is about to be done. Says whether it may be.
     #[inline]
     fn spend(&mut self, id: NodeId) -> Result<End, Cancelled> {
-        let n_successors = self.problem.model.graph().successors(self.buffers.nodes.get(id).state).len();
+        let state = self.buffers.nodes.get(id).state;
+        self.space.explore(state);
+        let n_successors = self.space.successors(state).len();
         let is_spent =
-            self.n_expanded >= self.budget.max_expansions || self.buffers.nodes.len() >= self.budget.max_nodes;
+            self.n_expanded >= self.budget.max_expansions || self.budget.is_full(self.buffers.nodes.len(), self.space);
         match self.meter.spend(1 + 2 * n_successors as u64) {
             Signal::Cancel => Err(Cancelled),
             Signal::Continue if !is_spent => Ok(End::Done),
@@ -251,13 +256,13 @@ impl Search<'_, '_> {
     /// way.
     #[inline]
     fn expand(&mut self, id: NodeId, mut found: impl FnMut(&mut Buffers, NodeId)) {
-        let (problem, projected) = (self.problem, &*self.projected);
+        let (problem, projected, space) = (self.problem, &*self.projected, &*self.space);
         let actions = problem.model.actions();
         let node = self.buffers.nodes.get(id);
         let (g, observation) = (node.g(), node.observation);
         self.buffers.nodes.close(id);
         let layers = [observation + 1, observation].map(|i| (i, projected.at(i as usize)));
-        let successors = problem.model.graph().successors(node.state);
+        let successors = space.successors(node.state);
         self.n_expanded += 1;
         self.n_generated += 1 + 2 * successors.len() as u64;
         let skip = Transition { action: NO_ACTION, to: node.state };
@@ -270,7 +275,7 @@ impl Search<'_, '_> {
             };
             for (observation, estimates) in layers {
                 let arrival = Arrival { observation: *observation, state, cost: g + action_cost, parent: id, action };
-                let Some(id) = self.buffers.nodes.offer(arrival, estimates, self.limit) else { continue };
+                let Some(id) = self.buffers.nodes.offer(arrival, space, estimates, self.limit) else { continue };
                 if *observation as usize == problem.last() {
                     self.limit = self.buffers.nodes.get(id).g() * (1.0 - ROUNDING);
                     self.incumbent = Some(id);

@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use super::{Move, MoveKind, NO_ACTION};
 use crate::mapping::heuristic::projected::{Estimate, EstimatesAt};
-use crate::model::{ActionIdx, StateIdx};
+use crate::model::{ActionIdx, Space, StateIdx};
 
 /// Where a node is in [`Nodes`].
 pub(super) type NodeId = u32;
@@ -126,7 +126,13 @@ impl Nodes {
     /// Gives the node's id then.
     #[expect(clippy::inline_always, reason = "without it a search takes a fifth more instructions")]
     #[inline(always)]
-    pub(super) fn offer(&mut self, arrival: Arrival, estimates: &EstimatesAt<'_>, limit: f64) -> Option<NodeId> {
+    pub(super) fn offer(
+        &mut self,
+        arrival: Arrival,
+        space: &impl Space,
+        estimates: &EstimatesAt<'_>,
+        limit: f64,
+    ) -> Option<NodeId> {
         let Arrival { observation, state, cost, parent, action } = arrival;
         let mut place = self.place_of(observation, state);
         loop {
@@ -143,7 +149,7 @@ impl Nodes {
             }
             place = (place + 1) & self.mask();
         }
-        let estimate = estimates.of(state);
+        let estimate = estimates.of(space.row(state));
         if cost + estimate.distance + estimate.cost_to_go >= limit {
             return None;
         }
