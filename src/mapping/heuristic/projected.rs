@@ -94,8 +94,9 @@ const MAX_ENTRIES: usize = 1 << 24;
 /// these takes about as long.
 const MIN_EXPANSIONS: u64 = 1 << 16;
 
-/// How many expansions must have been done for each entry of a level's tables: an entry takes about as long as two.
-const EXPANSIONS_PER_ENTRY: u64 = 4;
+/// How many expansions must have been done for each entry of a level's tables. An entry takes about as long as two; attempts that
+/// fail should not take much of the search, and they are repeated whenever it has doubled.
+const EXPANSIONS_PER_ENTRY: u64 = 16;
 
 /// Most entries of the tables of a level: 256 MB with the room in hash tables.
 const MAX_JOINT_ENTRIES: usize = 1 << 22;
@@ -277,10 +278,9 @@ impl<'p> Projected<'p> {
     ///
     /// ```text
     /// F_0(start) = term(0, start)
-    /// F_i(v) = term(i, v) + min( F_{i-1}(v),                  skip
-    ///                            F_{i-1}(v') + share(v', v),  match
-    ///                            ... )
-    /// F_i(v) = min( F_i(v), F_i(v') + share_i(v', v) + rest(i, v) )  extra
+    /// F_i(v) = min( F_{i-1}(v) + term(i, v),                  skip
+    ///               F_{i-1}(v') + share(v', v) + term(i, v),  match
+    ///               F_i(v') + share_i(v', v) + rest(i, v) )   extra
     /// ```
     fn solve_forward(
         &self,
@@ -376,9 +376,9 @@ impl<'p> Projected<'p> {
     ///
     /// ```text
     /// H_n(v) = 0
-    /// H_i(v) = min( N_i(v),                              skip
-    ///               share(v, v') + N_i(v'),              match
-    ///               share_i(v, v') + rest(i, v') + H_i(v')  extra )
+    /// H_i(v) = min( N_i(v),                                  skip
+    ///               share(v, v') + N_i(v'),                  match
+    ///               share_i(v, v') + rest(i, v') + H_i(v') ) extra
     /// ```
     ///
     /// with `share_i` and `rest` as in [`super::projection`].

@@ -167,23 +167,20 @@ impl Projections {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<&[Group]>, Cancelled> {
         // Two searches that come at the same time may both do the work, with the same result.
-        let levels = match self.levels.get() {
-            Some(levels) => levels,
-            None => {
-                let partitions = grouping::choose(model, interrupt)?;
-                let levels = partitions.into_iter().map(|partition| Level { partition, groups: OnceLock::new() });
-                let levels = levels.collect();
-                self.levels.get_or_init(|| levels)
-            }
+        let levels = if let Some(levels) = self.levels.get() {
+            levels
+        } else {
+            let partitions = grouping::choose(model, interrupt)?;
+            let levels = partitions.into_iter().map(|partition| Level { partition, groups: OnceLock::new() });
+            let levels = levels.collect();
+            self.levels.get_or_init(|| levels)
         };
         let Some(level) = levels.get(level) else { return Ok(None) };
-        match level.groups.get() {
-            Some(groups) => Ok(Some(groups)),
-            None => {
-                let groups = self.joint_groups(model, &level.partition, MAX_EDGES, interrupt)?;
-                Ok(Some(level.groups.get_or_init(|| groups)))
-            }
+        if let Some(groups) = level.groups.get() {
+            return Ok(Some(groups));
         }
+        let groups = self.joint_groups(model, &level.partition, MAX_EDGES, interrupt)?;
+        Ok(Some(level.groups.get_or_init(|| groups)))
     }
 
     /// Projects `model` on the groups of `partition` that have several attributes.
