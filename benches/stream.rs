@@ -88,7 +88,7 @@ fn observe(world: &World, lookahead: Option<NonZeroU32>) -> Result<(), Failure> 
     let there = states.iter().map(read).collect::<Result<Vec<_>, _>>()?;
     // Back and forth, so that it never jumps.
     let period: Vec<_> = there.iter().chain(there.iter().rev()).collect();
-    let mut online = OnlineMapping::new(Arc::clone(&mapper), schema.weights(), None, lookahead);
+    let mut online = OnlineMapping::new(&mapper, schema.weights(), None, lookahead);
     let marks = [10, 100, 10_000];
     let half = 9;
     let mut windows: [Vec<Duration>; 3] = Default::default();
@@ -341,7 +341,7 @@ fn observations_per_second(mapper: &Arc<Mapper>, states: &[Value]) -> Result<f64
     let schema = mapper.model().schema();
     let read = |state| schema.read_observation(&Place::root(state), &mut Faults::default()).ok_or("faults");
     let observations = states.iter().map(read).collect::<Result<Vec<_>, _>>()?;
-    let mut online = OnlineMapping::new(Arc::clone(mapper), schema.weights(), None, NonZeroU32::new(8));
+    let mut online = OnlineMapping::new(mapper, schema.weights(), None, NonZeroU32::new(8));
     let started = Instant::now();
     let mut n_mapped = 0_u32;
     for observation in observations.iter().cycle() {

@@ -28,7 +28,7 @@ fn follow(
     let weights = schema.read_weights(&Place::root(weights), &mut faults).unwrap();
     let start = start.map(|state| state as u32);
     let lookahead = lookahead.and_then(NonZeroU32::new);
-    let mut online = OnlineMapping::new(Arc::clone(mapper), weights, start, lookahead);
+    let mut online = OnlineMapping::new(mapper, weights, start, lookahead);
     let mut committed = Vec::new();
     for observation in demonstration.as_array().unwrap() {
         let observation = schema.read_observation(&Place::root(observation), &mut faults).unwrap();
@@ -146,7 +146,7 @@ fn without_a_lookahead_proven_steps_come_early_and_memory_stays_flat() {
     let n = 12;
     let mapper = Arc::new(mapper(&corridor(n)));
     let schema = mapper.model().schema().clone();
-    let mut online = OnlineMapping::new(Arc::clone(&mapper), schema.weights(), None, None);
+    let mut online = OnlineMapping::new(&mapper, schema.weights(), None, None);
     let mut most_nodes = 0;
     let mut longest_wait = 0;
     for i in 0..5000_u32 {

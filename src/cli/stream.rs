@@ -87,7 +87,7 @@ impl Stream {
         let (weights, start) = faults.check(opening).map_err(|faults| CliError::Faults { what, faults })?;
 
         printer.weights = Some(schema.by_attribute(weights.as_slice().iter().copied()));
-        let mut online = OnlineMapping::new(Arc::clone(&mapper), weights, start, self.lookahead.0);
+        let mut online = OnlineMapping::new(&mapper, weights, start, self.lookahead.0);
         let mut actions = Vec::new();
         let mut print = |printer: &mut Printer<'_, _>, steps: &[crate::mapping::CommittedStep]| {
             for step in steps {

@@ -32,8 +32,8 @@ struct ActiveAttribute<'m> {
     table: Vec<f64>,
 }
 
-/// Most entries of all tables together: 64 MB.
-const MAX_TABLE_ENTRIES: usize = 1 << 23;
+/// Most entries of all tables together: 2 MB, which take a millisecond to fill. Values of larger domains are compared one by one.
+const MAX_TABLE_ENTRIES: usize = 1 << 18;
 
 impl<'m> Distances<'m> {
     pub(crate) fn new(

@@ -1,21 +1,21 @@
 //! A model prepared for mapping.
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use super::Problem;
 use super::completion::{Allowance, Extras, complete};
 use super::cost::{Cost, cost_of};
 use super::heuristic::paper::Paper;
-use super::heuristic::projected::Projected;
+use super::heuristic::projected::{MAX_ENTRIES, Projected};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
 use super::search::best_first::{self, Buffers};
 use super::search::{Found, Move, astar};
-use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
+use super::{OnlineMapping, Problem};
+use crate::interrupt::{Cancelled, Interrupt, Signal, Uninterrupted};
 use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
 
 /// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
@@ -111,7 +111,7 @@ pub struct Mapping {
 /// A model, and what is computed once per model to search it.
 #[derive(Debug)]
 pub struct Mapper {
-    model: Model,
+    model: Arc<Model>,
     projections: Projections,
     /// Of searches that have ended, for those that come: at most as many as ran at the same time.
     buffers: Mutex<Vec<Buffers>>,
@@ -125,13 +125,17 @@ impl Mapper {
     /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
     pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
         let projections = Projections::new(&model, interrupt)?;
-        Ok(Self { model, projections, buffers: Mutex::default() })
+        Ok(Self { model: Arc::new(model), projections, buffers: Mutex::default() })
     }
 
     /// The model.
     #[must_use]
     pub fn model(&self) -> &Model {
         &self.model
+    }
+
+    pub(super) fn shared_model(&self) -> Arc<Model> {
+        Arc::clone(&self.model)
     }
 
     /// Approximate size in memory, in bytes.
@@ -150,7 +154,9 @@ impl Mapper {
     pub fn lower_bounds<'p>(&'p self, problem: &'p Problem<'p>) -> impl Fn(u32, StateIdx) -> f64 + 'p {
         self.check(problem);
         let projected =
-            Projected::solve(&self.projections, problem, Grouping::WhenItPays, &mut Uninterrupted).ok().flatten();
+            Projected::solve(&self.projections, problem, Grouping::WhenItPays, MAX_ENTRIES, &mut Uninterrupted)
+                .ok()
+                .flatten();
         let projected = projected.expect("nothing interrupts");
         move |observation, state| projected.cost_to_go(observation as usize, self.model.states().row(state))
     }
@@ -192,15 +198,7 @@ impl Mapper {
         // Sums in another order may be a little larger; a little room costs nothing.
         let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
         match settings.heuristic {
-            HeuristicName::Default => {
-                let projected = Projected::solve(&self.projections, problem, settings.grouping, interrupt)?;
-                if let Some(mut projected) = projected {
-                    return self.best_first(space, problem, &mut projected, budget, most_f, interrupt);
-                }
-                // No time for the estimate, so none for a search either.
-                let budget = Budget { max_expansions: 0, ..budget };
-                self.best_first(space, problem, &mut Projected::blind(problem), budget, most_f, interrupt)
-            }
+            HeuristicName::Default => self.best_first(space, problem, settings, most_f, interrupt),
             HeuristicName::None => {
                 let found = astar::search(problem, space, &Blind, budget, most_f, interrupt)?;
                 conclude(problem, space, &Blind, found, interrupt)
@@ -209,7 +207,7 @@ impl Mapper {
                 let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, space.row(problem.start));
-                match Projected::solve(&self.projections, problem, settings.grouping, interrupt)? {
+                match Projected::solve(&self.projections, problem, settings.grouping, MAX_ENTRIES, interrupt)? {
                     Some(projected) => {
                         let least_f = first + projected.cost_to_go(0, space.row(problem.start));
                         conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
@@ -221,27 +219,107 @@ impl Mapper {
     }
 
     fn check(&self, problem: &Problem<'_>) {
-        assert!(std::ptr::eq(problem.model, &raw const self.model), "the problem must be of this mapper's model");
+        assert!(std::ptr::eq(problem.model, &raw const *self.model), "the problem must be of this mapper's model");
     }
 
+    /// Searches best first, with more help the longer it takes: at first with tables of projections only where they are small,
+    /// then with all of them; and where it has still looked at a good part of all nodes, what is left is to look at all of them,
+    /// layer by layer, which takes a fraction of the time for each.
     fn best_first<S: Space>(
         &self,
         space: &mut S,
         problem: &Problem<'_>,
-        projected: &mut Projected<'_>,
-        budget: Budget,
+        settings: Settings,
         most_f: f64,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
-        let kept = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        let mut buffers = kept.unwrap_or_default();
-        let found = best_first::search(problem, space, projected, budget, most_f, &mut buffers, interrupt)?;
-        if buffers.are_small() {
-            self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
+        let Settings { budget, grouping, .. } = settings;
+        let n_nodes =
+            space.n_states().map_or(u64::MAX, |n| (n as u64).saturating_mul(problem.demonstration.len() as u64));
+        let may_sweep = space.n_states().is_some_and(|n_states| n_states <= MAX_SWEPT_STATES)
+            && n_nodes.saturating_mul(2) <= budget.max_expansions;
+        let (mut n_expanded, mut n_generated) = (0, 0);
+        let few_entries = FEW_ENTRIES.max(problem.demonstration.len() * FEW_ENTRIES_PER_OBSERVATION).min(MAX_ENTRIES);
+        for max_entries in [few_entries, MAX_ENTRIES] {
+            let solved = Projected::solve(&self.projections, problem, grouping, max_entries, interrupt)?;
+            // No time for the estimate, so none for a search either.
+            let max_expansions = if solved.is_some() { budget.max_expansions - n_expanded } else { 0 };
+            let mut projected = solved.unwrap_or_else(|| Projected::blind(problem));
+            // What would be done instead, should it take that long.
+            let n_untabled = if max_entries < MAX_ENTRIES { projected.n_left_out() } else { 0 };
+            let enough = match n_untabled {
+                0 if may_sweep => MIN_EXPANSIONS_BEFORE_SWEEP.max(n_nodes / NODES_PER_EXPANSION),
+                0 => u64::MAX,
+                n_untabled => n_untabled / ENTRIES_PER_EXPANSION,
+            };
+            let capped = Budget { max_expansions: max_expansions.min(enough), ..budget };
+            let mut buffers = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
+            let mut found =
+                best_first::search(problem, space, &mut projected, capped, most_f, &mut buffers, interrupt)?;
+            if buffers.are_small() {
+                self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
+            }
+            let is_capped = !found.is_complete && found.n_expanded >= capped.max_expansions;
+            n_expanded += found.n_expanded;
+            n_generated += found.n_generated;
+            (found.n_expanded, found.n_generated) = (n_expanded, n_generated);
+            if is_capped && n_untabled > 0 {
+                continue;
+            }
+            if is_capped
+                && enough < max_expansions
+                && let Some(swept) = self.sweep(problem, &found, budget, interrupt)?
+            {
+                return Ok(swept);
+            }
+            return conclude(problem, space, &projected, found, interrupt);
         }
-        conclude(problem, space, projected, found, interrupt)
+        unreachable!("the last search is the last")
+    }
+
+    /// The cheapest mapping, from the cheapest ways to all states at each observation after the other. `None` if `interrupt` said
+    /// to finish first, or the ways take more memory than `budget` allows.
+    fn sweep(
+        &self,
+        problem: &Problem<'_>,
+        found: &Found,
+        budget: Budget,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<Mapping>, Cancelled> {
+        let mut online = OnlineMapping::new(self, problem.weights.clone(), Some(problem.start), None);
+        for observation in problem.demonstration.iter() {
+            match interrupt.poll() {
+                Signal::Continue if online.n_nodes() <= budget.max_nodes => online.observe(observation, interrupt)?,
+                Signal::Continue | Signal::Finish => return Ok(None),
+                Signal::Cancel => return Err(Cancelled),
+            };
+        }
+        let swept = online.end().map(|(_, mapping)| Mapping {
+            n_expanded: found.n_expanded + mapping.n_expanded,
+            n_generated: found.n_generated + mapping.n_generated,
+            ..mapping
+        });
+        Ok(swept)
     }
 }
+
+/// Most entries of the tables of a search's first attempt: they take half a millisecond,
+const FEW_ENTRIES: usize = 1 << 16;
+
+/// or two microseconds per observation if that is more, which is no more than the search is bound to take.
+const FEW_ENTRIES_PER_OBSERVATION: usize = 1 << 8;
+
+/// How many entries of a table take as long as an expansion.
+const ENTRIES_PER_EXPANSION: u64 = 16;
+
+/// Most states of a model whose layers are swept: a layer takes tens of milliseconds then, between two looks at the interrupt.
+const MAX_SWEPT_STATES: usize = 1 << 20;
+
+/// Nodes of fewer expansions are in the caches, where an expansion takes less time.
+const MIN_EXPANSIONS_BEFORE_SWEEP: u64 = 1 << 16;
+
+/// How many nodes a sweep looks at in about the time of an expansion, where there are many.
+const NODES_PER_EXPANSION: u64 = 16;
 
 /// Numbers the states of `moves` anew, in the order in which they are first passed. Gives their former numbers, by the new ones.
 fn renumber(moves: &mut [Move]) -> Vec<StateIdx> {
@@ -295,4 +373,78 @@ fn conclude<S: Space, H: Heuristic>(
         n_generated,
         states: None,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+    use crate::document::{Faults, Place};
+    use crate::mapping::Request;
+    use crate::model::{Definition, Limits};
+
+    /// A belt of places with a dial of ten at each, and a demonstration that turns it in a way that the body cannot.
+    fn belt(n_places: usize, n_observations: usize) -> (Mapper, Value) {
+        let states: Value = (0..n_places * 10).map(|state| json!([state / 10, state % 10])).collect();
+        let transitions = (0..n_places * 10).flat_map(|state| {
+            let (place, dial) = (state / 10, state % 10);
+            let on = (place + 1 < n_places).then(|| json!([state, "on", state + 10]));
+            let back = (place > 0).then(|| json!([state, "back", state - 10]));
+            on.into_iter().chain(back).chain([json!([state, "turn", place * 10 + (dial + 3) % 10])])
+        });
+        let model = json!({
+            "attributes": [{"name": "place", "kind": "number"}, {"name": "dial", "kind": "cyclic", "period": 10}],
+            "actions": [{"name": "on", "cost": 0.3}, {"name": "back", "cost": 0.3}, {"name": "turn", "cost": 0.3}],
+            "dynamics": {"kind": "table", "start": 0, "states": states, "transitions": transitions.collect::<Value>()},
+        });
+        let definition = Definition::read(&model, Limits::NONE, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::NONE, &mut Uninterrupted).unwrap();
+        let seen = (0..n_observations).map(|i| json!({"place": i % n_places, "dial": i * 2 % 10}));
+        (
+            Mapper::new(model, &mut Uninterrupted).unwrap(),
+            json!({"model": "belt", "demonstration": seen.collect::<Value>()}),
+        )
+    }
+
+    fn read<'m>(mapper: &'m Mapper, request: &Value) -> Request<'m> {
+        let mut faults = Faults::default();
+        let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+        Request::read(mapper.model(), &object, &mut faults).unwrap()
+    }
+
+    #[test]
+    fn tables_left_out_at_first_and_sweeps_come_to_the_same_cost_as_a_search_without_heuristic() {
+        // The places' table is too large for a first attempt, which is not enough.
+        let (mapper, request) = belt(3_000, 30);
+        let request = read(&mapper, &request);
+        let few = Projected::solve(
+            &mapper.projections,
+            &request.problem,
+            Grouping::WhenItPays,
+            FEW_ENTRIES,
+            &mut Uninterrupted,
+        );
+        assert!(few.unwrap().unwrap().n_left_out() >= 90_000);
+        let map = |heuristic| {
+            let settings = Settings { heuristic, ..Settings::default() };
+            mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap()
+        };
+        let (by_default, without) = (map(HeuristicName::Default), map(HeuristicName::None));
+        assert_eq!((by_default.cost.total, by_default.status), (without.cost.total, Status::Optimal));
+
+        let (mapper, request) = belt(6, 40);
+        let request = read(&mapper, &request);
+        let found = || Found { paths: Vec::new(), is_complete: false, least_f: 0.0, n_expanded: 7, n_generated: 9 };
+        let sweep =
+            |interrupt: &mut dyn Interrupt| mapper.sweep(&request.problem, &found(), Budget::DEFAULT, interrupt);
+        let swept = sweep(&mut Uninterrupted).unwrap().unwrap();
+        let settings = Settings { heuristic: HeuristicName::None, ..Settings::default() };
+        let without = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+        assert_eq!((swept.cost.total, swept.status), (without.cost.total, Status::Optimal));
+        assert_eq!(swept.lower_bound, Some(swept.cost.total));
+        assert_eq!(swept.n_expanded, 7 + 60 * 40);
+        assert_eq!(sweep(&mut || Signal::Finish), Ok(None));
+        assert_eq!(sweep(&mut || Signal::Cancel), Err(Cancelled));
+    }
 }

@@ -103,7 +103,7 @@ impl<'m> Request<'m> {
             return mapper.map(problem, self.settings, interrupt);
         }
         let weights = problem.weights.clone();
-        let mut online = OnlineMapping::new(Arc::clone(mapper), weights, Some(problem.start), self.lookahead);
+        let mut online = OnlineMapping::new(mapper, weights, Some(problem.start), self.lookahead);
         for observation in problem.demonstration.iter() {
             online.observe(observation, interrupt)?;
         }

@@ -183,7 +183,7 @@ impl Etude {
             let name = source.learner.unwrap_or_default();
             return Err(ServiceError::Unknown { kind: "learner", name, pointer: Some("/learner") }.into());
         }
-        let online = OnlineMapping::new(Arc::clone(&mapper), weights.clone(), start, lookahead);
+        let online = OnlineMapping::new(&mapper, weights.clone(), start, lookahead);
         let online = Some(online);
         Ok(Session {
             id,
@@ -232,7 +232,7 @@ impl Etude {
             source: Source { learner: row.learner, weights_version: row.weights_version, trial_id: row.trial_id },
             n_received: row.n_observations,
             n_steps: 0,
-            online: Some(OnlineMapping::new(Arc::clone(&mapper), weights, row.start, lookahead)),
+            online: Some(OnlineMapping::new(&mapper, weights, row.start, lookahead)),
             mapper,
             ownership,
         };

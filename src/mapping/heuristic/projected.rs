@@ -32,6 +32,8 @@ pub(crate) struct Projected<'p> {
     entries: Vec<Estimate>,
     /// Positions of attributes that take part in the distance but are in no table.
     untabled: Vec<usize>,
+    /// Entries of tables that were left out.
+    n_left_out: u64,
     /// The least distance at each observation, of whatever state: the sum of the least terms. Shape `[n_observations]`.
     least_distances: Vec<f64>,
     /// The least term of each column. Shape `[n_observations, n_columns]`.
@@ -88,7 +90,7 @@ pub(in crate::mapping) enum Deepened {
 
 /// Most entries of all tables together: 256 MB. Groups that do not fit, the largest, are left out, which keeps the bound a
 /// bound.
-const MAX_ENTRIES: usize = 1 << 24;
+pub(in crate::mapping) const MAX_ENTRIES: usize = 1 << 24;
 
 /// Groups of several attributes are projected after this many expansions, and after as many as the model has transitions: looking at
 /// these takes about as long.
@@ -114,12 +116,13 @@ impl<'p> Projected<'p> {
         projections: &'p Projections,
         problem: &'p Problem<'p>,
         grouping: Grouping,
+        max_entries: usize,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
         /// How many classes are looked at between two looks at the interrupt: about a millisecond.
         const POLL_EVERY: u64 = 1 << 14;
-        let used = used_groups(projections, problem, MAX_ENTRIES);
-        let mut projected = Self::blind(problem);
+        let (used, n_left_out) = used_groups(projections, problem, max_entries);
+        let mut projected = Self { n_left_out, ..Self::blind(problem) };
         for (group, _) in projections.groups().iter().zip(&used).filter(|(_, is_used)| **is_used) {
             let Some(position) = group.positions().next() else { continue };
             projected.columns.push(Column { group, position, offset: projected.width });
@@ -168,6 +171,7 @@ impl<'p> Projected<'p> {
             least_terms: Vec::new(),
             joint: Vec::new(),
             deepening: None,
+            n_left_out: 0,
         }
     }
 
@@ -341,6 +345,11 @@ impl<'p> Projected<'p> {
         Ok(Forward { costs, optima })
     }
 
+    /// How many entries the tables would have that were left out, because only few were asked for.
+    pub(in crate::mapping) fn n_left_out(&self) -> u64 {
+        self.n_left_out
+    }
+
     /// What the nodes at one observation cost.
     #[inline]
     pub(in crate::mapping) fn at(&self, observation: usize) -> EstimatesAt<'_> {
@@ -488,8 +497,9 @@ impl Heuristic for Projected<'_> {
     }
 }
 
-/// Which groups have tables, the smallest first as far as `max_entries` go.
-fn used_groups(projections: &Projections, problem: &Problem<'_>, max_entries: usize) -> Vec<bool> {
+/// Which groups have tables, the smallest first as far as `max_entries` go; and how many entries the others would have, as far
+/// as all together go.
+fn used_groups(projections: &Projections, problem: &Problem<'_>, max_entries: usize) -> (Vec<bool>, u64) {
     let groups = projections.groups();
     // A group whose attributes weigh nothing would take its share of the actions' costs to no purpose.
     let mut wanted: Vec<usize> = (0..groups.len())
@@ -499,14 +509,18 @@ fn used_groups(projections: &Projections, problem: &Problem<'_>, max_entries: us
         .collect();
     wanted.sort_by_key(|number| groups[*number].n_classes());
     let mut used = vec![false; groups.len()];
-    let mut n_left = max_entries;
+    let mut n_entries = 0_usize;
+    let mut n_left_out = 0;
     for number in wanted {
-        let n_entries = problem.demonstration.len().saturating_mul(groups[number].n_classes());
-        let Some(left) = n_left.checked_sub(n_entries) else { break };
-        n_left = left;
-        used[number] = true;
+        let of_group = problem.demonstration.len().saturating_mul(groups[number].n_classes());
+        n_entries = n_entries.saturating_add(of_group);
+        match n_entries {
+            n if n <= max_entries => used[number] = true,
+            n if n <= MAX_ENTRIES => n_left_out += of_group as u64,
+            _ => break,
+        }
     }
-    used
+    (used, n_left_out)
 }
 
 /// How the costs of actions are divided, as one group sees it.
@@ -741,7 +755,7 @@ mod tests {
             let limit = optimum * (1.0 + room) + 1e-6;
             let close = 1e-9 * (1.0 + optimum);
 
-            let solved = Projected::solve(&projections, &problem, Grouping::Widest, &mut Uninterrupted).unwrap();
+            let solved = Projected::solve(&projections, &problem, Grouping::Widest, MAX_ENTRIES, &mut Uninterrupted).unwrap();
             let mut projected = solved.unwrap();
             let mut alone: Vec<f64> = Vec::new();
             for is_deep in [false, true] {

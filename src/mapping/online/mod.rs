@@ -57,7 +57,7 @@ use super::problem::choose_start;
 use super::{Mapper, Mapping, Move, MoveKind, Status};
 use crate::attribute::{Value, Weights};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
-use crate::model::StateIdx;
+use crate::model::{Model, StateIdx};
 use layer::{Layer, Sweep};
 use repair::{Predecessors, Repair, Repaired};
 use window::{Place, Window};
@@ -77,7 +77,7 @@ pub struct CommittedStep {
 /// A mapping in the making.
 #[derive(Debug)]
 pub struct OnlineMapping {
-    mapper: Arc<Mapper>,
+    model: Arc<Model>,
     weights: Weights,
     start: Option<StateIdx>,
     lookahead: Option<NonZeroU32>,
@@ -110,15 +110,15 @@ impl OnlineMapping {
     ///
     /// If the model is searched lazily: each layer looks at all states.
     #[must_use]
-    pub fn new(mapper: Arc<Mapper>, weights: Weights, start: Option<StateIdx>, lookahead: Option<NonZeroU32>) -> Self {
-        assert!(!mapper.model().is_lazy(), "each layer needs all states");
-        let model = mapper.model();
+    pub fn new(mapper: &Mapper, weights: Weights, start: Option<StateIdx>, lookahead: Option<NonZeroU32>) -> Self {
+        let model = mapper.shared_model();
+        assert!(!model.is_lazy(), "each layer needs all states");
         let n_layers = lookahead.map_or(u64::MAX, |lookahead| 1 + u64::from(lookahead.get()));
         let keeps = n_layers.saturating_mul(u64::from(model.states().len())) <= MAX_KEPT;
-        let sweep = Sweep::new(model);
+        let sweep = Sweep::new(&model);
         let window = Window::new(model.states().len(), keeps);
         Self {
-            mapper,
+            model,
             weights,
             start,
             lookahead,
@@ -164,8 +164,7 @@ impl OnlineMapping {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Vec<CommittedStep>, Cancelled> {
         let mut committed = Vec::new();
-        let mapper = Arc::clone(&self.mapper);
-        let model = mapper.model();
+        let model = &*Arc::clone(&self.model);
         let observed = ObservedDistances::new(model.schema(), model.states(), observation, &self.weights);
         self.n_observed += 1;
         if self.n_observed == 1 {
@@ -197,7 +196,7 @@ impl OnlineMapping {
         let status = if self.was_forced { Status::Local } else { Status::Optimal };
         let lower_bound = (status == Status::Optimal).then_some(self.cost.total);
         // Each observation looks at every state once.
-        let graph = self.mapper.model().graph();
+        let graph = self.model.graph();
         let n_expanded = u64::from(self.n_observed) * graph.n_states() as u64;
         let n_generated = u64::from(self.n_observed) * graph.n_transitions() as u64;
         let mapping =
@@ -213,7 +212,7 @@ impl OnlineMapping {
 
     /// Commits every step that all survivors share.
     fn commit_shared(&mut self, committed: &mut Vec<CommittedStep>) {
-        while let Some(child) = self.window.only_child(self.mapper.model()) {
+        while let Some(child) = self.window.only_child(&self.model) {
             committed.push(self.commit_at(child, true));
             self.window.advance(child);
         }
@@ -234,12 +233,12 @@ impl OnlineMapping {
     }
 
     fn commit_at(&mut self, place: Place, is_proven: bool) -> CommittedStep {
-        let step = self.window.step(self.mapper.model(), place);
+        let step = self.window.step(&self.model, place);
         self.commit(step, is_proven)
     }
 
     fn commit(&mut self, step: Move, is_proven: bool) -> CommittedStep {
-        let model = self.mapper.model();
+        let model = &self.model;
         let mut writer = self.writer;
         let layer = &self.window.layers[(step.observation - self.window.first) as usize];
         if step.kind != MoveKind::Start {
@@ -257,8 +256,7 @@ impl OnlineMapping {
 
     /// Gives survivors that have lost their way the cheapest one that is left.
     fn restore(&mut self, interrupt: &mut dyn Interrupt) -> Result<(), Cancelled> {
-        let mapper = Arc::clone(&self.mapper);
-        let model = mapper.model();
+        let model = &*Arc::clone(&self.model);
         let n_survivors = self.window.layers.back().map_or(0, Layer::n_alive);
         if self.window.keeps() {
             let predecessors = self.predecessors.get_or_insert_with(|| Predecessors::new(model.graph()));
@@ -289,7 +287,7 @@ impl OnlineMapping {
 
     fn begin(&mut self, root: StateIdx, cost: f64, observed: ObservedDistances) {
         let spare = self.window.spare();
-        let layer = self.sweep.begin(self.mapper.model(), (root, cost), &self.window.reached, observed, spare);
+        let layer = self.sweep.begin(&self.model, (root, cost), &self.window.reached, observed, spare);
         self.window.root = root;
         self.window.layers.push_back(layer);
         self.window.shrink();
@@ -303,7 +301,7 @@ impl OnlineMapping {
         }
         let spare = self.window.spare();
         let before = self.window.layers.back().expect("the first observation's layer begins a window");
-        Ok(self.sweep.follow(self.mapper.model(), &before.costs, &self.window.reached, observed, spare))
+        Ok(self.sweep.follow(&self.model, &before.costs, &self.window.reached, observed, spare))
     }
 }
 
@@ -348,7 +346,7 @@ mod tests {
         ) {
             let mapper = mapper(&places, &transitions);
             let weights = mapper.model().schema().weights();
-            let new = || OnlineMapping::new(Arc::clone(&mapper), weights.clone(), None, NonZeroU32::new(lookahead));
+            let new = || OnlineMapping::new(&mapper, weights.clone(), None, NonZeroU32::new(lookahead));
             let mut repaired = OnlineMapping { sweeps_from: 0, ..new() };
             let mut swept = OnlineMapping { sweeps_from: usize::MAX, ..new() };
             // A window that is not kept is always swept.
