@@ -238,13 +238,17 @@ impl Mapper {
             space.n_states().map_or(u64::MAX, |n| (n as u64).saturating_mul(problem.demonstration.len() as u64));
         let may_sweep = space.n_states().is_some_and(|n_states| n_states <= MAX_SWEPT_STATES)
             && n_nodes.saturating_mul(2) <= budget.max_expansions;
-        let (mut n_expanded, mut n_generated) = (0, 0);
-        let few_entries = FEW_ENTRIES.max(problem.demonstration.len() * FEW_ENTRIES_PER_OBSERVATION).min(MAX_ENTRIES);
-        for max_entries in [few_entries, MAX_ENTRIES] {
+        let n_observations = problem.demonstration.len();
+        // Where there are not even expansions enough to look at every observation, much depends on good estimates.
+        let is_small_budget = budget.max_expansions < n_observations as u64;
+        let few_entries = FEW_ENTRIES.max(n_observations * FEW_ENTRIES_PER_OBSERVATION).min(MAX_ENTRIES);
+        let mut before: Option<(Projected<'_>, Found)> = None;
+        for max_entries in [if is_small_budget { MAX_ENTRIES } else { few_entries }, MAX_ENTRIES] {
             let solved = Projected::solve(&self.projections, problem, grouping, max_entries, interrupt)?;
-            // No time for the estimate, so none for a search either.
-            let max_expansions = if solved.is_some() { budget.max_expansions - n_expanded } else { 0 };
-            let mut projected = solved.unwrap_or_else(|| Projected::blind(problem));
+            // No time for estimates, so none for a search with them.
+            let Some(mut projected) = solved else { break };
+            let n_before = before.as_ref().map_or(0, |(_, found)| found.n_expanded);
+            let max_expansions = budget.max_expansions - n_before;
             // What would be done instead, should it take that long.
             let n_untabled = if max_entries < MAX_ENTRIES { projected.n_left_out() } else { 0 };
             let enough = match n_untabled {
@@ -253,28 +257,48 @@ impl Mapper {
                 n_untabled => n_untabled / ENTRIES_PER_EXPANSION,
             };
             let capped = Budget { max_expansions: max_expansions.min(enough), ..budget };
-            let mut buffers = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop().unwrap_or_default();
-            let mut found =
-                best_first::search(problem, space, &mut projected, capped, most_f, &mut buffers, interrupt)?;
-            if buffers.are_small() {
-                self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
+            let mut found = self.search(space, problem, &mut projected, capped, most_f, interrupt)?;
+            let is_enough = !found.is_complete && enough < max_expansions && found.n_expanded >= enough;
+            if let Some((_, before)) = before.take() {
+                found.n_expanded += before.n_expanded;
+                found.n_generated += before.n_generated;
+                found.least_f = found.least_f.max(before.least_f);
+                found.paths.extend(before.paths);
             }
-            let is_capped = !found.is_complete && found.n_expanded >= capped.max_expansions;
-            n_expanded += found.n_expanded;
-            n_generated += found.n_generated;
-            (found.n_expanded, found.n_generated) = (n_expanded, n_generated);
-            if is_capped && n_untabled > 0 {
+            if is_enough && n_untabled > 0 {
+                before = Some((projected, found));
                 continue;
             }
-            if is_capped
-                && enough < max_expansions
-                && let Some(swept) = self.sweep(problem, &found, budget, interrupt)?
-            {
+            if is_enough && let Some(swept) = self.sweep(problem, &found, budget, interrupt)? {
                 return Ok(swept);
             }
             return conclude(problem, space, &projected, found, interrupt);
         }
-        unreachable!("the last search is the last")
+        if let Some((projected, found)) = before {
+            return conclude(problem, space, &projected, found, interrupt);
+        }
+        let mut blind = Projected::blind(problem);
+        let budget = Budget { max_expansions: 0, ..budget };
+        let found = self.search(space, problem, &mut blind, budget, most_f, interrupt)?;
+        conclude(problem, space, &blind, found, interrupt)
+    }
+
+    fn search<S: Space>(
+        &self,
+        space: &mut S,
+        problem: &Problem<'_>,
+        projected: &mut Projected<'_>,
+        budget: Budget,
+        most_f: f64,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Found, Cancelled> {
+        let kept = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let mut buffers = kept.unwrap_or_default();
+        let found = best_first::search(problem, space, projected, budget, most_f, &mut buffers, interrupt)?;
+        if buffers.are_small() {
+            self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
+        }
+        Ok(found)
     }
 
     /// The cheapest mapping, from the cheapest ways to all states at each observation after the other. `None` if `interrupt` said
@@ -432,6 +456,24 @@ mod tests {
         };
         let (by_default, without) = (map(HeuristicName::Default), map(HeuristicName::None));
         assert_eq!((by_default.cost.total, by_default.status), (without.cost.total, Status::Optimal));
+
+        // Cut short between the two attempts, it keeps what the first one found.
+        let optimum = without.cost.total;
+        for n_polls in 1..60 {
+            let mut n_left = n_polls;
+            let mut interrupt = || {
+                n_left -= i32::from(n_left > 0);
+                if n_left > 0 { Signal::Continue } else { Signal::Finish }
+            };
+            let mapping = mapper.map(&request.problem, Settings::default(), &mut interrupt).unwrap();
+            let lower_bound = mapping.lower_bound.unwrap();
+            assert!(lower_bound <= optimum + 1e-9 && optimum <= mapping.cost.total + 1e-9, "after {n_polls} polls");
+        }
+        for max_expansions in [0, 10, 1_000, 6_000, 10_000] {
+            let settings = Settings { budget: Budget { max_expansions, ..Budget::DEFAULT }, ..Settings::default() };
+            let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+            assert!(mapping.n_expanded <= max_expansions && mapping.lower_bound.unwrap() <= optimum + 1e-9);
+        }
 
         let (mapper, request) = belt(6, 40);
         let request = read(&mapper, &request);
