@@ -2,7 +2,7 @@
 //!
 //! A [`Definition`] is what a client registers: attributes, actions with costs, and dynamics of one of the
 //! kinds below. It is compiled into a [`Model`], whose [`Graph`] is the same whatever the source, and which searches
-//! run on. A wumpus world of too many states is left unexplored: a search then finds those that it comes to ([`Space`]).
+//! run on. A wumpus world of too many states is left unexplored: a search then finds those that it comes to (`Space`).
 //!
 //! ```text
 //! JSON --Definition::parse--> Definition { Table | Cave } --Model::compile--> Model { schema, actions, states, graph, start }
