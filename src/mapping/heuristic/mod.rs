@@ -7,6 +7,7 @@
 //! | `paper` | no | no | differences and least action cost ([`paper`]) |
 
 mod bounded;
+mod edges;
 mod grouping;
 pub(super) mod paper;
 pub(super) mod projected;

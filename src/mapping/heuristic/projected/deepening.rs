@@ -1,0 +1,250 @@
+//! Better estimates for a search that takes long: tables of groups of several attributes.
+
+use std::collections::BinaryHeap;
+
+use super::shares::{Parts, Way, Ways};
+use super::{Column, Projected};
+use crate::interrupt::{Cancelled, Meter, Signal};
+use crate::mapping::Problem;
+use crate::mapping::heuristic::Grouping;
+use crate::mapping::heuristic::bounded::{Basis, Bounded, Unsolved};
+use crate::mapping::heuristic::projection::Projections;
+use crate::mapping::open_list::CheapestFirst;
+
+/// What is known for making tables of groups of several attributes.
+#[derive(Debug)]
+pub(super) struct Deepening<'p> {
+    projections: &'p Projections,
+    /// By group of a single attribute: whether it has a table.
+    used: Vec<bool>,
+    /// The next level of groups.
+    level: usize,
+    /// After how many expansions it is worth a try.
+    due: u64,
+    grouping: Grouping,
+    forward: Option<Forward>,
+}
+
+impl<'p> Deepening<'p> {
+    /// Nothing is made yet. `used` tells which groups of a single attribute have tables.
+    pub(super) fn new(
+        projections: &'p Projections,
+        problem: &Problem<'_>,
+        used: Vec<bool>,
+        grouping: Grouping,
+    ) -> Self {
+        let due = match grouping {
+            // Groups are chosen by looking at states and transitions.
+            _ if problem.model.is_lazy() => u64::MAX,
+            Grouping::Widest => 0,
+            Grouping::WhenItPays => MIN_EXPANSIONS.max(problem.model.graph().n_transitions() as u64),
+        };
+        Self { projections, used, level: 0, due, grouping, forward: None }
+    }
+}
+
+/// Costs from the start.
+#[derive(Debug)]
+struct Forward {
+    /// By observation and class, with the distance. Shape `[n_observations, width]`.
+    costs: Vec<f64>,
+    /// By column: what it costs in all.
+    optima: Vec<f64>,
+}
+
+/// What came of an attempt to make the estimates better.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::mapping) enum Deepened {
+    /// Estimates have changed: they are higher, and infinite where nothing is worth finding.
+    Yes,
+    /// Nothing has changed.
+    No,
+    /// The interrupt said to finish; nothing has changed.
+    CutShort,
+}
+
+/// Groups of several attributes are projected after this many expansions, and after as many as the model has transitions: looking at
+/// these takes about as long.
+const MIN_EXPANSIONS: u64 = 1 << 16;
+
+/// How many expansions must have been done for each entry of a level's tables. An entry takes about as long as two; attempts that
+/// fail should not take much of the search, and they are repeated whenever it has doubled.
+const EXPANSIONS_PER_ENTRY: u64 = 16;
+
+/// Most entries of the tables of a level: 256 MB with the room in hash tables.
+const MAX_JOINT_ENTRIES: usize = 1 << 22;
+
+/// How much more than the limit a mapping may cost before its classes are dropped, relatively: more than sums differ by rounding.
+const SLACK: f64 = 1e-9;
+
+impl<'p> Projected<'p> {
+    /// After how many expansions better estimates are worth a try.
+    pub(in crate::mapping) fn deepening_due(&self) -> u64 {
+        self.deepening.as_ref().map_or(u64::MAX, |deepening| deepening.due)
+    }
+
+    /// Makes the estimates better for those nodes that may be on a mapping cheaper than `limit`, and infinite for others, if
+    /// that is not much more work than the `n_expanded` expansions that were done.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if the interrupt of `meter` said so.
+    pub(in crate::mapping) fn deepen(
+        &mut self,
+        limit: f64,
+        n_expanded: u64,
+        meter: &mut Meter<'_>,
+    ) -> Result<Deepened, Cancelled> {
+        let Some(mut deepening) = self.deepening.take() else { return Ok(Deepened::No) };
+        let most_entries = match deepening.grouping {
+            Grouping::Widest => MAX_JOINT_ENTRIES,
+            Grouping::WhenItPays => usize::try_from(n_expanded / EXPANSIONS_PER_ENTRY).unwrap_or(usize::MAX),
+        };
+        let most_entries = most_entries.min(MAX_JOINT_ENTRIES);
+        match self.solve_level(&mut deepening, limit, most_entries, meter) {
+            Ok(None) => Ok(Deepened::No),
+            Ok(Some(joint)) => {
+                let columns = self.columns.iter();
+                let joined = columns.filter(|column| joint.iter().any(|table| table.group().has(column.position)));
+                for column in joined {
+                    for row in self.entries.chunks_exact_mut(self.width) {
+                        for entry in &mut row[column.offset..][..column.group.n_classes()] {
+                            entry.cost_to_go = 0.0;
+                        }
+                    }
+                }
+                self.joint = joint;
+                deepening.level += 1;
+                if deepening.grouping == Grouping::WhenItPays {
+                    deepening.due = n_expanded.saturating_mul(2);
+                }
+                self.deepening = Some(deepening);
+                Ok(Deepened::Yes)
+            }
+            Err(Unsolved::TooLarge) => {
+                // When the search has taken longer, more is worth while, and the limit may be lower.
+                deepening.due = n_expanded.saturating_mul(2);
+                self.deepening = (deepening.grouping == Grouping::WhenItPays).then_some(deepening);
+                Ok(Deepened::No)
+            }
+            Err(Unsolved::Interrupted(Signal::Cancel)) => Err(Cancelled),
+            Err(Unsolved::Interrupted(_)) => Ok(Deepened::CutShort),
+        }
+    }
+
+    /// The tables of the next level's groups; `None` if there is no next level.
+    fn solve_level(
+        &self,
+        deepening: &mut Deepening<'p>,
+        limit: f64,
+        mut n_left: usize,
+        meter: &mut Meter<'_>,
+    ) -> Result<Option<Vec<Bounded<'p>>>, Unsolved> {
+        let Deepening { projections, used, level, forward, .. } = deepening;
+        let projections: &'p Projections = projections;
+        let mut poll = || meter.spend(u64::MAX);
+        let groups = projections.level(self.problem.model, *level, &mut poll).map_err(Unsolved::Interrupted)?;
+        let Some(groups) = groups else { return Ok(None) };
+        if forward.is_none() {
+            *forward = Some(self.solve_forward(projections, used, meter).map_err(Unsolved::Interrupted)?);
+        }
+        let Some(Forward { costs, optima }) = forward else { return Ok(None) };
+        let column_of = |position: usize| self.columns.iter().position(|column| column.position == position);
+        let mut joint = Vec::new();
+        for group in groups.iter().filter(|group| group.is_kept()) {
+            let columns: Vec<Option<usize>> = group.positions().map(column_of).collect();
+            let is_tabled = |position| !self.untabled.contains(&position);
+            if columns.iter().all(Option::is_none) || !group.positions().all(is_tabled) {
+                continue;
+            }
+            // A little more than the others leave, as sums differ by rounding.
+            let others = (0..self.columns.len()).filter(|number| !columns.contains(&Some(*number)));
+            let others: f64 = others.map(|number| optima[number]).sum();
+            let positions: Vec<usize> = group.positions().collect();
+            let parts = Parts::new(projections, self.problem, used, &positions);
+            let offsets: Vec<Option<usize>> =
+                columns.iter().map(|column| column.map(|number| self.columns[number].offset)).collect();
+            let rows = self.least_terms.chunks_exact(self.columns.len());
+            let least_terms = rows.map(|row| columns.iter().flatten().map(|number| row[*number]).sum());
+            let least_terms: Vec<f64> = least_terms.collect();
+            let basis = Basis {
+                columns: &offsets,
+                least_distances: &self.least_distances,
+                least_terms: &least_terms,
+                width: self.width,
+                entries: &self.entries,
+                forward: costs,
+                limit: limit * (1.0 + SLACK) - others,
+            };
+            joint.push(Bounded::solve(group, &basis, |edge, more| parts.of(edge, more), &mut n_left, meter)?);
+        }
+        Ok(Some(joint))
+    }
+
+    /// Costs from the start, forwards over the demonstration: with `F_i(v)` as in [`super::bounded`],
+    ///
+    /// ```text
+    /// F_0(start) = term(0, start)
+    /// F_i(v) = min( F_{i-1}(v) + term(i, v),                  skip
+    ///               F_{i-1}(v') + share(v', v) + term(i, v),  match
+    ///               F_i(v') + share_i(v', v) + rest(i, v) )   extra
+    /// ```
+    fn solve_forward(
+        &self,
+        projections: &Projections,
+        used: &[bool],
+        meter: &mut Meter<'_>,
+    ) -> Result<Forward, Signal> {
+        let width = self.width;
+        let mut costs = vec![f64::INFINITY; self.entries.len()];
+        let mut optima = Vec::new();
+        let start = self.problem.model.states().row(self.problem.start);
+        let mut open = BinaryHeap::new();
+        for (number, Column { group, position, offset }) in self.columns.iter().enumerate() {
+            let n_classes = group.n_classes();
+            let parts = Parts::new(projections, self.problem, used, &[*position]);
+            let ways = Ways::into_classes(group, &parts).reversed();
+            let first = start[*position] as usize;
+            for i in 0..self.problem.demonstration.len() {
+                let (before, after) = costs.split_at_mut(i * width);
+                let here = &mut after[*offset..][..n_classes];
+                let terms = &self.entries[i * width + offset..][..n_classes];
+                let least = self.least_terms[i * self.columns.len() + number];
+                if i == 0 {
+                    here[first] = terms[first].distance;
+                } else {
+                    let before = &before[(i - 1) * width + offset..][..n_classes];
+                    for class in 0..n_classes {
+                        here[class] = here[class].min(before[class] + terms[class].distance);
+                        for Way { class: to, share, .. } in ways.of(class) {
+                            let to = *to as usize;
+                            here[to] = here[to].min(before[class] + share + terms[to].distance);
+                        }
+                    }
+                }
+                match meter.spend((n_classes + ways.ways.len()) as u64) {
+                    Signal::Continue => {}
+                    signal => return Err(signal),
+                }
+                #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+                open.extend((0..n_classes).map(|class| CheapestFirst { cost: here[class], id: class as u32 }));
+                while let Some(CheapestFirst { cost, id }) = open.pop() {
+                    if cost > here[id as usize] || cost == f64::INFINITY {
+                        continue;
+                    }
+                    for way in ways.of(id as usize) {
+                        let (to, rest) = (way.class as usize, terms[way.class as usize].distance - least);
+                        let arrived = cost + way.share_of_extra(self.least_distances[i]) + rest;
+                        if arrived < here[to] {
+                            here[to] = arrived;
+                            open.push(CheapestFirst { cost: arrived, id: way.class });
+                        }
+                    }
+                }
+            }
+            let last = &costs[self.problem.last() * width + offset..][..n_classes];
+            optima.push(last.iter().copied().fold(f64::INFINITY, f64::min));
+        }
+        Ok(Forward { costs, optima })
+    }
+}

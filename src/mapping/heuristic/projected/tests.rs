@@ -1,0 +1,146 @@
+//! Bounds against least costs by definition.
+
+use proptest::prelude::*;
+use serde_json::{Value, json};
+
+use super::*;
+use crate::document::{Faults, Place};
+use crate::interrupt::Uninterrupted;
+use crate::mapping::Request;
+use crate::model::{Definition, Limits, Model, StateIdx};
+
+/// A model of up to 12 states and three attributes, of which some weigh nothing, and a demonstration.
+fn model_and_demonstration() -> impl Strategy<Value = (Value, Value)> {
+    let weights = prop::array::uniform3(prop_oneof![Just(0.0), Just(1.0), 0.1..3.0]);
+    let costs = prop::array::uniform3(prop_oneof![Just(0.0), Just(1.0), 0.1..3.0]);
+    let row = || prop::array::uniform3(0u8..3);
+    let seen = prop::array::uniform3(prop::option::weighted(0.8, 0u8..4));
+    (2usize..12).prop_flat_map(move |n_states| {
+        let ways = prop::collection::vec((0..n_states, 0usize..3, 0..n_states), 0..3 * n_states);
+        let rows = prop::collection::vec(row(), n_states);
+        (weights.clone(), costs.clone(), rows, ways, prop::collection::vec(seen.clone(), 1..6)).prop_map(
+            |(weights, costs, rows, mut ways, seen)| {
+                ways.sort_unstable();
+                ways.dedup_by_key(|(from, action, _)| (*from, *action));
+                let attributes = ["a", "b", "c"].into_iter().zip(weights);
+                let attributes =
+                    attributes.map(|(name, weight)| json!({"name": name, "kind": "number", "weight": weight}));
+                let actions = costs.iter().enumerate().map(|(n, cost)| json!({"name": format!("{n}"), "cost": cost}));
+                let model = json!({
+                    "attributes": attributes.collect::<Value>(), "actions": actions.collect::<Value>(),
+                    "dynamics": {"kind": "table", "states": rows, "transitions": ways, "start": 0},
+                });
+                (model, json!(seen))
+            },
+        )
+    })
+}
+
+fn distance(problem: &Problem<'_>, i: usize, state: StateIdx) -> f64 {
+    problem.distances.distance(i, problem.model.states().row(state))
+}
+
+/// The moves out of a node, with what they cost.
+fn moves(problem: &Problem<'_>, i: usize, state: StateIdx) -> Vec<(usize, StateIdx, f64)> {
+    let mut moves = vec![(i + 1, state, 0.0)];
+    for transition in problem.model.graph().successors(state) {
+        let cost = problem.model.action(transition.action).cost;
+        moves.extend([(i + 1, transition.to, cost), (i, transition.to, cost)]);
+    }
+    moves.retain(|(i, _, _)| *i <= problem.last());
+    moves.into_iter().map(|(i, state, cost)| (i, state, cost + distance(problem, i, state))).collect()
+}
+
+fn nodes(problem: &Problem<'_>) -> Vec<(usize, StateIdx)> {
+    (0..=problem.last()).flat_map(|i| (0..problem.model.states().len()).map(move |state| (i, state))).collect()
+}
+
+/// Least costs of all nodes, from the start and to the end, by going over all moves until nothing changes.
+fn least_costs(problem: &Problem<'_>) -> [Vec<Vec<f64>>; 2] {
+    let unknown = vec![vec![f64::INFINITY; problem.model.states().len() as usize]; problem.last() + 1];
+    let (mut from_start, mut to_end) = (unknown.clone(), unknown);
+    from_start[0][problem.start as usize] = distance(problem, 0, problem.start);
+    to_end[problem.last()].fill(0.0);
+    loop {
+        let mut has_changed = false;
+        for (i, state) in nodes(problem) {
+            for (next, to, cost) in moves(problem, i, state) {
+                let (state, to) = (state as usize, to as usize);
+                let arrived = from_start[i][state] + cost;
+                if arrived < from_start[next][to] {
+                    from_start[next][to] = arrived;
+                    has_changed = true;
+                }
+                let completed = cost + to_end[next][to];
+                if completed < to_end[i][state] {
+                    to_end[i][state] = completed;
+                    has_changed = true;
+                }
+            }
+        }
+        if !has_changed {
+            return [from_start, to_end];
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn estimates_are_admissible_and_consistent_and_grow_with_the_groups(
+        (definition, demonstration) in model_and_demonstration(),
+        groups in prop_oneof![
+            Just(vec![vec![0, 1], vec![2]]), Just(vec![vec![0], vec![1, 2]]), Just(vec![vec![0, 2], vec![1]]),
+            Just(vec![vec![0, 1, 2]]),
+        ],
+        room in prop_oneof![Just(0.0), 0.0..0.5, Just(f64::INFINITY)],
+    ) {
+        let definition = Definition::read(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let varies = |at: &usize| model.states().domain(*at).len() > 1;
+        let partition = groups.into_iter().map(|group| group.into_iter().filter(varies).collect());
+        let partition: Vec<Vec<usize>> = partition.filter(|group: &Vec<usize>| !group.is_empty()).collect();
+        let projections = Projections::with_levels(&model, [partition]);
+        let seen: Vec<Value> = demonstration.as_array().unwrap().iter().map(|seen| {
+            json!({"a": seen[0], "b": seen[1], "c": seen[2]})
+        }).collect();
+        let request = json!({"model": "m", "demonstration": seen});
+        let mut faults = Faults::default();
+        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
+        let [from_start, to_end] = least_costs(&problem);
+        let optimum = from_start[problem.last()].iter().copied().fold(f64::INFINITY, f64::min);
+        let limit = optimum * (1.0 + room) + 1e-6;
+        let close = 1e-9 * (1.0 + optimum);
+
+        let solved = Projected::solve(&projections, &problem, Grouping::Widest, MAX_ENTRIES, &mut Uninterrupted).unwrap();
+        let mut projected = solved.unwrap();
+        let mut alone: Vec<f64> = Vec::new();
+        for is_deep in [false, true] {
+            if is_deep {
+                let mut interrupt = Uninterrupted;
+                let mut meter = Meter::new(&mut interrupt, 1);
+                prop_assert_eq!(projected.deepen(limit, 0, &mut meter), Ok(Deepened::Yes));
+            }
+            for (number, (i, state)) in nodes(&problem).into_iter().enumerate() {
+                let estimate = projected.at(i).of(problem.model.states().row(state));
+                prop_assert!((estimate.distance - distance(&problem, i, state)).abs() <= close);
+                let h = estimate.cost_to_go;
+                let through = from_start[i][state as usize] + to_end[i][state as usize];
+                if !is_deep || through < limit {
+                    prop_assert!(h <= to_end[i][state as usize] + close, "admissible at ({i}, {state})");
+                }
+                for (next, to, cost) in moves(&problem, i, state) {
+                    let next_h = projected.at(next).of(problem.model.states().row(to)).cost_to_go;
+                    prop_assert!(h == f64::INFINITY || h <= cost + next_h + close, "consistent at ({i}, {state})");
+                }
+                if is_deep {
+                    prop_assert!(h >= alone[number] - close, "no lower than alone");
+                } else {
+                    alone.push(h);
+                }
+            }
+        }
+    }
+}
