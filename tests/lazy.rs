@@ -114,6 +114,32 @@ proptest! {
     }
 }
 
+#[test]
+fn a_start_that_the_models_own_does_not_lead_to_is_mapped_at_least_cost() {
+    // The body cannot shoot, so the arrows stay as many as they are: two at the model's own start, none where it is asked for.
+    let model = json!({
+        "actions": [{"name": "forward"}, {"name": "turn_left"}],
+        "dynamics": {"kind": "wumpus", "width": 5, "height": 3, "arrows": 2},
+    });
+    let lazy = mapper_within(LAZY, &model);
+    let map = |heuristic| {
+        let request = json!({
+            "model": "m", "heuristic": heuristic,
+            "start": {"x": 4, "y": 2, "heading": "south", "arrows": 0, "outside": false},
+            "demonstration": [
+                {"arrows": 2, "heading": "west", "x": 2, "y": 1},
+                {"arrows": 0, "x": 3},
+                {"arrows": 2, "heading": "west", "x": 2, "y": 0},
+            ],
+        });
+        let policy = solve(&lazy, &request);
+        (policy.cost.total, policy.status)
+    };
+    let ((by_default, status), (without, _)) = (map("default"), map("none"));
+    assert!(close(by_default, without) && close(without, 20.3), "{by_default} and {without}");
+    assert_eq!(status, Status::Optimal);
+}
+
 /// A cave of 3600 cells with 20 pieces of gold, that is more than 10^10 states, and what is seen of one who goes along the south wall and
 /// takes what lies there.
 fn large() -> (Value, Value) {

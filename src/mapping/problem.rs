@@ -15,6 +15,8 @@ pub struct Problem<'m> {
     pub(crate) start: StateIdx,
     /// What `s_0` is, if it is a state without a number in a model that is searched lazily.
     pub(crate) cave_start: Option<CaveState>,
+    /// The row of `s_0`. Shape `[n_attributes]`.
+    pub(crate) start_row: Vec<u32>,
     pub(crate) distances: Distances<'m>,
 }
 
@@ -30,7 +32,11 @@ impl<'m> Problem<'m> {
             // A search that finds its states numbers them from the start on.
             Some(Origin::Cave(state)) => (0, Some(state)),
         };
-        Self { model, demonstration, weights, start, cave_start, distances }
+        let start_row = match (model.unexplored(), &cave_start) {
+            (Some(cave), Some(state)) => cave.row(state).collect(),
+            _ => model.states().row(start).to_vec(),
+        };
+        Self { model, demonstration, weights, start, cave_start, start_row, distances }
     }
 
     /// The demonstration.

@@ -272,7 +272,7 @@ impl Cave {
     }
 
     /// The state as indices into [`Self::domains`].
-    pub(super) fn row(&self, state: &CaveState) -> impl Iterator<Item = u32> {
+    pub(crate) fn row(&self, state: &CaveState) -> impl Iterator<Item = u32> {
         #[expect(clippy::cast_possible_truncation, reason = "at most MAX_THINGS")]
         let n_gold = self.gold.len() as u32;
         let (x, y) = state.cell;

@@ -198,7 +198,7 @@ impl<'p> Projected<'p> {
         let width = self.width;
         let mut costs = vec![f64::INFINITY; self.entries.len()];
         let mut optima = Vec::new();
-        let start = self.problem.model.states().row(self.problem.start);
+        let start = &self.problem.start_row;
         let mut open = BinaryHeap::new();
         for (number, Column { group, position, offset }) in self.columns.iter().enumerate() {
             let n_classes = group.n_classes();

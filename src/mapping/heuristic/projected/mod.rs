@@ -142,7 +142,7 @@ impl<'p> Projected<'p> {
 
     /// Writes the terms of an observation, and the least of them. What no action changes stays as it was at the start.
     fn write_terms(&mut self, i: usize) {
-        let start = self.problem.model.states().row(self.problem.start);
+        let start = &self.problem.start_row;
         let row = &mut self.entries[i * self.width..][..self.width];
         let mut least_distance = 0.0;
         for Column { group, position, offset } in &self.columns {
