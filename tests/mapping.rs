@@ -160,6 +160,36 @@ proptest! {
     }
 }
 
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn one_observation_far_off_does_not_hide_what_the_others_cost(
+        seen in prop::collection::vec(0u32..12, 4..14),
+        at in any::<prop::sample::Index>(),
+        ways in prop::collection::btree_map((0usize..12, 0usize..2), 0usize..12, 8..24),
+    ) {
+        let transitions: Value = ways.iter().map(|((from, action), to)| json!([from, action, to])).collect();
+        let states: Value = (0..12).map(|x| json!([x])).collect();
+        let model = json!({
+            "attributes": [{"name": "x", "kind": "number"}],
+            "actions": [{"name": "a", "cost": 0.3}, {"name": "b", "cost": 1.1}],
+            "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
+        });
+        let mut demonstration: Vec<Value> = seen.iter().map(|x| json!({"x": x})).collect();
+        // A sensor that failed once: this observation alone costs 10^12, of which a float still tells thousandths.
+        let far = at.index(seen.len());
+        demonstration[far] = json!({"x": 1e6});
+        let mapper = mapper(&model);
+        let map = |heuristic| {
+            let request = json!({"model": "m", "demonstration": demonstration, "heuristic": heuristic});
+            solve(&mapper, &request).cost.total
+        };
+        let (by_default, without) = (map("default"), map("none"));
+        prop_assert!((by_default - without).abs() < 0.05, "{by_default} and {without}");
+    }
+}
+
 /// The policy for an example, checked against the solver.
 fn example_policy(model: &str, demonstration: &str, weights: &Value) -> Policy {
     let (model, demonstration) = (example(model), example(demonstration));

@@ -40,6 +40,18 @@ impl CostSum {
     }
 }
 
+/// Costs that are closer than this, as a part of them, are the same: they are told to 15 significant digits.
+pub(super) const ROUNDING: f64 = 1e-14;
+
+/// How much sums of the same costs differ, as a part of them, by the order in which a search of `n_observations` adds them up. It does
+/// not look for what is cheaper by less, so that it need not go through all mappings of equal cost.
+pub(super) fn rounding_of_sums(n_observations: usize) -> f64 {
+    #[expect(clippy::cast_precision_loss, reason = "there are at most MAX_OBSERVATIONS")]
+    let n_steps = n_observations as f64;
+    // Each addition may be half a bit off, either way.
+    f64::EPSILON * (8.0 + n_steps / 16.0)
+}
+
 /// The cost of `moves` in `space`.
 pub(super) fn cost_of(problem: &Problem<'_>, space: &impl Space, moves: &[Move]) -> Cost {
     let mut sum = CostSum::default();

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::completion::{Allowance, Extras, complete};
-use super::cost::{Cost, cost_of};
+use super::cost::{Cost, ROUNDING, cost_of};
 use super::heuristic::paper::Paper;
 use super::heuristic::projected::{MAX_ENTRIES, Projected};
 use super::heuristic::projection::Projections;
@@ -363,9 +363,6 @@ fn renumber(moves: &mut [Move]) -> Vec<StateIdx> {
 
 /// How much more than an upper bound a mapping may cost, relatively: more than sums of 100,000 terms differ by rounding.
 const SLACK: f64 = 1e-9;
-
-/// Sums in different orders may differ by rounding; what is closer than this, relatively, is the same.
-const ROUNDING: f64 = 1e-12;
 
 /// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than its `least_f`.
 fn conclude<S: Space, H: Heuristic>(

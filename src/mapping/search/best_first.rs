@@ -20,6 +20,7 @@ use super::buckets::Buckets;
 use super::nodes::{Arrival, NO_NODE, Node, NodeId, Nodes};
 use super::{Found, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
+use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{Deepened, Projected};
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::{Budget, Problem};
@@ -30,9 +31,6 @@ const PROBE_WIDENING: u64 = 8;
 
 /// A probe may take this part of the work that was done before it.
 const PROBE_SHARE: u64 = 16;
-
-/// Sums in different orders may differ by rounding; what is closer than this, relatively, is the same.
-const ROUNDING: f64 = 1e-12;
 
 /// Buffers of a search, kept to be used again.
 #[derive(Debug, Default)]
@@ -77,6 +75,7 @@ pub(in crate::mapping) fn search<S: Space>(
         incumbent: (problem.last() == 0).then_some(first),
         n_expanded: 0,
         n_generated: 0,
+        rounding: rounding_of_sums(problem.demonstration.len()),
         meter: Meter::new(interrupt, POLL_EVERY),
     };
     let mut end = End::Done;
@@ -110,6 +109,8 @@ struct Search<'s, 'p, S> {
     incumbent: Option<NodeId>,
     n_expanded: u64,
     n_generated: u64,
+    /// What is less than this cheaper, as a part of the cost, is not looked for.
+    rounding: f64,
     meter: Meter<'s>,
 }
 
@@ -277,7 +278,7 @@ impl<S: Space> Search<'_, '_, S> {
                 let arrival = Arrival { observation: *observation, state, cost: g + action_cost, parent: id, action };
                 let Some(id) = self.buffers.nodes.offer(arrival, space, estimates, self.limit) else { continue };
                 if *observation as usize == problem.last() {
-                    self.limit = self.buffers.nodes.get(id).g() * (1.0 - ROUNDING);
+                    self.limit = self.buffers.nodes.get(id).g() * (1.0 - self.rounding);
                     self.incumbent = Some(id);
                 } else {
                     found(self.buffers, id);
