@@ -18,7 +18,7 @@ use std::collections::BinaryHeap;
 
 use super::buckets::Buckets;
 use super::nodes::{Arrival, NO_NODE, Node, NodeId, Nodes};
-use super::{Found, NO_ACTION, POLL_EVERY};
+use super::{Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{Deepened, Projected};
@@ -62,7 +62,14 @@ pub(in crate::mapping) fn search<S: Space>(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
     buffers.nodes.clear(problem.demonstration.len().saturating_mul(space.n_states().unwrap_or(usize::MAX)));
-    let start = Arrival { observation: 0, state: problem.start, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
+    let start = Arrival {
+        kind: MoveKind::Start,
+        observation: 0,
+        state: problem.start,
+        cost: 0.0,
+        parent: NO_NODE,
+        action: NO_ACTION,
+    };
     // The start is kept whatever it costs: it is what is left to complete if there is no budget at all.
     let first = buffers.nodes.offer(start, space, &projected.at(0), f64::INFINITY).unwrap_or(NO_NODE);
     let mut search = Search {
@@ -75,6 +82,8 @@ pub(in crate::mapping) fn search<S: Space>(
         incumbent: (problem.last() == 0).then_some(first),
         n_expanded: 0,
         n_generated: 0,
+        #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
+        last: problem.last() as u32,
         rounding: rounding_of_sums(problem.demonstration.len()),
         meter: Meter::new(interrupt, POLL_EVERY),
     };
@@ -109,6 +118,8 @@ struct Search<'s, 'p, S> {
     incumbent: Option<NodeId>,
     n_expanded: u64,
     n_generated: u64,
+    /// The last observation.
+    last: u32,
     /// What is less than this cheaper, as a part of the cost, is not looked for.
     rounding: f64,
     meter: Meter<'s>,
@@ -253,35 +264,42 @@ impl<S: Space> Search<'_, '_, S> {
         }
     }
 
-    /// Follows all moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper
+    /// Follows the moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper
     /// way.
+    ///
+    /// A skip and an extra action, in either order, cost no less than the action as a match: it comes to the same node without the
+    /// distance in between. So what was come to by the one is not left by the other.
     #[inline]
     fn expand(&mut self, id: NodeId, mut found: impl FnMut(&mut Buffers, NodeId)) {
-        let (problem, projected, space) = (self.problem, &*self.projected, &*self.space);
-        let actions = problem.model.actions();
-        let node = self.buffers.nodes.get(id);
-        let (g, observation) = (node.g(), node.observation);
-        self.buffers.nodes.close(id);
-        let layers = [observation + 1, observation].map(|i| (i, projected.at(i as usize)));
+        let Self { buffers, projected, space, limit, incumbent, last, rounding, .. } = self;
+        let actions = self.problem.model.actions();
+        let node = buffers.nodes.get(id);
+        let (g, here, next) = (node.g(), node.observation, node.observation + 1);
+        buffers.nodes.close(id);
+        let (at_here, at_next) = (projected.at(here as usize), projected.at(next as usize));
         let successors = space.successors(node.state);
+        let (may_skip, may_linger) = (node.kind != MoveKind::Extra, node.kind != MoveKind::Skip);
         self.n_expanded += 1;
-        self.n_generated += 1 + 2 * successors.len() as u64;
-        let skip = Transition { action: NO_ACTION, to: node.state };
-        for transition in std::iter::once(&skip).chain(successors) {
-            let Transition { action, to: state } = *transition;
-            // A skip only advances.
-            let (action_cost, layers) = match actions.get(usize::from(action)) {
-                Some(action) => (action.cost, &layers[..]),
-                None => (0.0, &layers[..1]),
+        self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * successors.len() as u64;
+        let skip = [Transition { action: NO_ACTION, to: node.state }];
+        let skip = &skip[..usize::from(may_skip)];
+        let skips = [(MoveKind::Skip, next, &at_next)];
+        let moves = [(MoveKind::Match, next, &at_next), (MoveKind::Extra, here, &at_here)];
+        let moves = &moves[..1 + usize::from(may_linger)];
+        for Transition { action, to: state } in skip.iter().chain(successors) {
+            let (cost, moves) = match actions.get(usize::from(*action)) {
+                Some(action) => (g + action.cost, moves),
+                None => (g, &skips[..]),
             };
-            for (observation, estimates) in layers {
-                let arrival = Arrival { observation: *observation, state, cost: g + action_cost, parent: id, action };
-                let Some(id) = self.buffers.nodes.offer(arrival, space, estimates, self.limit) else { continue };
-                if *observation as usize == problem.last() {
-                    self.limit = self.buffers.nodes.get(id).g() * (1.0 - self.rounding);
-                    self.incumbent = Some(id);
+            for (kind, observation, estimates) in moves {
+                let (action, kind, state) = (*action, *kind, *state);
+                let arrival = Arrival { kind, observation: *observation, state, cost, parent: id, action };
+                let Some(id) = buffers.nodes.offer(arrival, &**space, estimates, *limit) else { continue };
+                if observation == last {
+                    *limit = buffers.nodes.get(id).g() * (1.0 - *rounding);
+                    *incumbent = Some(id);
                 } else {
-                    found(self.buffers, id);
+                    found(buffers, id);
                 }
             }
         }

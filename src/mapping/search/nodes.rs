@@ -24,6 +24,8 @@ pub(super) struct Node {
     pub(super) parent: NodeId,
     /// The action that led here, or [`NO_ACTION`].
     pub(super) action: ActionIdx,
+    /// How the way ends.
+    pub(super) kind: MoveKind,
     /// Whether it was expanded since its way last became cheaper.
     pub(super) is_closed: bool,
 }
@@ -43,6 +45,7 @@ struct Rest {
     estimate: Estimate,
     parent: NodeId,
     action: ActionIdx,
+    kind: MoveKind,
     is_closed: bool,
 }
 
@@ -63,6 +66,7 @@ impl Node {
 /// A way to a node, before its distance is paid.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Arrival {
+    pub(super) kind: MoveKind,
     pub(super) observation: u32,
     pub(super) state: StateIdx,
     pub(super) cost: f64,
@@ -133,7 +137,7 @@ impl Nodes {
         estimates: &EstimatesAt<'_>,
         limit: f64,
     ) -> Option<NodeId> {
-        let Arrival { observation, state, cost, parent, action } = arrival;
+        let Arrival { kind, observation, state, cost, parent, action } = arrival;
         let mut place = self.place_of(observation, state);
         loop {
             let id = self.index[place];
@@ -144,7 +148,7 @@ impl Nodes {
                 }
                 key.cost = cost;
                 let rest = &mut self.rest[id as usize];
-                *rest = Rest { parent, action, is_closed: false, ..*rest };
+                *rest = Rest { parent, action, kind, is_closed: false, ..*rest };
                 return (cost + rest.estimate.distance + rest.estimate.cost_to_go < limit).then_some(id);
             }
             place = (place + 1) & self.mask();
@@ -156,7 +160,7 @@ impl Nodes {
         #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
         let id = self.keys.len() as NodeId;
         self.keys.push(Key { cost, state, observation });
-        self.rest.push(Rest { estimate, parent, action, is_closed: false });
+        self.rest.push(Rest { estimate, parent, action, kind, is_closed: false });
         self.index[place] = id;
         if self.keys.len() * 2 > self.mask() {
             self.resize_index(self.bits + 1);
@@ -203,14 +207,7 @@ impl Nodes {
     pub(super) fn path(&self, mut id: NodeId) -> Vec<Move> {
         let mut moves = Vec::new();
         while id != NO_NODE {
-            let Node { state, observation, parent, action, .. } = self.get(id);
-            let advances = self.keys.get(parent as usize).map(|parent| parent.observation < observation);
-            let kind = match (advances, action) {
-                (None, _) => MoveKind::Start,
-                (Some(_), NO_ACTION) => MoveKind::Skip,
-                (Some(true), _) => MoveKind::Match,
-                (Some(false), _) => MoveKind::Extra,
-            };
+            let Node { state, observation, parent, action, kind, .. } = self.get(id);
             let action = (action != NO_ACTION).then_some(action);
             moves.push(Move { kind, action, observation, state });
             id = parent;
@@ -223,6 +220,6 @@ impl Nodes {
 #[inline]
 fn joined(key: &Key, rest: &Rest) -> Node {
     let Key { cost, state, observation } = *key;
-    let Rest { estimate, parent, action, is_closed } = *rest;
-    Node { cost, state, observation, estimate, parent, action, is_closed }
+    let Rest { estimate, parent, action, kind, is_closed } = *rest;
+    Node { cost, state, observation, estimate, parent, action, kind, is_closed }
 }
