@@ -285,7 +285,7 @@ impl<S: Space> Search<'_, '_, S> {
         let skip = &skip[..usize::from(may_skip)];
         let skips = [(MoveKind::Skip, next, &at_next)];
         let moves = [(MoveKind::Match, next, &at_next), (MoveKind::Extra, here, &at_here)];
-        let moves = &moves[..1 + usize::from(may_linger)];
+        let moves = &moves[..=usize::from(may_linger)];
         for Transition { action, to: state } in skip.iter().chain(successors) {
             let (cost, moves) = match actions.get(usize::from(*action)) {
                 Some(action) => (g + action.cost, moves),
