@@ -1,5 +1,5 @@
 //! The mapping against its peers on the same problems, in one run: `cargo bench --bench mapping [-- part ..]`, where a part is `peers`,
-//! `growth`, `deadline` or `instructions`; all if none is named.
+//! `growth`, `deadline`, `limit` or `instructions`; all if none is named.
 //!
 //! Every solver is given the problem ready: models are compiled, and terms of distances are tabulated by observation and value,
 //! for the peers too. Rounds are interleaved, so that a machine that slows down slows all of them down; in each, a solver
@@ -13,6 +13,7 @@
 mod deadline;
 mod growth;
 mod instructions;
+mod limit;
 mod peers;
 mod table;
 #[path = "../worlds/mod.rs"]
@@ -53,6 +54,9 @@ fn main() {
     }
     if is_wanted("deadline") {
         deadline::measure();
+    }
+    if is_wanted("limit") {
+        limit::measure();
     }
     if is_wanted("instructions") {
         instructions::measure();
