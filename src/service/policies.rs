@@ -15,7 +15,7 @@ use super::{Admission, Etude, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Status};
+use crate::mapping::{Mapper, Mapping, Problem, Request, Stamp, Status, WrittenPolicy};
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
@@ -207,21 +207,26 @@ pub(super) struct Searched {
 /// A policy as it will be stored.
 pub(super) struct PolicyText {
     id: String,
-    policy: String,
     summary: String,
+    steps: Vec<u8>,
 }
 
 impl PolicyText {
-    /// Writes a policy that has an id.
-    pub(super) fn of(policy: &Policy) -> Result<Self, ServiceError> {
-        let id = policy.id.clone().unwrap_or_default();
-        Ok(Self { id, policy: write(policy)?, summary: write(&PolicySummary::of(policy))? })
-    }
-
     pub(super) fn at(self, created_at: Timestamp) -> NewPolicy {
-        let Self { id, policy, summary } = self;
-        NewPolicy { id, summary, policy, created_at }
+        let Self { id, summary, steps } = self;
+        NewPolicy { id, summary, steps, created_at }
     }
+}
+
+/// Writes the policy of `mapping`, which has an id: as it will be answered, and as it will be stored.
+pub(super) fn write_policy(
+    stamp: Stamp,
+    problem: &Problem<'_>,
+    mapping: &Mapping,
+) -> Result<(String, PolicyText), ServiceError> {
+    let written = WrittenPolicy::new(&stamp, problem, mapping)?;
+    let WrittenPolicy { answer, summary, steps } = written;
+    Ok((answer, PolicyText { id: stamp.id.unwrap_or_default(), summary, steps }))
 }
 
 /// Reads the request against its model, with weights from `base` where it names none, searches, and writes the policy.
@@ -234,23 +239,38 @@ pub(super) fn search(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
     match read_request(mapper.model(), document, fields, base) {
-        Ok(request) => Ok(searched(&follow(mapper, &request, stamp, interrupt)?, document)),
+        Ok(request) => follow(mapper, &request, document, stamp, interrupt),
         Err(faults) => Ok(Err(faults.into())),
     }
 }
 
-/// Searches, and gives the policy.
+/// Searches, and writes the policy. The request was read from `document`.
 pub(super) fn follow(
     mapper: &Arc<Mapper>,
     request: &Request<'_>,
+    document: &Value,
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
-) -> Result<Policy, Cancelled> {
+) -> Result<Result<Searched, ServiceError>, Cancelled> {
     let started = Instant::now();
     let mapping = request.solve(mapper, interrupt)?;
     let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
-    Ok(Policy::new(stamp, &request.problem, &mapping))
+    let refinement = (mapping.status == Status::Local).then(|| {
+        let mut request_for_refined = document.clone();
+        // The weights that are used, wherever they came from.
+        request_for_refined["weights"] = serde_json::json!(request.problem.named_weights());
+        for name in ["learner", "lookahead"] {
+            request_for_refined[name] = Value::Null;
+        }
+        NewRefinement {
+            policy_id: stamp.id.clone().unwrap_or_default(),
+            model_hash: stamp.model_hash.clone(),
+            request: request_for_refined.to_string(),
+        }
+    });
+    let written = write_policy(stamp, &request.problem, &mapping);
+    Ok(written.map(|(policy, row)| Searched { policy, row, refinement }))
 }
 
 /// The weights from which a request starts: the means of its learner, or the model's own.
@@ -259,21 +279,6 @@ pub(super) fn base_weights(model: &Model, learner: Option<&Ready>, faults: &mut 
     let Some(Ready { learner, weights, .. }) = learner else { return Some(schema.weights()) };
     let learned = learner.weights_for(schema, &weights.distribution.mean);
     learned.map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string())).ok()
-}
-
-/// Writes the policy that was made for the request in `document`.
-pub(super) fn searched(policy: &Policy, document: &Value) -> Result<Searched, ServiceError> {
-    let row = PolicyText::of(policy)?;
-    let refinement = (policy.status == Status::Local).then(|| {
-        let mut request = document.clone();
-        // The weights that were used, wherever they came from.
-        request["weights"] = serde_json::json!(policy.weights);
-        for name in ["learner", "lookahead"] {
-            request[name] = Value::Null;
-        }
-        NewRefinement { policy_id: row.id.clone(), model_hash: policy.model_hash.clone(), request: request.to_string() }
-    });
-    Ok(Searched { policy: row.policy.clone(), row, refinement })
 }
 
 /// Reads a request that may have these `fields` against its model, with weights from `base` where it names none.

@@ -8,7 +8,8 @@
 //! ```
 //!
 //! A write that was answered is on disk. Rows become domain types here and nowhere else; times are milliseconds since 1970,
-//! documents are JSON text, in compressed pieces where it is long.
+//! documents are JSON text, in compressed pieces where it is long. Of a policy, what could be told from the rest is left out, and
+//! put back when it is read.
 
 mod arrivals;
 mod definitions;
@@ -168,6 +169,7 @@ fn migrator() -> Migrator {
             migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
             migration(4, "large definitions", include_str!("../../migrations/0004_large_definitions.sql")),
             migration(5, "arrivals", include_str!("../../migrations/0005_arrivals.sql")),
+            migration(6, "short policies", include_str!("../../migrations/0006_short_policies.sql")),
         ]
         .into(),
         ..Migrator::DEFAULT

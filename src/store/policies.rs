@@ -6,6 +6,7 @@ use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 use super::refinements::NewRefinement;
 use super::writer::Write;
 use super::{Page, Store, StoreError, corrupt};
+use crate::mapping::read_answer;
 
 /// A policy to be stored.
 #[derive(Clone, Debug)]
@@ -14,8 +15,8 @@ pub struct NewPolicy {
     pub id: String,
     /// JSON: the policy without its steps.
     pub summary: String,
-    /// JSON: the whole policy.
-    pub policy: String,
+    /// Its steps in short, as [`WrittenPolicy`](crate::mapping::WrittenPolicy) has them.
+    pub steps: Vec<u8>,
     /// When it was made.
     pub created_at: Timestamp,
 }
@@ -43,14 +44,23 @@ impl Store {
         self.writer.write(Write::AddPolicies(policies, refinements)).await.map(drop)
     }
 
-    /// The policy with this id: JSON.
+    /// The policy with this id, as it was answered: JSON.
     ///
     /// # Errors
     ///
     /// If the database failed.
     pub async fn policy(&self, id: &str) -> Result<Option<String>, StoreError> {
-        let query = sqlx::query_scalar("SELECT policy FROM policies WHERE id = $1").bind(id);
-        Ok(query.fetch_optional(&self.readers).await?)
+        let query = sqlx::query("SELECT summary, policy, steps FROM policies WHERE id = $1").bind(id);
+        let Some(row) = query.fetch_optional(&self.readers).await? else { return Ok(None) };
+        let Some(steps) = row.try_get::<Option<Vec<u8>>, _>("steps")? else { return Ok(Some(row.try_get("policy")?)) };
+        let summary: String = row.try_get("summary")?;
+        let answer = if steps.len() <= MAX_INLINE_BYTES {
+            read_answer(&summary, &steps)
+        } else {
+            let reading = self.tasks.spawn_blocking(move || read_answer(&summary, &steps));
+            reading.await.map_err(corrupt("policies", "steps"))?
+        };
+        Ok(Some(answer.map_err(corrupt("policies", "steps"))?))
     }
 
     /// At most `limit` policies in the order in which they became durable, from the first after the sequence number
@@ -76,6 +86,10 @@ pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -
     add_all(connection, &[policy]).await
 }
 
+/// Policies whose steps in short are up to this size are written where they are asked for, which takes a millisecond or so; larger
+/// ones on a thread of their own.
+const MAX_INLINE_BYTES: usize = 32 * 1024;
+
 /// Most policies that a statement inserts.
 const MAX_ROWS: usize = 32;
 
@@ -88,11 +102,13 @@ pub(super) async fn add_all(connection: &mut SqliteConnection, policies: &[&NewP
         let n_rows = 1 << left.len().min(MAX_ROWS).ilog2();
         let (rows, rest) = left.split_at(n_rows);
         left = rest;
-        let mut insert = QueryBuilder::<Sqlite>::new("INSERT INTO policies (id, summary, policy, created_at_ms) ");
+        let mut insert =
+            QueryBuilder::<Sqlite>::new("INSERT INTO policies (id, summary, policy, steps, created_at_ms) ");
         insert.push_values(rows, |mut row, policy| {
             row.push_bind(&policy.id)
                 .push_bind(&policy.summary)
-                .push_bind(&policy.policy)
+                .push("''")
+                .push_bind(&policy.steps)
                 .push_bind(policy.created_at.as_millisecond());
         });
         insert.build().execute(&mut *connection).await?;
