@@ -5,9 +5,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
-use serde::Serialize;
-use serde_json::Value;
+use serde::de::{Error as _, MapAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::value::RawValue;
+use serde_json::{Map, Value};
 use uuid::Uuid;
 
 use super::learners::Ready;
@@ -15,7 +16,7 @@ use super::{Admission, Etude, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{Mapper, Mapping, Problem, Request, Stamp, Status, WrittenPolicy};
+use crate::mapping::{Demonstration, Mapper, Mapping, Problem, Request, Stamp, Status, WrittenPolicy};
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
@@ -46,30 +47,17 @@ impl Etude {
         now: Timestamp,
     ) -> Result<MadePolicy, ServiceError> {
         let place = self.pool.admit()?;
-        let is_small = body.as_ref().len() <= MAX_INLINE_BYTES;
-        let document = parse(body, &place).await?;
-        let (envelope, faults) = Envelope::read(&document, &Request::FIELDS, "demonstration");
-        // With the help of the model, more faults may be found; so those found without it wait.
-        let Some(envelope) = envelope else { return Err(faults.into()) };
-        let Named { learner, model_hash, mapper } = self.find(&envelope, faults, &place).await?;
-
         let id = Uuid::now_v7().to_string();
-        let stamp = Stamp {
-            id: Some(id.clone()),
-            model: envelope.model,
-            model_hash,
-            learner: learner.as_ref().map(|ready| ready.name.clone()),
-            weights_version: learner.as_ref().map(|ready| ready.weights.version),
-            ..Stamp::default()
+        let quick = if body.as_ref().len() <= MAX_INLINE_BYTES {
+            self.search_quickly(body.as_ref(), &id, &place, arrived).await?
+        } else {
+            None
         };
-        let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
-        let is_quick = is_small && is_quick(mapper.model(), &document);
-        let job = move |interrupt: &mut dyn Interrupt| {
-            let base = |faults: &mut Faults| base_weights(mapper.model(), learner.as_ref(), faults);
-            search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)
+        let searched = match quick {
+            Some(searched) => searched,
+            None => self.search_at_length(body, &id, &place, arrived).await?,
         };
-        let searched = if is_quick { place.run_here(deadline, job).await } else { place.run(deadline, job).await };
-        let Searched { policy, row, refinement } = searched??;
+        let Searched { policy, row, refinement } = searched;
         // The disk is no concern of those who wait for a thread.
         drop(place);
         let is_refined = refinement.is_some();
@@ -78,6 +66,68 @@ impl Etude {
             self.refiner.wake();
         }
         Ok(MadePolicy { id, policy })
+    }
+
+    /// Searches for the policy of a request that is well-formed in all its parts, and for which [`is_quick`]. Nothing for others, of
+    /// which it takes a closer look to tell what is wrong.
+    async fn search_quickly(
+        &self,
+        body: &[u8],
+        id: &str,
+        place: &Admission,
+        arrived: Instant,
+    ) -> Result<Option<Searched>, ServiceError> {
+        let Ok(Outline { document, demonstration }) = serde_json::from_slice::<Outline<'_>>(body) else {
+            return Ok(None);
+        };
+        let (Some(envelope), faults) = Envelope::read(&document, &Request::FIELDS, "demonstration") else {
+            return Ok(None);
+        };
+        let Ok(named) = self.find(&envelope, faults, place).await else { return Ok(None) };
+        let model = named.mapper.model();
+        let demonstration = Demonstration::read_well_formed(model.schema(), demonstration.get());
+        let Some(demonstration) = demonstration.filter(|read| is_quick(model, &document, read.len())) else {
+            return Ok(None);
+        };
+        let (deadline, stamp) = (envelope.deadline(arrived), envelope.stamp(id, &named));
+        let Named { learner, mapper, .. } = &named;
+        let job = |interrupt: &mut dyn Interrupt| {
+            let mut faults = Faults::default();
+            let object = Place::root(&document).object(&Request::FIELDS, &mut faults);
+            let request = object.and_then(|object| {
+                let base = |faults: &mut Faults| base_weights(model, learner.as_ref(), faults);
+                Request::read_beside(Some(demonstration), model, &object, base, &mut faults)
+            });
+            let Ok(request) = faults.check(request) else { return Ok(Ok(None)) };
+            let searched = follow(mapper, &request, &document, stamp, interrupt)?;
+            Ok(searched.map(Some))
+        };
+        place.run_here(deadline, job).await?
+    }
+
+    /// Searches for the policy of any request, and tells what is wrong with it.
+    async fn search_at_length(
+        &self,
+        body: impl AsRef<[u8]> + Send + 'static,
+        id: &str,
+        place: &Admission,
+        arrived: Instant,
+    ) -> Result<Searched, ServiceError> {
+        let is_small = body.as_ref().len() <= MAX_INLINE_BYTES;
+        let document = parse(body, place).await?;
+        let (envelope, faults) = Envelope::read(&document, &Request::FIELDS, "demonstration");
+        // With the help of the model, more faults may be found; so those found without it wait.
+        let Some(envelope) = envelope else { return Err(faults.into()) };
+        let named = self.find(&envelope, faults, place).await?;
+        let (deadline, stamp) = (envelope.deadline(arrived), envelope.stamp(id, &named));
+        let Named { learner, mapper, .. } = named;
+        let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
+        let is_quick = is_small && is_quick(mapper.model(), &document, n_observations);
+        let job = move |interrupt: &mut dyn Interrupt| {
+            let base = |faults: &mut Faults| base_weights(mapper.model(), learner.as_ref(), faults);
+            search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)
+        };
+        if is_quick { place.run_here(deadline, job).await? } else { place.run(deadline, job).await? }
     }
 
     /// Finds what the request names. `faults` are those found so far; what is unknown is one more, if there are any.
@@ -151,6 +201,42 @@ pub(super) struct Envelope {
     pub(super) deadline: Option<Duration>,
 }
 
+/// A request whose demonstration, which is most of it, is not read yet.
+struct Outline<'b> {
+    /// With something else in place of the demonstration.
+    document: Value,
+    demonstration: &'b RawValue,
+}
+
+impl<'de: 'b, 'b> Deserialize<'de> for Outline<'b> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Members;
+        impl<'de> Visitor<'de> for Members {
+            type Value = Outline<'de>;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("a request")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<Outline<'de>, A::Error> {
+                let (mut document, mut demonstration) = (Map::new(), None);
+                while let Some(name) = members.next_key::<String>()? {
+                    let value = if name == "demonstration" {
+                        demonstration = Some(members.next_value()?);
+                        Value::Bool(true)
+                    } else {
+                        members.next_value()?
+                    };
+                    document.insert(name, value);
+                }
+                let demonstration = demonstration.ok_or_else(|| A::Error::missing_field("demonstration"))?;
+                Ok(Outline { document: Value::Object(document), demonstration })
+            }
+        }
+        deserializer.deserialize_map(Members)
+    }
+}
+
 /// What a request names.
 pub(super) struct Named {
     pub(super) learner: Option<Ready>,
@@ -177,6 +263,23 @@ impl Envelope {
         });
         (envelope, faults)
     }
+
+    /// When a request that came at `arrived` is to be answered.
+    fn deadline(&self, arrived: Instant) -> Option<Instant> {
+        self.deadline.and_then(|deadline| arrived.checked_add(deadline))
+    }
+
+    /// What the policy `id` is stamped with.
+    fn stamp(&self, id: &str, named: &Named) -> Stamp {
+        Stamp {
+            id: Some(id.to_owned()),
+            model: self.model.clone(),
+            model_hash: named.model_hash.clone(),
+            learner: named.learner.as_ref().map(|ready| ready.name.clone()),
+            weights_version: named.learner.as_ref().map(|ready| ready.weights.version),
+            ..Stamp::default()
+        }
+    }
 }
 
 /// Largest search that runs where its request arrived: observations times states and transitions. One that looks at all of this
@@ -185,8 +288,7 @@ const MAX_INLINE_WORK: usize = 16_384;
 
 /// Whether a request with a small body is answered sooner than another thread would have taken it over. Of what may be in a
 /// request, a finite lookahead and the paper's heuristic can take far longer than the size of the problem tells.
-fn is_quick(model: &Model, document: &Value) -> bool {
-    let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
+fn is_quick(model: &Model, document: &Value, n_observations: usize) -> bool {
     let size = model.graph().n_states() + model.graph().n_transitions();
     let step_bytes = || serde_json::to_string(&model.describe(0)).map_or(usize::MAX, |text| text.len());
     document["lookahead"].is_null()
