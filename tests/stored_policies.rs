@@ -139,3 +139,21 @@ async fn a_long_policy_is_read_as_it_was_answered() {
     store.add_policies(vec![new("long", written)], Vec::new()).await.unwrap();
     assert_eq!(store.policy("long").await.unwrap().unwrap(), serde_json::to_string(&policy).unwrap());
 }
+
+#[tokio::test]
+async fn policies_that_come_together_are_stored_together_and_one_that_cannot_be_spoils_no_other() {
+    const N_POLICIES: usize = 200;
+    let (_, written) = figure_4(&stamp("p"));
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+    store.add_policies(vec![new("100", written.clone())], Vec::new()).await.unwrap();
+    let policies = (0..N_POLICIES).map(|n| store.add_policies(vec![new(&n.to_string(), written.clone())], Vec::new()));
+    let added = futures_util::future::join_all(policies).await;
+    let refused: Vec<_> = added.iter().enumerate().filter(|(_, added)| added.is_err()).map(|(n, _)| n).collect();
+    assert_eq!(refused, [100], "its id is taken");
+    let listed = store.policies(0, 1000).await.unwrap().items;
+    assert_eq!(listed.len(), N_POLICIES);
+    for n in 0..N_POLICIES {
+        assert_eq!(store.policy(&n.to_string()).await.unwrap().as_ref(), Some(&written.answer));
+    }
+}

@@ -47,6 +47,9 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 /// Readers at the same time. Reads are short, and there are few cores.
 const N_READERS: u32 = 4;
 
+/// Statements that a connection keeps prepared: all that there are, those with a number of rows as often as there are numbers.
+const N_STATEMENTS: usize = 256;
+
 /// Why the store could not do as told.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
@@ -118,6 +121,7 @@ impl Store {
             .journal_mode(SqliteJournalMode::Wal)
             .synchronous(SqliteSynchronous::Full)
             .busy_timeout(BUSY_TIMEOUT)
+            .statement_cache_capacity(N_STATEMENTS)
             .disable_statement_logging();
         let mut connection = SqliteConnection::connect_with(&options).await?;
         check_version(&mut connection).await?;

@@ -90,28 +90,40 @@ pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -
 /// ones on a thread of their own.
 const MAX_INLINE_BYTES: usize = 32 * 1024;
 
-/// Most policies that a statement inserts.
-const MAX_ROWS: usize = 32;
+/// Most policies that a statement inserts. Each number of them is a statement of its own, which is prepared once and kept.
+const MAX_ROWS: usize = 64;
 
-/// Adds policies in this order, several a statement: each statement costs the driver a change of threads. Statements come in a
-/// few lengths, so that they are prepared once.
+/// Adds policies in this order, within a transaction.
 pub(super) async fn add_all(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
-    let mut left = policies;
-    while !left.is_empty() {
-        // The largest power of two that fits.
-        let n_rows = 1 << left.len().min(MAX_ROWS).ilog2();
-        let (rows, rest) = left.split_at(n_rows);
-        left = rest;
-        let mut insert =
-            QueryBuilder::<Sqlite>::new("INSERT INTO policies (id, summary, policy, steps, created_at_ms) ");
-        insert.push_values(rows, |mut row, policy| {
-            row.push_bind(&policy.id)
-                .push_bind(&policy.summary)
-                .push("''")
-                .push_bind(&policy.steps)
-                .push_bind(policy.created_at.as_millisecond());
-        });
-        insert.build().execute(&mut *connection).await?;
+    for rows in policies.chunks(MAX_ROWS) {
+        insert(connection, rows).await?;
     }
+    Ok(())
+}
+
+/// Adds policies in this order, all of them or none, outside of a transaction: one statement, which is durable when this returns.
+/// Says whether they were added; they are not if they are none, or too many.
+pub(super) async fn add_at_once(
+    connection: &mut SqliteConnection,
+    policies: &[&NewPolicy],
+) -> Result<bool, StoreError> {
+    let fits = (1..=MAX_ROWS).contains(&policies.len());
+    if fits {
+        insert(connection, policies).await?;
+    }
+    Ok(fits)
+}
+
+/// Adds some policies. Each statement costs the driver a change of threads, so there is only one.
+async fn insert(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
+    let mut insert = QueryBuilder::<Sqlite>::new("INSERT INTO policies (id, summary, policy, steps, created_at_ms) ");
+    insert.push_values(policies, |mut row, policy| {
+        row.push_bind(&policy.id)
+            .push_bind(&policy.summary)
+            .push("''")
+            .push_bind(&policy.steps)
+            .push_bind(policy.created_at.as_millisecond());
+    });
+    insert.build().execute(connection).await?;
     Ok(())
 }
