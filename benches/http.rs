@@ -22,7 +22,7 @@ use axum::response::IntoResponse;
 use axum::routing::post;
 use serde_json::{Value, json};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
-use sqlx::{ConnectOptions, Connection};
+use sqlx::{ConnectOptions, Connection, Row};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
@@ -50,9 +50,11 @@ fn main() -> Result<(), Failure> {
     // The first answer tells how large answers are.
     let service = Service::start(&model, &runtime, 0)?;
     let policy = runtime.block_on(async { Client::connect(service.address).await?.send(&http(&request)).await })?;
+    let stored = runtime.block_on(StoredPolicy::read(&service))?;
     drop(service);
     let n_bytes = policy.len();
-    println!("requests of {} bytes, answers of {n_bytes}", request.len());
+    let n_stored = stored.summary.len() + stored.steps.len();
+    println!("requests of {} bytes, answers of {n_bytes}, of which {n_stored} are stored", request.len());
     let bare = bare(n_bytes)?;
 
     let mut table = Table::default();
@@ -73,7 +75,7 @@ fn main() -> Result<(), Failure> {
         }
         drop(service);
         for n_rows in [1, 16, 64] {
-            let inserted = runtime.block_on(inserts(&policy, n_rows))?;
+            let inserted = runtime.block_on(inserts(&stored, n_rows))?;
             table.note(format!("SQLite alone, {n_rows} policies a transaction"), inserted);
         }
         for n_threads in [1, 2] {
@@ -147,7 +149,7 @@ fn bare(n_bytes: usize) -> Result<SocketAddr, Failure> {
 struct Service {
     child: Child,
     address: SocketAddr,
-    _directory: tempfile::TempDir,
+    directory: tempfile::TempDir,
 }
 
 impl Service {
@@ -180,7 +182,7 @@ impl Service {
             model.len()
         );
         runtime.block_on(async { Client::connect(address).await?.send(format!("{head}{model}").as_bytes()).await })?;
-        Ok(Self { child, address, _directory: directory })
+        Ok(Self { child, address, directory })
     }
 
     /// How long it has kept a processor busy so far; tells more than the clock on a machine that has other work.
@@ -284,27 +286,26 @@ async fn batch(address: SocketAddr, demonstration: &Value) -> Result<f64, Failur
     Ok(rate(N_BATCH, started.elapsed()))
 }
 
-/// Rows a second that SQLite stores of policies like this one, `n_rows` a transaction, one statement a row, as durably as the
-/// service does.
-async fn inserts(policy: &str, n_rows: usize) -> Result<f64, Failure> {
+/// Rows a second that SQLite stores of policies like this one, as the service stored it, `n_rows` a transaction, one statement a
+/// row, as durably as the service does.
+async fn inserts(stored: &StoredPolicy, n_rows: usize) -> Result<f64, Failure> {
     let directory = tempfile::tempdir()?;
-    let migration = include_str!("../migrations/0001_models_and_policies.sql");
     let mut connection = open(directory.path()).await?;
-    sqlx::raw_sql(migration).execute(&mut connection).await?;
-    let mut summary: Value = serde_json::from_str(policy)?;
-    for steps in ["steps", "actions"] {
-        summary.as_object_mut().ok_or("a policy is an object")?.remove(steps);
+    for migration in [
+        include_str!("../migrations/0001_models_and_policies.sql"),
+        include_str!("../migrations/0006_short_policies.sql"),
+    ] {
+        sqlx::raw_sql(migration).execute(&mut connection).await?;
     }
-    let summary = summary.to_string();
     let started = Instant::now();
     let mut n_inserted = 0;
     while started.elapsed() < WINDOW {
         let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
         for _ in 0..n_rows {
-            sqlx::query("INSERT INTO policies (id, summary, policy, created_at_ms) VALUES ($1, $2, $3, $4)")
+            sqlx::query("INSERT INTO policies (id, summary, policy, steps, created_at_ms) VALUES ($1, $2, '', $3, $4)")
                 .bind(uuid::Uuid::now_v7().to_string())
-                .bind(&summary)
-                .bind(policy)
+                .bind(&stored.summary)
+                .bind(&stored.steps)
                 .bind(1_800_000_000_000_i64)
                 .execute(&mut *transaction)
                 .await?;
@@ -315,6 +316,24 @@ async fn inserts(policy: &str, n_rows: usize) -> Result<f64, Failure> {
     let per_second = rate(n_inserted, started.elapsed());
     connection.close().await?;
     Ok(per_second)
+}
+
+/// What the service stores of a policy.
+struct StoredPolicy {
+    summary: String,
+    steps: Vec<u8>,
+}
+
+impl StoredPolicy {
+    /// The one in the database of `service`.
+    async fn read(service: &Service) -> Result<Self, Failure> {
+        let options = SqliteConnectOptions::new().filename(service.directory.path().join("etude.db")).read_only(true);
+        let mut connection = options.connect().await?;
+        let row = sqlx::query("SELECT summary, steps FROM policies").fetch_one(&mut connection).await?;
+        let stored = Self { summary: row.try_get("summary")?, steps: row.try_get("steps")? };
+        connection.close().await?;
+        Ok(stored)
+    }
 }
 
 async fn open(directory: &Path) -> Result<sqlx::SqliteConnection, Failure> {

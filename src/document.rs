@@ -8,6 +8,9 @@
 //! A reader returns `Option`: `None` means that it noted at least one fault. [`Faults::check`] turns the two
 //! into a `Result` at the end.
 //!
+//! Where that takes too long, what is well-formed may be read from its text at once (such as a small demonstration); whatever is not is
+//! read again, to tell what is wrong.
+//!
 //! This module knows no document in particular; those live beside the types that they describe.
 
 use std::fmt;

@@ -34,8 +34,8 @@
 //! | [`config`], [`telemetry`] | settings, logs and measurements |
 //!
 //! A request for a policy passes `http::policies` (body), `service::policies` (model from `service::cache`, a place in
-//! `service::pool`), [`mapping::Request`] (faults), [`mapping::Mapper`] (search), [`mapping::Policy`] (answer), and
-//! `store::writer` (disk) before it is answered. An observation of a stream passes `http::stream` (transport),
+//! `service::pool`), [`mapping::Request`] (faults), [`mapping::Mapper`] (search), [`mapping::WrittenPolicy`] (the answer, and what
+//! is stored of it), and `store::writer` (disk) before it is answered. An observation of a stream passes `http::stream` (transport),
 //! [`stream::run`] (frames), `service::sessions` (durable before it is acknowledged) and [`mapping::OnlineMapping`]
 //! (committed steps).
 //!

@@ -196,7 +196,10 @@ impl From<ServiceError> for Problem {
             ServiceError::Store(StoreError::Closed) | ServiceError::Pool(PoolError::Stopped) => {
                 Self::new(ProblemKind::Stopping, detail)
             }
-            ServiceError::Pool(PoolError::Panicked) | ServiceError::Store(_) | ServiceError::Write(_) => {
+            ServiceError::Pool(PoolError::Panicked)
+            | ServiceError::Store(_)
+            | ServiceError::Write(_)
+            | ServiceError::WritePolicy(_) => {
                 // The client gets nothing but its request id, under which the log has the rest.
                 tracing::error!(error = &error as &dyn Error, "a request failed");
                 Self::new(ProblemKind::Internal, "an internal error was logged under this request id")

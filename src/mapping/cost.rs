@@ -30,13 +30,22 @@ pub(super) struct CostSum {
 }
 
 impl CostSum {
-    /// Adds a step's costs, and gives the sums so far.
-    pub(super) fn add(&mut self, action_cost: f64, distance: f64) -> Cost {
+    /// Adds a step's costs.
+    pub(super) fn add(&mut self, action_cost: f64, distance: f64) {
         self.actions.add(action_cost);
         self.distance.add(distance);
         self.total.add(action_cost);
         self.total.add(distance);
-        Cost { total: as_decimal(self.total), actions: as_decimal(self.actions), distance: as_decimal(self.distance) }
+    }
+
+    /// The sums so far.
+    pub(super) fn cost(&self) -> Cost {
+        Cost { total: self.total(), actions: as_decimal(self.actions), distance: as_decimal(self.distance) }
+    }
+
+    /// What all steps cost so far.
+    pub(super) fn total(&self) -> f64 {
+        as_decimal(self.total)
     }
 }
 
@@ -55,10 +64,11 @@ pub(super) fn rounding_of_sums(n_observations: usize) -> f64 {
 /// The cost of `moves` in `space`.
 pub(super) fn cost_of(problem: &Problem<'_>, space: &impl Space, moves: &[Move]) -> Cost {
     let mut sum = CostSum::default();
-    moves.iter().fold(Cost::default(), |_, step| {
+    for step in moves {
         let action_cost = step.action.map_or(0.0, |action| problem.model.action(action).cost);
-        sum.add(action_cost, problem.distances.distance(step.observation as usize, space.row(step.state)))
-    })
+        sum.add(action_cost, problem.distances.distance(step.observation as usize, space.row(step.state)));
+    }
+    sum.cost()
 }
 
 /// A sum with a running compensation for lost low-order bits (Neumaier 1974).
@@ -102,20 +112,21 @@ mod tests {
     #[test]
     fn many_small_costs_add_up_exactly() {
         let mut sum = CostSum::default();
-        let mut cost = Cost::default();
         for n in 1..=100_u32 {
-            cost = sum.add(0.3, 2.1);
+            sum.add(0.3, 2.1);
             let decimal = |tenths: u32| f64::from(tenths) / 10.0;
             let expected = Cost { total: decimal(24 * n), actions: decimal(3 * n), distance: decimal(21 * n) };
-            assert_eq!(cost, expected, "after {n} steps");
+            assert_eq!(sum.cost(), expected, "after {n} steps");
         }
-        assert_eq!(cost.actions, 30.0);
+        assert_eq!(sum.cost().actions, 30.0);
     }
 
     #[test]
     fn sums_out_of_the_reach_of_decimals_are_left_alone() {
         for term in [0.0, 1e-12, 1e150] {
-            assert_eq!(CostSum::default().add(0.0, term).total.to_bits(), term.to_bits());
+            let mut sum = CostSum::default();
+            sum.add(0.0, term);
+            assert_eq!(sum.total().to_bits(), term.to_bits());
         }
     }
 }

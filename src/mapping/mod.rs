@@ -19,7 +19,7 @@
 //! Mapper::map ---- search (best first) <-------------------+
 //!    |                |  budget over: the incumbent, or completion (greedy)
 //!    v                v
-//! Mapping (moves, status, lower bound, counts) --> Policy (what a client gets)
+//! Mapping (moves, status, lower bound, counts) --> Policy (what a client gets), WrittenPolicy (the same, as it is answered and stored)
 //! ```
 //!
 //! [`OnlineMapping`] does the same while the demonstration is still running.
@@ -41,6 +41,7 @@ mod policy;
 mod problem;
 mod request;
 mod search;
+mod written;
 
 pub use cost::Cost;
 pub use demonstration::Demonstration;
@@ -53,3 +54,5 @@ pub use request::{
     ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,
 };
 pub use search::{Move, MoveKind};
+pub(crate) use written::read_answer;
+pub use written::{WriteError, WrittenPolicy};

@@ -169,6 +169,14 @@ pub struct Coverage {
     pub exact: u32,
 }
 
+impl Coverage {
+    /// Of observations, of each of which is said whether some step meets it.
+    pub(super) fn of(is_exact: &[bool]) -> Self {
+        let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
+        Self { observed: count(is_exact.len()), exact: count(is_exact.iter().filter(|is_exact| **is_exact).count()) }
+    }
+}
+
 /// What a search took.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct SearchReport {
@@ -208,29 +216,24 @@ impl Policy {
     #[must_use]
     pub fn new(stamp: Stamp, problem: &Problem<'_>, mapping: &Mapping) -> Self {
         let steps = steps(problem, mapping);
-        let n_observed = problem.demonstration.len();
-        let mut is_exact = vec![false; n_observed];
+        let mut is_exact = vec![false; problem.demonstration.len()];
         for step in steps.iter().filter(|step| step.distance == 0.0) {
             is_exact[step.observation as usize] = true;
         }
-        let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
         Self {
             id: stamp.id,
             model: stamp.model,
             model_hash: stamp.model_hash,
             learner: stamp.learner,
             weights_version: stamp.weights_version,
-            weights: problem.model.schema().by_attribute(problem.weights.as_slice().iter().copied()),
+            weights: problem.named_weights(),
             lookahead: stamp.lookahead,
             status: mapping.status,
             cost: mapping.cost,
             lower_bound: mapping.lower_bound,
             actions: steps.iter().filter_map(|step| step.action.clone()).collect(),
             steps,
-            coverage: Coverage {
-                observed: count(n_observed),
-                exact: count(is_exact.iter().filter(|is_exact| **is_exact).count()),
-            },
+            coverage: Coverage::of(&is_exact),
             search: SearchReport {
                 expanded: mapping.n_expanded,
                 generated: mapping.n_generated,
@@ -256,7 +259,6 @@ fn steps(problem: &Problem<'_>, mapping: &Mapping) -> Vec<Step> {
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct StepWriter {
     sum: CostSum,
-    cost: Cost,
     n_steps: u32,
 }
 
@@ -277,7 +279,7 @@ impl StepWriter {
             distance += term;
             by_attribute[position] = Some(term);
         }
-        self.cost = self.sum.add(action_cost, distance);
+        self.sum.add(action_cost, distance);
         self.n_steps += 1;
         Step {
             step: self.n_steps - 1,
@@ -289,12 +291,12 @@ impl StepWriter {
             action_cost,
             distance,
             distance_by_attribute: schema.by_some_attributes(by_attribute),
-            cost: self.cost.total,
+            cost: self.sum.total(),
         }
     }
 
     /// What the steps cost so far.
     pub(super) fn cost(&self) -> Cost {
-        self.cost
+        self.sum.cost()
     }
 }

@@ -2,7 +2,7 @@
 
 use super::Demonstration;
 use super::distances::Distances;
-use crate::attribute::Weights;
+use crate::attribute::{ByAttribute, Weights};
 use crate::model::{CaveState, Model, Origin, Start, StateIdx};
 
 /// A demonstration to be followed by a body, under given weights, from a given start.
@@ -37,6 +37,11 @@ impl<'m> Problem<'m> {
             _ => model.states().row(start).to_vec(),
         };
         Self { model, demonstration, weights, start, cave_start, start_row, distances }
+    }
+
+    /// The weights of the distance, by attribute.
+    pub(crate) fn named_weights(&self) -> ByAttribute<f64> {
+        self.model.schema().by_attribute(self.weights.as_slice().iter().copied())
     }
 
     /// The demonstration.

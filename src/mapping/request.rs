@@ -59,15 +59,27 @@ impl<'m> Request<'m> {
         base: impl FnOnce(&mut Faults) -> Option<Weights>,
         faults: &mut Faults,
     ) -> Option<Self> {
-        let schema = model.schema();
         let demonstration = object.required("demonstration", faults);
         let demonstration = demonstration.and_then(|place| {
             // Before it is read: small observations make as large steps as others.
             let n_observations = place.value.as_array().map_or(0, Vec::len);
             let is_answerable = n_observations > Demonstration::MAX_OBSERVATIONS
                 || Policy::check_size(model, n_observations, &place, faults);
-            is_answerable.then(|| Demonstration::read(schema, &place, faults)).flatten()
+            is_answerable.then(|| Demonstration::read(model.schema(), &place, faults)).flatten()
         });
+        Self::read_beside(demonstration, model, object, base, faults)
+    }
+
+    /// Reads a request like [`Self::read_over`], whose demonstration was read before; `None` if that has faults. It must be one whose
+    /// policy is not too large.
+    pub(crate) fn read_beside(
+        demonstration: Option<Demonstration>,
+        model: &'m Model,
+        object: &Object<'_, '_>,
+        base: impl FnOnce(&mut Faults) -> Option<Weights>,
+        faults: &mut Faults,
+    ) -> Option<Self> {
+        let schema = model.schema();
         let named = match object.optional("weights") {
             Some(place) => schema.read_named_weights(&place, faults),
             None => Some(Vec::new()),

@@ -21,7 +21,7 @@ use serde_json::{Map, Value};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-use super::policies::{Envelope, Named, Searched, base_weights, follow, parse, searched};
+use super::policies::{Envelope, Named, Searched, base_weights, follow, parse};
 use super::{Etude, MadePolicy, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{Faults, Object, Path, Place};
@@ -191,7 +191,7 @@ impl Batch {
             Err(faults) => return Ok(Err(faults.into())),
         };
         let stamp = Stamp { id: Some(Uuid::now_v7().to_string()), ..self.stamp.clone() };
-        Ok(searched(&follow(&self.mapper, &request, stamp, interrupt)?, &document))
+        follow(&self.mapper, &request, &document, stamp, interrupt)
     }
 
     /// The item as a request of its own.

@@ -38,6 +38,7 @@ use tokio_util::task::TaskTracker;
 pub use trials::TrialAnswer;
 
 use crate::document::{Faults, ParseError, Quoted};
+use crate::mapping::WriteError;
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
 use cache::{MapperCache, ModelNames};
@@ -127,6 +128,9 @@ pub enum ServiceError {
     /// What was made could not be written as JSON: a defect.
     #[error("an answer could not be written")]
     Write(#[source] serde_json::Error),
+    /// A policy could not be written: a defect.
+    #[error("a policy could not be written")]
+    WritePolicy(#[from] WriteError),
 }
 
 /// The application.

@@ -5,9 +5,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
-use serde::Serialize;
-use serde_json::Value;
+use serde::de::{Error as _, MapAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::value::RawValue;
+use serde_json::{Map, Value};
 use uuid::Uuid;
 
 use super::learners::Ready;
@@ -15,7 +16,7 @@ use super::{Admission, Etude, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Status};
+use crate::mapping::{Demonstration, Mapper, Mapping, Problem, Request, Stamp, Status, WrittenPolicy};
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
@@ -46,30 +47,17 @@ impl Etude {
         now: Timestamp,
     ) -> Result<MadePolicy, ServiceError> {
         let place = self.pool.admit()?;
-        let is_small = body.as_ref().len() <= MAX_INLINE_BYTES;
-        let document = parse(body, &place).await?;
-        let (envelope, faults) = Envelope::read(&document, &Request::FIELDS, "demonstration");
-        // With the help of the model, more faults may be found; so those found without it wait.
-        let Some(envelope) = envelope else { return Err(faults.into()) };
-        let Named { learner, model_hash, mapper } = self.find(&envelope, faults, &place).await?;
-
         let id = Uuid::now_v7().to_string();
-        let stamp = Stamp {
-            id: Some(id.clone()),
-            model: envelope.model,
-            model_hash,
-            learner: learner.as_ref().map(|ready| ready.name.clone()),
-            weights_version: learner.as_ref().map(|ready| ready.weights.version),
-            ..Stamp::default()
+        let quick = if body.as_ref().len() <= MAX_INLINE_BYTES {
+            self.search_quickly(body.as_ref(), &id, &place, arrived).await?
+        } else {
+            None
         };
-        let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
-        let is_quick = is_small && is_quick(mapper.model(), &document);
-        let job = move |interrupt: &mut dyn Interrupt| {
-            let base = |faults: &mut Faults| base_weights(mapper.model(), learner.as_ref(), faults);
-            search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)
+        let searched = match quick {
+            Some(searched) => searched,
+            None => self.search_at_length(body, &id, &place, arrived).await?,
         };
-        let searched = if is_quick { place.run_here(deadline, job).await } else { place.run(deadline, job).await };
-        let Searched { policy, row, refinement } = searched??;
+        let Searched { policy, row, refinement } = searched;
         // The disk is no concern of those who wait for a thread.
         drop(place);
         let is_refined = refinement.is_some();
@@ -78,6 +66,68 @@ impl Etude {
             self.refiner.wake();
         }
         Ok(MadePolicy { id, policy })
+    }
+
+    /// Searches for the policy of a request that is well-formed in all its parts, and for which [`is_quick`]. Nothing for others, of
+    /// which it takes a closer look to tell what is wrong.
+    async fn search_quickly(
+        &self,
+        body: &[u8],
+        id: &str,
+        place: &Admission,
+        arrived: Instant,
+    ) -> Result<Option<Searched>, ServiceError> {
+        let Ok(Outline { document, demonstration }) = serde_json::from_slice::<Outline<'_>>(body) else {
+            return Ok(None);
+        };
+        let (Some(envelope), faults) = Envelope::read(&document, &Request::FIELDS, "demonstration") else {
+            return Ok(None);
+        };
+        let Ok(named) = self.find(&envelope, faults, place).await else { return Ok(None) };
+        let model = named.mapper.model();
+        let demonstration = Demonstration::read_well_formed(model.schema(), demonstration.get());
+        let Some(demonstration) = demonstration.filter(|read| is_quick(model, &document, read.len())) else {
+            return Ok(None);
+        };
+        let (deadline, stamp) = (envelope.deadline(arrived), envelope.stamp(id, &named));
+        let Named { learner, mapper, .. } = &named;
+        let job = |interrupt: &mut dyn Interrupt| {
+            let mut faults = Faults::default();
+            let object = Place::root(&document).object(&Request::FIELDS, &mut faults);
+            let request = object.and_then(|object| {
+                let base = |faults: &mut Faults| base_weights(model, learner.as_ref(), faults);
+                Request::read_beside(Some(demonstration), model, &object, base, &mut faults)
+            });
+            let Ok(request) = faults.check(request) else { return Ok(Ok(None)) };
+            let searched = follow(mapper, &request, &document, stamp, interrupt)?;
+            Ok(searched.map(Some))
+        };
+        place.run_here(deadline, job).await?
+    }
+
+    /// Searches for the policy of any request, and tells what is wrong with it.
+    async fn search_at_length(
+        &self,
+        body: impl AsRef<[u8]> + Send + 'static,
+        id: &str,
+        place: &Admission,
+        arrived: Instant,
+    ) -> Result<Searched, ServiceError> {
+        let is_small = body.as_ref().len() <= MAX_INLINE_BYTES;
+        let document = parse(body, place).await?;
+        let (envelope, faults) = Envelope::read(&document, &Request::FIELDS, "demonstration");
+        // With the help of the model, more faults may be found; so those found without it wait.
+        let Some(envelope) = envelope else { return Err(faults.into()) };
+        let named = self.find(&envelope, faults, place).await?;
+        let (deadline, stamp) = (envelope.deadline(arrived), envelope.stamp(id, &named));
+        let Named { learner, mapper, .. } = named;
+        let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
+        let is_quick = is_small && is_quick(mapper.model(), &document, n_observations);
+        let job = move |interrupt: &mut dyn Interrupt| {
+            let base = |faults: &mut Faults| base_weights(mapper.model(), learner.as_ref(), faults);
+            search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)
+        };
+        if is_quick { place.run_here(deadline, job).await? } else { place.run(deadline, job).await? }
     }
 
     /// Finds what the request names. `faults` are those found so far; what is unknown is one more, if there are any.
@@ -151,6 +201,42 @@ pub(super) struct Envelope {
     pub(super) deadline: Option<Duration>,
 }
 
+/// A request whose demonstration, which is most of it, is not read yet.
+struct Outline<'b> {
+    /// With something else in place of the demonstration.
+    document: Value,
+    demonstration: &'b RawValue,
+}
+
+impl<'de: 'b, 'b> Deserialize<'de> for Outline<'b> {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct Members;
+        impl<'de> Visitor<'de> for Members {
+            type Value = Outline<'de>;
+
+            fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.write_str("a request")
+            }
+
+            fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<Outline<'de>, A::Error> {
+                let (mut document, mut demonstration) = (Map::new(), None);
+                while let Some(name) = members.next_key::<String>()? {
+                    let value = if name == "demonstration" {
+                        demonstration = Some(members.next_value()?);
+                        Value::Bool(true)
+                    } else {
+                        members.next_value()?
+                    };
+                    document.insert(name, value);
+                }
+                let demonstration = demonstration.ok_or_else(|| A::Error::missing_field("demonstration"))?;
+                Ok(Outline { document: Value::Object(document), demonstration })
+            }
+        }
+        deserializer.deserialize_map(Members)
+    }
+}
+
 /// What a request names.
 pub(super) struct Named {
     pub(super) learner: Option<Ready>,
@@ -177,6 +263,23 @@ impl Envelope {
         });
         (envelope, faults)
     }
+
+    /// When a request that came at `arrived` is to be answered.
+    fn deadline(&self, arrived: Instant) -> Option<Instant> {
+        self.deadline.and_then(|deadline| arrived.checked_add(deadline))
+    }
+
+    /// What the policy `id` is stamped with.
+    fn stamp(&self, id: &str, named: &Named) -> Stamp {
+        Stamp {
+            id: Some(id.to_owned()),
+            model: self.model.clone(),
+            model_hash: named.model_hash.clone(),
+            learner: named.learner.as_ref().map(|ready| ready.name.clone()),
+            weights_version: named.learner.as_ref().map(|ready| ready.weights.version),
+            ..Stamp::default()
+        }
+    }
 }
 
 /// Largest search that runs where its request arrived: observations times states and transitions. One that looks at all of this
@@ -185,8 +288,7 @@ const MAX_INLINE_WORK: usize = 16_384;
 
 /// Whether a request with a small body is answered sooner than another thread would have taken it over. Of what may be in a
 /// request, a finite lookahead and the paper's heuristic can take far longer than the size of the problem tells.
-fn is_quick(model: &Model, document: &Value) -> bool {
-    let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
+fn is_quick(model: &Model, document: &Value, n_observations: usize) -> bool {
     let size = model.graph().n_states() + model.graph().n_transitions();
     let step_bytes = || serde_json::to_string(&model.describe(0)).map_or(usize::MAX, |text| text.len());
     document["lookahead"].is_null()
@@ -207,21 +309,26 @@ pub(super) struct Searched {
 /// A policy as it will be stored.
 pub(super) struct PolicyText {
     id: String,
-    policy: String,
     summary: String,
+    steps: Vec<u8>,
 }
 
 impl PolicyText {
-    /// Writes a policy that has an id.
-    pub(super) fn of(policy: &Policy) -> Result<Self, ServiceError> {
-        let id = policy.id.clone().unwrap_or_default();
-        Ok(Self { id, policy: write(policy)?, summary: write(&PolicySummary::of(policy))? })
-    }
-
     pub(super) fn at(self, created_at: Timestamp) -> NewPolicy {
-        let Self { id, policy, summary } = self;
-        NewPolicy { id, summary, policy, created_at }
+        let Self { id, summary, steps } = self;
+        NewPolicy { id, summary, steps, created_at }
     }
+}
+
+/// Writes the policy of `mapping`, which has an id: as it will be answered, and as it will be stored.
+pub(super) fn write_policy(
+    stamp: Stamp,
+    problem: &Problem<'_>,
+    mapping: &Mapping,
+) -> Result<(String, PolicyText), ServiceError> {
+    let written = WrittenPolicy::new(&stamp, problem, mapping)?;
+    let WrittenPolicy { answer, summary, steps } = written;
+    Ok((answer, PolicyText { id: stamp.id.unwrap_or_default(), summary, steps }))
 }
 
 /// Reads the request against its model, with weights from `base` where it names none, searches, and writes the policy.
@@ -234,23 +341,38 @@ pub(super) fn search(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
     match read_request(mapper.model(), document, fields, base) {
-        Ok(request) => Ok(searched(&follow(mapper, &request, stamp, interrupt)?, document)),
+        Ok(request) => follow(mapper, &request, document, stamp, interrupt),
         Err(faults) => Ok(Err(faults.into())),
     }
 }
 
-/// Searches, and gives the policy.
+/// Searches, and writes the policy. The request was read from `document`.
 pub(super) fn follow(
     mapper: &Arc<Mapper>,
     request: &Request<'_>,
+    document: &Value,
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
-) -> Result<Policy, Cancelled> {
+) -> Result<Result<Searched, ServiceError>, Cancelled> {
     let started = Instant::now();
     let mapping = request.solve(mapper, interrupt)?;
     let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
-    Ok(Policy::new(stamp, &request.problem, &mapping))
+    let refinement = (mapping.status == Status::Local).then(|| {
+        let mut request_for_refined = document.clone();
+        // The weights that are used, wherever they came from.
+        request_for_refined["weights"] = serde_json::json!(request.problem.named_weights());
+        for name in ["learner", "lookahead"] {
+            request_for_refined[name] = Value::Null;
+        }
+        NewRefinement {
+            policy_id: stamp.id.clone().unwrap_or_default(),
+            model_hash: stamp.model_hash.clone(),
+            request: request_for_refined.to_string(),
+        }
+    });
+    let written = write_policy(stamp, &request.problem, &mapping);
+    Ok(written.map(|(policy, row)| Searched { policy, row, refinement }))
 }
 
 /// The weights from which a request starts: the means of its learner, or the model's own.
@@ -259,21 +381,6 @@ pub(super) fn base_weights(model: &Model, learner: Option<&Ready>, faults: &mut 
     let Some(Ready { learner, weights, .. }) = learner else { return Some(schema.weights()) };
     let learned = learner.weights_for(schema, &weights.distribution.mean);
     learned.map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string())).ok()
-}
-
-/// Writes the policy that was made for the request in `document`.
-pub(super) fn searched(policy: &Policy, document: &Value) -> Result<Searched, ServiceError> {
-    let row = PolicyText::of(policy)?;
-    let refinement = (policy.status == Status::Local).then(|| {
-        let mut request = document.clone();
-        // The weights that were used, wherever they came from.
-        request["weights"] = serde_json::json!(policy.weights);
-        for name in ["learner", "lookahead"] {
-            request[name] = Value::Null;
-        }
-        NewRefinement { policy_id: row.id.clone(), model_hash: policy.model_hash.clone(), request: request.to_string() }
-    });
-    Ok(Searched { policy: row.policy.clone(), row, refinement })
 }
 
 /// Reads a request that may have these `fields` against its model, with weights from `base` where it names none.

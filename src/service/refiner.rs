@@ -10,7 +10,7 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::policies::{PolicyText, as_micros, read_weighted_request, report};
+use super::policies::{PolicyText, as_micros, read_weighted_request, report, write_policy};
 use super::{Etude, ServiceError};
 use crate::document;
 use crate::interrupt::{Cancelled, Interrupt};
@@ -113,5 +113,5 @@ fn refine(
     }
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
-    Ok(PolicyText::of(&Policy::new(stamp, &request.problem, &mapping)).map(Some))
+    Ok(write_policy(stamp, &request.problem, &mapping).map(|(_, row)| Some(row)))
 }

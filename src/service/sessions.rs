@@ -14,7 +14,7 @@ use uuid::Uuid;
 
 use super::learners::Ready;
 use super::owners::Ownership;
-use super::policies::{PolicyText, as_micros, report};
+use super::policies::{PolicyText, as_micros, report, write_policy};
 use super::{Etude, PoolError, ServiceError};
 use crate::attribute::{ByAttribute, Weights};
 use crate::document::{self, Faults, Object, Path, Place};
@@ -509,8 +509,8 @@ fn conclude(
     let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
-    let policy = Policy::new(stamp, &problem, &mapping);
-    let row = PolicyText::of(&policy)?;
+    let policy = Policy::new(stamp.clone(), &problem, &mapping);
+    let (_, row) = write_policy(stamp, &problem, &mapping)?;
     let refinement = (policy.status == Status::Local).then(|| {
         let parsed = texts.iter().map(|text| serde_json::from_str::<Vec<Value>>(text).unwrap_or_default());
         let demonstration: Vec<Value> = parsed.flatten().collect();

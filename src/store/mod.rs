@@ -8,7 +8,8 @@
 //! ```
 //!
 //! A write that was answered is on disk. Rows become domain types here and nowhere else; times are milliseconds since 1970,
-//! documents are JSON text, in compressed pieces where it is long.
+//! documents are JSON text, in compressed pieces where it is long. Of a policy, what could be told from the rest is left out, and
+//! put back when it is read.
 
 mod arrivals;
 mod definitions;
@@ -45,6 +46,9 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Readers at the same time. Reads are short, and there are few cores.
 const N_READERS: u32 = 4;
+
+/// Statements that a connection keeps prepared: all that there are, those with a number of rows as often as there are numbers.
+const N_STATEMENTS: usize = 256;
 
 /// Why the store could not do as told.
 #[derive(Debug, thiserror::Error)]
@@ -117,6 +121,7 @@ impl Store {
             .journal_mode(SqliteJournalMode::Wal)
             .synchronous(SqliteSynchronous::Full)
             .busy_timeout(BUSY_TIMEOUT)
+            .statement_cache_capacity(N_STATEMENTS)
             .disable_statement_logging();
         let mut connection = SqliteConnection::connect_with(&options).await?;
         check_version(&mut connection).await?;
@@ -168,6 +173,7 @@ fn migrator() -> Migrator {
             migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
             migration(4, "large definitions", include_str!("../../migrations/0004_large_definitions.sql")),
             migration(5, "arrivals", include_str!("../../migrations/0005_arrivals.sql")),
+            migration(6, "short policies", include_str!("../../migrations/0006_short_policies.sql")),
         ]
         .into(),
         ..Migrator::DEFAULT

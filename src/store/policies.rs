@@ -6,6 +6,7 @@ use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
 use super::refinements::NewRefinement;
 use super::writer::Write;
 use super::{Page, Store, StoreError, corrupt};
+use crate::mapping::read_answer;
 
 /// A policy to be stored.
 #[derive(Clone, Debug)]
@@ -14,8 +15,8 @@ pub struct NewPolicy {
     pub id: String,
     /// JSON: the policy without its steps.
     pub summary: String,
-    /// JSON: the whole policy.
-    pub policy: String,
+    /// Its steps in short, as [`WrittenPolicy`](crate::mapping::WrittenPolicy) has them.
+    pub steps: Vec<u8>,
     /// When it was made.
     pub created_at: Timestamp,
 }
@@ -43,14 +44,23 @@ impl Store {
         self.writer.write(Write::AddPolicies(policies, refinements)).await.map(drop)
     }
 
-    /// The policy with this id: JSON.
+    /// The policy with this id, as it was answered: JSON.
     ///
     /// # Errors
     ///
     /// If the database failed.
     pub async fn policy(&self, id: &str) -> Result<Option<String>, StoreError> {
-        let query = sqlx::query_scalar("SELECT policy FROM policies WHERE id = $1").bind(id);
-        Ok(query.fetch_optional(&self.readers).await?)
+        let query = sqlx::query("SELECT summary, policy, steps FROM policies WHERE id = $1").bind(id);
+        let Some(row) = query.fetch_optional(&self.readers).await? else { return Ok(None) };
+        let Some(steps) = row.try_get::<Option<Vec<u8>>, _>("steps")? else { return Ok(Some(row.try_get("policy")?)) };
+        let summary: String = row.try_get("summary")?;
+        let answer = if steps.len() <= MAX_INLINE_BYTES {
+            read_answer(&summary, &steps)
+        } else {
+            let reading = self.tasks.spawn_blocking(move || read_answer(&summary, &steps));
+            reading.await.map_err(corrupt("policies", "steps"))?
+        };
+        Ok(Some(answer.map_err(corrupt("policies", "steps"))?))
     }
 
     /// At most `limit` policies in the order in which they became durable, from the first after the sequence number
@@ -76,26 +86,44 @@ pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -
     add_all(connection, &[policy]).await
 }
 
-/// Most policies that a statement inserts.
-const MAX_ROWS: usize = 32;
+/// Policies whose steps in short are up to this size are written where they are asked for, which takes a millisecond or so; larger
+/// ones on a thread of their own.
+const MAX_INLINE_BYTES: usize = 32 * 1024;
 
-/// Adds policies in this order, several a statement: each statement costs the driver a change of threads. Statements come in a
-/// few lengths, so that they are prepared once.
+/// Most policies that a statement inserts. Each number of them is a statement of its own, which is prepared once and kept.
+const MAX_ROWS: usize = 64;
+
+/// Adds policies in this order, within a transaction.
 pub(super) async fn add_all(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
-    let mut left = policies;
-    while !left.is_empty() {
-        // The largest power of two that fits.
-        let n_rows = 1 << left.len().min(MAX_ROWS).ilog2();
-        let (rows, rest) = left.split_at(n_rows);
-        left = rest;
-        let mut insert = QueryBuilder::<Sqlite>::new("INSERT INTO policies (id, summary, policy, created_at_ms) ");
-        insert.push_values(rows, |mut row, policy| {
-            row.push_bind(&policy.id)
-                .push_bind(&policy.summary)
-                .push_bind(&policy.policy)
-                .push_bind(policy.created_at.as_millisecond());
-        });
-        insert.build().execute(&mut *connection).await?;
+    for rows in policies.chunks(MAX_ROWS) {
+        insert(connection, rows).await?;
     }
+    Ok(())
+}
+
+/// Adds policies in this order, all of them or none, outside of a transaction: one statement, which is durable when this returns.
+/// Says whether they were added; they are not if they are none, or too many.
+pub(super) async fn add_at_once(
+    connection: &mut SqliteConnection,
+    policies: &[&NewPolicy],
+) -> Result<bool, StoreError> {
+    let fits = (1..=MAX_ROWS).contains(&policies.len());
+    if fits {
+        insert(connection, policies).await?;
+    }
+    Ok(fits)
+}
+
+/// Adds some policies. Each statement costs the driver a change of threads, so there is only one.
+async fn insert(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
+    let mut insert = QueryBuilder::<Sqlite>::new("INSERT INTO policies (id, summary, policy, steps, created_at_ms) ");
+    insert.push_values(policies, |mut row, policy| {
+        row.push_bind(&policy.id)
+            .push_bind(&policy.summary)
+            .push("''")
+            .push_bind(&policy.steps)
+            .push_bind(policy.created_at.as_millisecond());
+    });
+    insert.build().execute(connection).await?;
     Ok(())
 }

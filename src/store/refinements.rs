@@ -68,7 +68,8 @@ pub(super) async fn end(connection: &mut SqliteConnection, end: &RefinementEnd) 
     let (true, Some(refined)) = (was_waiting, &end.refined) else { return Ok(()) };
     policies::add(connection, refined).await?;
     sqlx::query(
-        "UPDATE policies SET policy = json_set(policy, '$.refined_by', $2), summary = json_set(summary, '$.refined_by', $2)
+        "UPDATE policies SET summary = json_set(summary, '$.refined_by', $2),
+             policy = iif(steps IS NULL, json_set(policy, '$.refined_by', $2), policy)
          WHERE id = $1",
     )
     .bind(&end.policy_id)

@@ -2,7 +2,8 @@
 //!
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies
 //! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves. Observations,
-//! which are most of it, only arrive with a commit, and are settled in their table later (`arrivals`).
+//! which are most of it, only arrive with a commit, and are settled in their table later (`arrivals`). A group of nothing but
+//! observations, or nothing but policies, takes a single statement, as each costs the driver a change of threads.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -62,6 +63,16 @@ pub(super) enum Write {
         reason: Option<String>,
     },
     PutReward(NewReward),
+}
+
+impl Write {
+    /// The policies that are all there is to it.
+    fn as_policies(&self) -> Option<&[NewPolicy]> {
+        match self {
+            Self::AddPolicies(added, to_refine) if to_refine.is_empty() => Some(added),
+            _ => None,
+        }
+    }
 }
 
 /// What became of a [`Write`].
@@ -213,15 +224,15 @@ async fn commit(
         Write::AddObservations(new) => Some(new),
         _ => None,
     });
-    let committed = match observations.collect::<Option<Vec<_>>>() {
-        Some(news) if arrivals.is_known() && !arrivals.is_full() => {
-            match add_observations(connection, arrivals, &news).await {
-                Ok(None) => transact(connection, arrivals, group).await,
-                Ok(Some(written)) => Ok(written),
-                Err(error) => Err(error),
-            }
-        }
-        _ => transact(connection, arrivals, group).await,
+    let at_once = match observations.collect::<Option<Vec<_>>>() {
+        None => add_policies(connection, group).await,
+        Some(news) if arrivals.is_known() && !arrivals.is_full() => add_observations(connection, arrivals, &news).await,
+        Some(_) => Ok(None),
+    };
+    let committed = match at_once {
+        Ok(Some(written)) => Ok(written),
+        Ok(None) => transact(connection, arrivals, group).await,
+        Err(error) => Err(error),
     };
     if committed.is_err() {
         arrivals.forget();
@@ -242,6 +253,15 @@ async fn add_observations(
         return Ok(None);
     }
     Ok(Some(accepted.is_next.into_iter().map(Written::Done).collect()))
+}
+
+/// Adds policies in one statement, if there is nothing else in the group and they fit; else it gives nothing, and has done nothing.
+async fn add_policies(connection: &mut SqliteConnection, group: &[Job]) -> Result<Option<Vec<Written>>, StoreError> {
+    let added = group.iter().map(|job| job.write.as_policies());
+    let Some(added) = added.collect::<Option<Vec<_>>>() else { return Ok(None) };
+    let added: Vec<_> = added.into_iter().flatten().collect();
+    let was_added = policies::add_at_once(connection, &added).await?;
+    Ok(was_added.then(|| group.iter().map(|_| Written::Done(true)).collect()))
 }
 
 /// Applies `group` in one transaction: observations and policies first, rewards last, each all together. Nobody was answered yet, so that
@@ -277,10 +297,7 @@ async fn transact(
     let mut are_next = are_next.into_iter();
     let mut written = Vec::with_capacity(group.len());
     let mut rewards = Vec::new();
-    let added_policies = group.iter().filter_map(|job| match &job.write {
-        Write::AddPolicies(added, to_refine) if to_refine.is_empty() => Some(added),
-        _ => None,
-    });
+    let added_policies = group.iter().filter_map(|job| job.write.as_policies());
     policies::add_all(&mut transaction, &added_policies.flatten().collect::<Vec<_>>()).await?;
     for job in group {
         written.push(match &job.write {

@@ -1,0 +1,159 @@
+//! Policies as they are stored, and as those of earlier versions were.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::too_many_lines,
+    clippy::cast_possible_truncation,
+    reason = "tests may panic, and are read top to bottom"
+)]
+
+mod oracle;
+mod problems;
+
+use std::path::Path;
+
+use etude::document::{Faults, Place};
+use etude::interrupt::Uninterrupted;
+use etude::mapping::{Mapper, Policy, PolicySummary, Request, Stamp, WrittenPolicy};
+use etude::store::{NewPolicy, NewRefinement, RefinementEnd, Store};
+use jiff::Timestamp;
+use problems::{example, mapper, problem};
+use proptest::prelude::*;
+use serde_json::{Value, json};
+use sqlx::{ConnectOptions, Connection};
+use tokio_util::task::TaskTracker;
+
+/// The policy that `request` gives, and what it is written as.
+fn follow(mapper: &Mapper, request: &Value, stamp: &Stamp) -> (Policy, WrittenPolicy) {
+    let mut faults = Faults::default();
+    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let read = Request::read(mapper.model(), &object, &mut faults);
+    let request = faults.check(read).unwrap();
+    let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();
+    let written = WrittenPolicy::new(stamp, &request.problem, &mapping).unwrap();
+    (Policy::new(stamp.clone(), &request.problem, &mapping), written)
+}
+
+fn stamp(id: &str) -> Stamp {
+    Stamp { id: Some(id.to_owned()), model: r#""coverage":{"#.to_owned(), ..Stamp::default() }
+}
+
+fn figure_4(stamp: &Stamp) -> (Policy, WrittenPolicy) {
+    follow(&mapper(&example("figure-4/model.json")), &example("figure-4/request.json"), stamp)
+}
+
+fn new(id: &str, WrittenPolicy { summary, steps, .. }: WrittenPolicy) -> NewPolicy {
+    NewPolicy { id: id.to_owned(), summary, steps, created_at: Timestamp::UNIX_EPOCH }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn a_policy_is_read_as_it_was_answered((model, demonstration, weights, start) in problem(), huge in any::<bool>()) {
+        let mut model = model;
+        if huge && model["attributes"][0]["kind"] == "number" {
+            // Neither whole nor short.
+            for state in model["dynamics"]["states"].as_array_mut().unwrap() {
+                state[0] = json!(state[0].as_f64().unwrap() * 1e300 / 3.0);
+            }
+        }
+        let request = json!({"model": "m", "demonstration": demonstration, "weights": weights, "start": start});
+        let (policy, written) = follow(&mapper(&model), &request, &stamp("p"));
+        prop_assert_eq!(&written.answer, &serde_json::to_string(&policy).unwrap());
+        prop_assert_eq!(&written.summary, &serde_json::to_string(&PolicySummary::of(&policy)).unwrap());
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let answer = written.answer.clone();
+        let stored = runtime.block_on(async {
+            let directory = tempfile::tempdir().unwrap();
+            let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+            store.add_policies(vec![new("p", written)], Vec::new()).await.unwrap();
+            store.policy("p").await.unwrap().unwrap()
+        });
+        prop_assert_eq!(stored, answer);
+    }
+}
+
+#[test]
+fn a_policy_takes_a_fifth_of_what_is_answered_at_most() {
+    let (_, WrittenPolicy { answer, summary, steps }) = figure_4(&stamp("p"));
+    assert!(
+        5 * (summary.len() + steps.len()) < answer.len(),
+        "{} + {} of {}",
+        summary.len(),
+        steps.len(),
+        answer.len()
+    );
+}
+
+/// Stores a policy in `database` as it was done before its steps were packed.
+async fn store_whole(database: &Path, policy: &Policy) {
+    let mut connection = sqlx::sqlite::SqliteConnectOptions::new().filename(database).connect().await.unwrap();
+    sqlx::query("INSERT INTO policies (id, summary, policy, created_at_ms) VALUES ($1, $2, $3, 0)")
+        .bind(policy.id.as_deref())
+        .bind(serde_json::to_string(&PolicySummary::of(policy)).unwrap())
+        .bind(serde_json::to_string(policy).unwrap())
+        .execute(&mut connection)
+        .await
+        .unwrap();
+    connection.close().await.unwrap();
+}
+
+#[tokio::test]
+async fn policies_of_earlier_versions_are_read_listed_and_refined_like_new_ones() {
+    let directory = tempfile::tempdir().unwrap();
+    let database = directory.path().join("etude.db");
+    let store = Store::open(&database, &TaskTracker::new()).await.unwrap();
+    let refinement =
+        |id: &str| NewRefinement { policy_id: id.to_owned(), model_hash: String::new(), request: "{}".to_owned() };
+    // Both refinements are noted with the new one.
+    store_whole(&database, &figure_4(&stamp("old")).0).await;
+    let refinements = vec![refinement("old"), refinement("new")];
+    store.add_policies(vec![new("new", figure_4(&stamp("new")).1)], refinements).await.unwrap();
+    for (id, refined_by) in [("old", "old-refined"), ("new", "new-refined")] {
+        let (mut policy, written) = figure_4(&stamp(id));
+        assert_eq!(store.policy(id).await.unwrap().unwrap(), written.answer);
+        let (_, refined) = figure_4(&Stamp { refines: Some(id.to_owned()), ..stamp(refined_by) });
+        let answer = refined.answer.clone();
+        let end = RefinementEnd { policy_id: id.to_owned(), refined: Some(new(refined_by, refined)) };
+        store.end_refinement(end).await.unwrap();
+        policy.refined_by = Some(refined_by.to_owned());
+        assert_eq!(store.policy(id).await.unwrap().unwrap(), serde_json::to_string(&policy).unwrap());
+        assert_eq!(store.policy(refined_by).await.unwrap().unwrap(), answer);
+    }
+    let listed = store.policies(0, 100).await.unwrap().items;
+    let ids = listed.iter().map(|row| serde_json::from_str::<Value>(&row.summary).unwrap()["id"].clone());
+    assert_eq!(ids.collect::<Vec<_>>(), ["old", "new", "old-refined", "new-refined"]);
+}
+
+#[tokio::test]
+async fn a_long_policy_is_read_as_it_was_answered() {
+    let mut request = example("figure-4/request.json");
+    let observations = request["demonstration"].as_array().unwrap();
+    let there_and_back: Vec<Value> = observations.iter().chain(observations.iter().rev()).cloned().collect();
+    request["demonstration"] = Value::Array(there_and_back.iter().cycle().take(3000).cloned().collect());
+    let (policy, written) = follow(&mapper(&example("figure-4/model.json")), &request, &stamp("long"));
+    assert_eq!(written.answer, serde_json::to_string(&policy).unwrap());
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+    store.add_policies(vec![new("long", written)], Vec::new()).await.unwrap();
+    assert_eq!(store.policy("long").await.unwrap().unwrap(), serde_json::to_string(&policy).unwrap());
+}
+
+#[tokio::test]
+async fn policies_that_come_together_are_stored_together_and_one_that_cannot_be_spoils_no_other() {
+    const N_POLICIES: usize = 200;
+    let (_, written) = figure_4(&stamp("p"));
+    let directory = tempfile::tempdir().unwrap();
+    let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+    store.add_policies(vec![new("100", written.clone())], Vec::new()).await.unwrap();
+    let policies = (0..N_POLICIES).map(|n| store.add_policies(vec![new(&n.to_string(), written.clone())], Vec::new()));
+    let added = futures_util::future::join_all(policies).await;
+    let refused: Vec<_> = added.iter().enumerate().filter(|(_, added)| added.is_err()).map(|(n, _)| n).collect();
+    assert_eq!(refused, [100], "its id is taken");
+    let listed = store.policies(0, 1000).await.unwrap().items;
+    assert_eq!(listed.len(), N_POLICIES);
+    for n in 0..N_POLICIES {
+        assert_eq!(store.policy(&n.to_string()).await.unwrap().as_ref(), Some(&written.answer));
+    }
+}
