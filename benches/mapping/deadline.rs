@@ -5,18 +5,24 @@ use std::time::{Duration, Instant};
 use etude::interrupt::Signal;
 use etude::mapping::Settings;
 
-use crate::{Spread, prepare, problem, shown, table};
+use crate::worlds::World;
+use crate::{Spread, prepare, problem, shown, table, worlds};
 
 const N_ROUNDS: usize = 5;
 
 pub(crate) fn measure() {
-    let world = table::table(100_000, 2_000, 1);
-    println!("\nsearches cut short: {}, 2,000 observations", world.name);
+    // One that takes a few milliseconds, and one that takes a minute.
+    compare(&worlds::cave(40, 8, 100, 1), &[500, 1_000, 2_000, 3_000, 4_000]);
+    compare(&table::table(100_000, 2_000, 1), &[20_000, 50_000, 100_000, 500_000, 2_000_000]);
+}
+
+fn compare(world: &World, deadlines_us: &[u64]) {
+    let mapper = prepare(world);
+    let problem = problem(&mapper, world);
+    println!("\nsearches cut short: {}, {} observations", world.name, problem.demonstration().len());
     println!("{:>12} {:>36} {:>10} {:>10} {:>12}", "deadline", "answered after", "of it", "cost", "lower bound");
-    let mapper = prepare(&world);
-    let problem = problem(&mapper, &world);
-    for deadline_ms in [20, 50, 100, 500, 2_000] {
-        let deadline = Duration::from_millis(deadline_ms);
+    for deadline_us in deadlines_us {
+        let deadline = Duration::from_micros(*deadline_us);
         let solve = || {
             let started = Instant::now();
             let mut interrupt = || if started.elapsed() < deadline { Signal::Continue } else { Signal::Finish };
