@@ -237,8 +237,7 @@ impl Mapper {
         let Settings { budget, grouping, .. } = settings;
         let n_nodes =
             space.n_states().map_or(u64::MAX, |n| (n as u64).saturating_mul(problem.demonstration.len() as u64));
-        let may_sweep = space.n_states().is_some_and(|n_states| n_states <= MAX_SWEPT_STATES)
-            && n_nodes.saturating_mul(2) <= budget.max_expansions;
+        let may_be_swept = space.n_states().is_some_and(|n_states| n_states <= MAX_SWEPT_STATES);
         let n_observations = problem.demonstration.len();
         // Where there are not even expansions enough to look at every observation, much depends on good estimates.
         let is_small_budget = budget.max_expansions < n_observations as u64;
@@ -255,8 +254,10 @@ impl Mapper {
             let max_expansions = budget.max_expansions - n_before;
             // What would be done instead, should it take that long.
             let n_untabled = if max_entries < MAX_ENTRIES { projected.n_left_out() } else { 0 };
+            let before_sweep = patience.min_expansions_before_sweep.max(n_nodes / patience.nodes_per_expansion);
+            let may_sweep = may_be_swept && before_sweep.saturating_add(n_nodes) <= max_expansions;
             let enough = match n_untabled {
-                0 if may_sweep => patience.min_expansions_before_sweep.max(n_nodes / patience.nodes_per_expansion),
+                0 if may_sweep => before_sweep,
                 0 => u64::MAX,
                 n_untabled => n_untabled / patience.entries_per_expansion,
             };
@@ -264,17 +265,29 @@ impl Mapper {
             let mut found = self.search(space, problem, &mut projected, capped, most_f, interrupt)?;
             let is_enough = !found.is_complete && enough < max_expansions && found.n_expanded >= enough;
             if let Some((_, before)) = before.take() {
-                found.n_expanded += before.n_expanded;
-                found.n_generated += before.n_generated;
-                found.least_f = found.least_f.max(before.least_f);
-                found.paths.extend(before.paths);
+                found = joined(before, found);
             }
             if is_enough && n_untabled > 0 {
                 before = Some((projected, found));
                 continue;
             }
-            if is_enough && let Some(swept) = self.sweep(problem, &found, budget, interrupt)? {
-                return Ok(swept);
+            if is_enough {
+                let swept = self.sweep(problem, budget, interrupt)?;
+                found.n_expanded += swept.n_expanded;
+                found.n_generated += swept.n_generated;
+                match swept.outcome {
+                    Outcome::Mapped(mapping) => {
+                        let Found { n_expanded, n_generated, .. } = found;
+                        return Ok(Mapping { n_expanded, n_generated, ..mapping });
+                    }
+                    Outcome::CutShort => {}
+                    Outcome::TooLarge => {
+                        let max_expansions = budget.max_expansions - found.n_expanded;
+                        let rest = Budget { max_expansions, ..budget };
+                        let more = self.search(space, problem, &mut projected, rest, most_f, interrupt)?;
+                        found = joined(found, more);
+                    }
+                }
             }
             return conclude(problem, space, &projected, found, interrupt);
         }
@@ -305,29 +318,57 @@ impl Mapper {
         Ok(found)
     }
 
-    /// The cheapest mapping, from the cheapest ways to all states at each observation after the other. `None` if `interrupt` said
-    /// to finish first, or the ways take more memory than `budget` allows.
-    fn sweep(
-        &self,
-        problem: &Problem<'_>,
-        found: &Found,
-        budget: Budget,
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<Option<Mapping>, Cancelled> {
+    /// The cheapest mapping, from the cheapest ways to all states at each observation after the other.
+    fn sweep(&self, problem: &Problem<'_>, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Swept, Cancelled> {
         let mut online = OnlineMapping::new(self, problem.weights.clone(), Some(problem.start), None);
+        let mut is_cut_short = None;
         for observation in problem.demonstration.iter() {
-            match interrupt.poll() {
-                Signal::Continue if online.n_nodes() <= budget.max_nodes => online.observe(observation, interrupt)?,
-                Signal::Continue | Signal::Finish => return Ok(None),
+            is_cut_short = match interrupt.poll() {
+                Signal::Continue if online.n_nodes() > budget.max_nodes => Some(Outcome::TooLarge),
+                Signal::Continue => None,
+                Signal::Finish => Some(Outcome::CutShort),
                 Signal::Cancel => return Err(Cancelled),
             };
+            if is_cut_short.is_some() {
+                break;
+            }
+            online.observe(observation, interrupt)?;
         }
-        let swept = online.end().map(|(_, mapping)| Mapping {
-            n_expanded: found.n_expanded + mapping.n_expanded,
-            n_generated: found.n_generated + mapping.n_generated,
-            ..mapping
-        });
-        Ok(swept)
+        let (n_expanded, n_generated) = (online.n_expanded(), online.n_generated());
+        let end = || online.end().map_or(Outcome::CutShort, |(_, mapping)| Outcome::Mapped(mapping));
+        Ok(Swept { outcome: is_cut_short.unwrap_or_else(end), n_expanded, n_generated })
+    }
+}
+
+/// What a sweep gave, and what it took.
+#[derive(Debug)]
+struct Swept {
+    outcome: Outcome,
+    n_expanded: u64,
+    n_generated: u64,
+}
+
+/// How a sweep ended.
+#[derive(Debug, PartialEq)]
+enum Outcome {
+    /// With the cheapest mapping.
+    Mapped(Mapping),
+    /// The interrupt said to finish.
+    CutShort,
+    /// The ways would have taken more memory than the budget allows.
+    TooLarge,
+}
+
+/// What two searches for the same mappings found together, of which the later one is `found`.
+fn joined(before: Found, found: Found) -> Found {
+    let mut paths = found.paths;
+    paths.extend(before.paths);
+    Found {
+        paths,
+        least_f: found.least_f.max(before.least_f),
+        n_expanded: before.n_expanded + found.n_expanded,
+        n_generated: before.n_generated + found.n_generated,
+        is_complete: found.is_complete,
     }
 }
 
@@ -615,16 +656,43 @@ mod tests {
 
         let (mapper, request) = belt(6, 40);
         let request = read(&mapper, &request);
-        let found = || Found { paths: Vec::new(), is_complete: false, least_f: 0.0, n_expanded: 7, n_generated: 9 };
-        let sweep =
-            |interrupt: &mut dyn Interrupt| mapper.sweep(&request.problem, &found(), Budget::DEFAULT, interrupt);
-        let swept = sweep(&mut Uninterrupted).unwrap().unwrap();
+        let sweep = |interrupt: &mut dyn Interrupt| mapper.sweep(&request.problem, Budget::DEFAULT, interrupt);
+        let swept = sweep(&mut Uninterrupted).unwrap();
+        assert_eq!(swept.n_expanded, 60 * 40);
+        let Outcome::Mapped(swept) = swept.outcome else { panic!("{swept:?}") };
         let settings = Settings { heuristic: HeuristicName::None, ..Settings::default() };
         let without = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
         assert_eq!((swept.cost.total, swept.status), (without.cost.total, Status::Optimal));
         assert_eq!(swept.lower_bound, Some(swept.cost.total));
-        assert_eq!(swept.n_expanded, 7 + 60 * 40);
-        assert_eq!(sweep(&mut || Signal::Finish), Ok(None));
-        assert_eq!(sweep(&mut || Signal::Cancel), Err(Cancelled));
+        assert_eq!(sweep(&mut || Signal::Finish).unwrap().outcome, Outcome::CutShort);
+        assert_eq!(sweep(&mut || Signal::Cancel).unwrap_err(), Cancelled);
+    }
+
+    #[test]
+    fn a_search_goes_on_where_there_is_no_room_for_a_sweep_and_none_is_begun_that_would_take_too_many_expansions() {
+        let (mapper, request) = belt(3_000, 30);
+        let patience = Patience {
+            few_entries: MAX_ENTRIES,
+            min_expansions_before_sweep: 100,
+            nodes_per_expansion: u64::MAX,
+            ..Patience::DEFAULT
+        };
+        let mapper = Mapper { patience, ..mapper };
+        let request = read(&mapper, &request);
+        let map = |budget| {
+            let settings = Settings { budget, ..Settings::default() };
+            mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap()
+        };
+        let swept = map(Budget::DEFAULT);
+        assert_eq!((swept.status, swept.n_expanded), (Status::Optimal, 100 + 30_000 * 30));
+        // The newest layer alone has 30,000 nodes.
+        let searched = map(Budget { max_nodes: 20_000, ..Budget::DEFAULT });
+        assert_eq!((searched.status, searched.cost.total), (Status::Optimal, swept.cost.total));
+        assert!(searched.n_expanded < 100 + 30_000 * 2, "one layer, and a search: {}", searched.n_expanded);
+
+        let n_all = swept.n_expanded;
+        assert_eq!(map(Budget { max_expansions: n_all, ..Budget::DEFAULT }).n_expanded, n_all);
+        let searched = map(Budget { max_expansions: n_all - 1, ..Budget::DEFAULT });
+        assert!(searched.status == Status::Optimal && searched.n_expanded < 30_000, "{}", searched.n_expanded);
     }
 }

@@ -153,6 +153,16 @@ impl OnlineMapping {
         self.window.n_alive()
     }
 
+    /// How many nodes were looked at. Each observation looks at every state once.
+    pub(super) fn n_expanded(&self) -> u64 {
+        u64::from(self.n_observed) * self.model.graph().n_states() as u64
+    }
+
+    /// How many moves were looked at.
+    pub(super) fn n_generated(&self) -> u64 {
+        u64::from(self.n_observed) * self.model.graph().n_transitions() as u64
+    }
+
     /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits.
     ///
     /// # Errors
@@ -195,10 +205,7 @@ impl OnlineMapping {
         let committed = path.into_iter().map(|place| self.commit_at(place, true)).collect();
         let status = if self.was_forced { Status::Local } else { Status::Optimal };
         let lower_bound = (status == Status::Optimal).then_some(self.cost.total);
-        // Each observation looks at every state once.
-        let graph = self.model.graph();
-        let n_expanded = u64::from(self.n_observed) * graph.n_states() as u64;
-        let n_generated = u64::from(self.n_observed) * graph.n_transitions() as u64;
+        let (n_expanded, n_generated) = (self.n_expanded(), self.n_generated());
         let mapping =
             Mapping { moves: self.moves, cost: self.cost, status, lower_bound, n_expanded, n_generated, states: None };
         Some((committed, mapping))
