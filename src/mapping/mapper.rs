@@ -57,8 +57,8 @@ pub struct Settings {
     pub heuristic: HeuristicName,
     /// What it may spend.
     pub budget: Budget,
-    /// The cost of a mapping that is known already: nothing that costs more is looked at. Has no effect with the paper's
-    /// heuristic.
+    /// The cost of a mapping that is known already: nothing that costs more is looked at. If it is below the optimum, the mapping
+    /// is bounded by it. Has no effect with the paper's heuristic.
     pub upper_bound: Option<f64>,
     /// When the default heuristic projects attributes together.
     pub grouping: Grouping,
@@ -202,7 +202,7 @@ impl Mapper {
             HeuristicName::Default => self.best_first(space, problem, settings, most_f, interrupt),
             HeuristicName::None => {
                 let found = astar::search(problem, space, &Blind, budget, most_f, interrupt)?;
-                conclude(problem, space, &Blind, found, interrupt)
+                conclude(problem, space, &Blind, within(most_f, found, problem), interrupt)
             }
             HeuristicName::Paper => {
                 let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
@@ -289,7 +289,7 @@ impl Mapper {
                     }
                 }
             }
-            return conclude(problem, space, &projected, found, interrupt);
+            return conclude(problem, space, &projected, within(most_f, found, problem), interrupt);
         }
         if let Some((projected, found)) = before {
             return conclude(problem, space, &projected, found, interrupt);
@@ -425,6 +425,17 @@ fn renumber(moves: &mut [Move]) -> Vec<StateIdx> {
 
 /// How much more than an upper bound a mapping may cost, relatively: more than sums of 100,000 terms differ by rounding.
 const SLACK: f64 = 1e-9;
+
+/// What was found by a search among the mappings that cost at most `most_f`. If it came to its end without one, there is none, so
+/// that is a lower bound.
+fn within(most_f: f64, found: Found, problem: &Problem<'_>) -> Found {
+    let is_whole = |path: &Vec<Move>| path.last().is_some_and(|end| end.observation as usize == problem.last());
+    if found.is_complete && !found.paths.iter().any(is_whole) {
+        Found { is_complete: false, least_f: most_f, ..found }
+    } else {
+        found
+    }
+}
 
 /// Sums in different orders may differ by rounding; what is closer than this, relatively, is the same.
 const ROUNDING: f64 = 1e-12;
@@ -666,6 +677,21 @@ mod tests {
         assert_eq!(swept.lower_bound, Some(swept.cost.total));
         assert_eq!(sweep(&mut || Signal::Finish).unwrap().outcome, Outcome::CutShort);
         assert_eq!(sweep(&mut || Signal::Cancel).unwrap_err(), Cancelled);
+    }
+
+    #[test]
+    fn an_upper_bound_below_the_optimum_proves_that_there_is_no_such_mapping() {
+        let (mapper, request) = belt(6, 40);
+        let request = read(&mapper, &request);
+        let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap().cost.total;
+        for factor in [0.0, 0.5, 0.99, 0.999_999] {
+            let upper_bound = Some(optimum * factor);
+            let settings = Settings { upper_bound, ..Settings::default() };
+            let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+            assert_eq!(mapping.status, Status::Bounded, "{factor}");
+            assert!(mapping.lower_bound.unwrap() <= optimum && optimum <= mapping.cost.total, "{factor}: {mapping:?}");
+            assert!(mapping.lower_bound.unwrap() >= optimum * factor);
+        }
     }
 
     #[test]
