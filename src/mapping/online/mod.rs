@@ -33,9 +33,10 @@
 //! - nodes at earlier observations that no survivor hangs on, and in a repair those whose lower bound (what they cost from an
 //!   earlier root) is no less than what a way that is left costs.
 //!
-//! **Memory.** Without a lookahead, older layers keep the nodes that survivors hang on, and no costs. With one, layers are
-//! kept whole so that they can be repaired (16 bytes per state and observation after the root's), unless that would be more
-//! than [`MAX_KEPT`] nodes.
+//! **Memory.** Without a lookahead, older layers keep the observation and the nodes that survivors hang on, at most 8 bytes per
+//! state; but no costs, and no distances: of the few states that steps lead to, these are computed again. With a lookahead,
+//! layers are kept whole so that they can be repaired (16 bytes per state and observation after the root's, and tables of
+//! distances), unless that would be more than [`MAX_KEPT`] nodes or terms of distances.
 //!
 //! **Ties.** The way found first is kept: a skip, then matches, from the lower state first, then extras, from the cheaper state
 //! first; of actions between the same two states the cheapest, the first among equals. In a repair, ways that were not
@@ -99,7 +100,8 @@ pub struct OnlineMapping {
 /// Where more than one survivor in this many has lost its way, sweeping all layers takes less time than a repair.
 const SWEEPS_FROM: usize = 8;
 
-/// Most nodes of a window whose layers are kept whole, to be repaired; 16 bytes each.
+/// Most nodes of a window whose layers are kept whole, to be repaired, 16 bytes each; and most terms in its tables of distances,
+/// 8 bytes each. Together 48 MB.
 const MAX_KEPT: u64 = 1 << 21;
 
 impl OnlineMapping {
@@ -114,7 +116,10 @@ impl OnlineMapping {
         let model = mapper.shared_model();
         assert!(!model.is_lazy(), "each layer needs all states");
         let n_layers = lookahead.map_or(u64::MAX, |lookahead| 1 + u64::from(lookahead.get()));
-        let keeps = n_layers.saturating_mul(u64::from(model.states().len())) <= MAX_KEPT;
+        let weighted = weights.as_slice().iter().enumerate().filter(|(_, weight)| **weight > 0.0);
+        let n_terms: usize = weighted.map(|(position, _)| model.states().domain(position).len()).sum();
+        let n_each = u64::from(model.states().len()).max(n_terms as u64);
+        let keeps = n_layers.saturating_mul(n_each) <= MAX_KEPT;
         let sweep = Sweep::new(&model);
         let window = Window::new(model.states().len(), keeps);
         Self {
@@ -147,10 +152,16 @@ impl OnlineMapping {
         self.moves.len()
     }
 
-    /// How many nodes of observations from the last committed one on survivors hang on.
+    /// How many nodes of observations from the last committed one on survivors hang on. Looks at each of these observations.
     #[must_use]
     pub fn n_nodes(&self) -> usize {
         self.window.n_alive()
+    }
+
+    /// Approximate size in memory, in bytes, without the model and the committed steps.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        self.window.size_bytes() + self.sweep.size_bytes()
     }
 
     /// How many nodes were looked at. Each observation looks at every state once.
@@ -175,12 +186,11 @@ impl OnlineMapping {
     ) -> Result<Vec<CommittedStep>, Cancelled> {
         let mut committed = Vec::new();
         let model = &*Arc::clone(&self.model);
-        let observed = ObservedDistances::new(model.schema(), model.states(), observation, &self.weights);
+        let observed = ObservedDistances::new(model, observation, &self.weights);
         self.n_observed += 1;
         if self.n_observed == 1 {
-            let state =
-                self.start.unwrap_or_else(|| choose_start(model, |state| observed.distance(model.states(), state)));
-            self.root_cost = observed.distance(model.states(), state);
+            let state = self.start.unwrap_or_else(|| choose_start(model, |state| observed.distance(model, state)));
+            self.root_cost = observed.distance(model, state);
             self.begin(state, self.root_cost, observed);
             // There is no other start.
             committed.push(self.commit(Move { kind: MoveKind::Start, action: None, observation: 0, state }, true));
@@ -251,9 +261,9 @@ impl OnlineMapping {
         if step.kind != MoveKind::Start {
             let action_cost = step.action.map_or(0.0, |action| model.action(action).cost);
             self.root_cost += action_cost;
-            self.root_cost += layer.observed.distance(model.states(), step.state);
+            self.root_cost += layer.observed.distance(model, step.state);
         }
-        let terms = layer.observed.terms(model.states(), step.state);
+        let terms = layer.observed.terms(model, step.state);
         let written = writer.write(model, model.states(), &step, terms);
         self.cost = writer.cost();
         self.writer = writer;
@@ -275,13 +285,15 @@ impl OnlineMapping {
         }
         let root = self.window.root;
         let mut observed = self.window.clear().into_iter();
-        if let Some(first) = observed.next() {
+        if let Some(mut first) = observed.next() {
+            first.fill_tables(model);
             self.begin(root, self.root_cost, first);
         }
-        for observed in observed {
+        for mut observed in observed {
+            observed.fill_tables(model);
             let layer = self.follow(observed, interrupt)?;
             if self.window.keeps() {
-                self.window.layers.push_back(layer);
+                self.window.add(layer);
             } else {
                 self.window.push(layer);
             }
@@ -296,7 +308,7 @@ impl OnlineMapping {
         let spare = self.window.spare();
         let layer = self.sweep.begin(&self.model, (root, cost), &self.window.reached, observed, spare);
         self.window.root = root;
-        self.window.layers.push_back(layer);
+        self.window.add(layer);
         self.window.shrink();
         self.window.recount();
     }
@@ -322,7 +334,7 @@ mod tests {
     use crate::model::{Definition, Limits, Model};
 
     /// States on a line, in any order, with any transitions.
-    fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Arc<Mapper> {
+    fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Mapper {
         let states: Vec<_> = places.iter().map(|x| json!([x])).collect();
         let actions = [("a", 0.0), ("b", 0.5), ("c", 2.0)];
         let mut transitions: Vec<_> = transitions
@@ -336,9 +348,48 @@ mod tests {
             "actions": actions.map(|(name, cost)| json!({"name": name, "cost": cost})),
             "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
         });
-        let definition = Definition::read(&document, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        prepared(&document)
+    }
+
+    fn prepared(model: &serde_json::Value) -> Mapper {
+        let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-        Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap())
+        Mapper::new(model, &mut Uninterrupted).unwrap()
+    }
+
+    /// Two loops of as many states each. From state 0 either can be entered, and none is left. All attributes tell all states
+    /// apart.
+    fn loops(n_each: usize, n_attributes: usize) -> Mapper {
+        let on = |first: usize| (0..n_each).map(move |n| json!([first + n, "on", first + (n + 1) % n_each]));
+        let entries = [json!([0, "left", 1]), json!([0, "right", 1 + n_each])];
+        let transitions: Vec<_> = entries.into_iter().chain(on(1)).chain(on(1 + n_each)).collect();
+        let states: Vec<Vec<usize>> = (0..=2 * n_each).map(|state| vec![state; n_attributes]).collect();
+        let attributes = (0..n_attributes).map(|n| json!({"name": format!("a{n}"), "kind": "number"}));
+        prepared(&json!({
+            "attributes": attributes.collect::<Vec<_>>(),
+            "actions": [{"name": "left"}, {"name": "right"}, {"name": "on"}],
+            "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
+        }))
+    }
+
+    #[test]
+    fn without_a_lookahead_an_observation_that_commits_nothing_keeps_no_distances() {
+        let (n_each, n_attributes) = (150, 8);
+        let mapper = loops(n_each, n_attributes);
+        let mut online = OnlineMapping::new(&mapper, mapper.model().schema().weights(), None, None);
+        let mut sizes = Vec::new();
+        for n in 0..900_u32 {
+            let observation = vec![Some(Value::Number(f64::from(1 + n % 150))); n_attributes];
+            online.observe(&observation, &mut Uninterrupted).unwrap();
+            assert!(online.window.knows_its_size());
+            sizes.push(online.size_bytes());
+        }
+        // Nobody knows yet that the other loop is not meant.
+        assert_eq!(online.n_steps(), 1);
+        let per_observation = (sizes[899] - sizes[449]) / 450;
+        assert!(per_observation < 2048, "{per_observation} bytes, where distances would take {}", 301 * 8 * 8);
+        let (_, mapping) = online.end().unwrap();
+        assert_eq!((mapping.status, mapping.moves.len()), (Status::Optimal, 901));
     }
 
     proptest! {
@@ -371,6 +422,9 @@ mod tests {
                 prop_assert_eq!(costs(&swept), costs(&thinned));
                 prop_assert_eq!(swept.n_nodes(), thinned.n_nodes());
                 observe(&mut repaired);
+                for online in [&repaired, &swept, &thinned] {
+                    prop_assert!(online.window.knows_its_size());
+                }
                 // Ties may have been told apart in another way.
                 if repaired.moves != swept.moves {
                     break;
