@@ -323,6 +323,23 @@ impl Mapper {
         Ok(found)
     }
 
+    /// A mapping of `problem` that begins with `moves` and goes on greedily; of whole states, as for a lookahead. Nothing is
+    /// proven of it.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    pub(super) fn complete(
+        &self,
+        problem: &Problem<'_>,
+        moves: Vec<Move>,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        let found = Found { paths: vec![moves], is_complete: false, least_f: 0.0, n_expanded: 0, n_generated: 0 };
+        let mapping = conclude(problem, &mut Whole::of(&self.model), &Blind, found, interrupt)?;
+        Ok(Mapping { status: Status::Local, lower_bound: None, ..mapping })
+    }
+
     /// The cheapest mapping, from the cheapest ways to all states at each observation after the other.
     fn sweep(&self, problem: &Problem<'_>, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Swept, Cancelled> {
         let mut online = OnlineMapping::new(self, problem.weights.clone(), Some(problem.start), None);

@@ -46,6 +46,7 @@ pub use cost::Cost;
 pub use demonstration::Demonstration;
 pub use heuristic::{Grouping, HeuristicName};
 pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
+pub(crate) use online::longest_lookahead;
 pub use online::{CommittedStep, OnlineMapping};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step};
 pub use problem::Problem;

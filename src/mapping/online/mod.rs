@@ -36,7 +36,8 @@
 //! **Memory.** Without a lookahead, older layers keep the observation and the nodes that survivors hang on, at most 8 bytes per
 //! state; but no costs, and no distances: of the few states that steps lead to, these are computed again. With a lookahead,
 //! layers are kept whole so that they can be repaired (16 bytes per state and observation after the root's, and tables of
-//! distances), unless that would be more than [`MAX_KEPT`] nodes or terms of distances.
+//! distances), unless that would be more than [`MAX_KEPT`] nodes or terms of distances; requests with a lookahead beyond
+//! [`longest_lookahead`] are refused.
 //!
 //! **Ties.** The way found first is kept: a skip, then matches, from the lower state first, then extras, from the cheaper state
 //! first; of actions between the same two states the cheapest, the first among equals. In a repair, ways that were not
@@ -83,6 +84,7 @@ pub struct OnlineMapping {
     start: Option<StateIdx>,
     lookahead: Option<NonZeroU32>,
     n_observed: u32,
+    n_swept: u64,
     window: Window,
     /// The cost of the way to the window's root, summed as the layers' costs are.
     root_cost: f64,
@@ -103,6 +105,16 @@ const SWEEPS_FROM: usize = 8;
 /// Most nodes of a window whose layers are kept whole, to be repaired, 16 bytes each; and most terms in its tables of distances,
 /// 8 bytes each. Together 48 MB.
 const MAX_KEPT: u64 = 1 << 21;
+
+/// Most nodes of a window, kept whole or not: 1 GB if all are alive, as when nothing tells the ways apart.
+const MAX_WINDOW: u64 = 1 << 27;
+
+/// The longest lookahead that is allowed with `model`: the window that it decides on, of one layer more, has at most 134 million
+/// nodes, which take 1 GB at worst. 0 if not even the shortest one is.
+pub(crate) fn longest_lookahead(model: &Model) -> u32 {
+    let n_layers = MAX_WINDOW / u64::from(model.states().len()).max(1);
+    u32::try_from(n_layers.saturating_sub(1)).unwrap_or(u32::MAX)
+}
 
 impl OnlineMapping {
     /// A mapping of a demonstration of which nothing has come yet. `start` overrides the model's; `lookahead` is how many
@@ -128,6 +140,7 @@ impl OnlineMapping {
             start,
             lookahead,
             n_observed: 0,
+            n_swept: 0,
             window,
             root_cost: 0.0,
             sweep,
@@ -164,14 +177,19 @@ impl OnlineMapping {
         self.window.size_bytes() + self.sweep.size_bytes()
     }
 
-    /// How many nodes were looked at. Each observation looks at every state once.
+    /// How many nodes were looked at: every state once for each layer that was swept.
     pub(super) fn n_expanded(&self) -> u64 {
-        u64::from(self.n_observed) * self.model.graph().n_states() as u64
+        self.n_swept * self.model.graph().n_states() as u64
     }
 
-    /// How many moves were looked at.
+    /// How many transitions were looked at.
     pub(super) fn n_generated(&self) -> u64 {
-        u64::from(self.n_observed) * self.model.graph().n_transitions() as u64
+        self.n_swept * self.model.graph().n_transitions() as u64
+    }
+
+    /// The committed steps, also of a mapping that was cancelled.
+    pub(super) fn into_moves(self) -> Vec<Move> {
+        self.moves
     }
 
     /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits.
@@ -305,6 +323,7 @@ impl OnlineMapping {
     }
 
     fn begin(&mut self, root: StateIdx, cost: f64, observed: ObservedDistances) {
+        self.n_swept += 1;
         let spare = self.window.spare();
         let layer = self.sweep.begin(&self.model, (root, cost), &self.window.reached, observed, spare);
         self.window.root = root;
@@ -318,6 +337,7 @@ impl OnlineMapping {
         if interrupt.poll() == Signal::Cancel {
             return Err(Cancelled);
         }
+        self.n_swept += 1;
         let spare = self.window.spare();
         let before = self.window.layers.back().expect("the first observation's layer begins a window");
         Ok(self.sweep.follow(&self.model, &before.costs, &self.window.reached, observed, spare))
