@@ -89,6 +89,9 @@ impl Definition {
     /// Writes the definition as JSON in canonical form: defaults filled in, actions of transitions by name. Reading it gives
     /// the same definition, and equal content gives equal text.
     ///
+    /// The order of lists is part of the content, also that of transitions and of candidates to start in, where it means
+    /// nothing: their texts are hashed, and databases hold hashes of texts that were written in the order that was sent.
+    ///
     /// # Errors
     ///
     /// If `writer` failed.
