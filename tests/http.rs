@@ -195,7 +195,7 @@ async fn all_faults_of_a_model_are_told_at_once() {
         found,
         [
             "/actions/0/cost",
-            "/actions/2",
+            "/actions/2/name",
             "/actions/2/price",
             "/attributes/0/color",
             "/attributes/0/scale",
@@ -250,7 +250,13 @@ async fn all_faults_of_a_cave_are_told_at_once() {
         ]
     );
     let deadly = json!({"dynamics": {"kind": "wumpus", "width": 2, "height": 2, "wumpi": [[0, 0]]}});
-    assert_eq!(pointers(&service.put("/v1/models/m", &deadly).await.1), ["/dynamics/start"]);
+    assert_eq!(pointers(&service.put("/v1/models/m", &deadly).await.1), ["/dynamics/wumpi/0"]);
+    let deadly = json!({"dynamics": {
+        "kind": "wumpus", "width": 0, "height": 2, "wumpi": [[0, 9], [1, 1]], "pits": [[1, 1]], "start": {"x": 1, "y": 1},
+    }});
+    let (_, problem) = service.put("/v1/models/m", &deadly).await;
+    let expected = ["/dynamics/width", "/dynamics/wumpi/0/1", "/dynamics/start", "/dynamics/start"];
+    assert_eq!(pointers(&problem), expected, "whatever else is wrong");
 }
 
 #[tokio::test]

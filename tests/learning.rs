@@ -34,6 +34,14 @@ fn the_simulator_pays_what_the_paper_s_worlds_pay() {
 }
 
 #[test]
+fn after_the_last_seed_comes_the_first() {
+    let mut plan = CurvePlan { n_runs: 2, n_trials: 1, ..CurvePlan::documented() };
+    plan.learner.seed = Some(u64::MAX);
+    let curve = figure_7(&mut Local::new(), &plan, || {}).unwrap();
+    assert_eq!(curve.runs.iter().map(|run| run.seed).collect::<Vec<_>>(), [u64::MAX, 0]);
+}
+
+#[test]
 fn a_hundred_learners_learn_to_fetch_the_gold_and_what_they_learned_helps_elsewhere() {
     let plan = CurvePlan { n_runs: 100, ..CurvePlan::documented() };
     let curve = figure_7(&mut Local::new(), &plan, || {}).unwrap();

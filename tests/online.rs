@@ -9,8 +9,8 @@ use std::num::NonZeroU32;
 use std::sync::Arc;
 
 use etude::document::{Faults, Place};
-use etude::interrupt::Uninterrupted;
-use etude::mapping::{CommittedStep, Mapper, Mapping, OnlineMapping, Status};
+use etude::interrupt::{Cancelled, Signal, Uninterrupted};
+use etude::mapping::{CommittedStep, Mapper, Mapping, OnlineMapping, Policy, Request, Stamp, Status};
 use problems::{close, example, mapper, problem};
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -52,12 +52,33 @@ fn another_end(demonstration: &Value, n: usize, turn: usize) -> Value {
     other.into()
 }
 
+/// States on a line, and longer demonstrations: often few of the states lose their ways by what is decided.
+fn line() -> impl Strategy<Value = (Value, Value, Value, Option<usize>)> {
+    let states = prop::collection::vec((0..12_u32, 0..3_u32), 5..25);
+    let transitions = prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..70);
+    let seen = prop::collection::vec((0..12_u32, prop::option::weighted(0.7, 0..3_u32)), 5..25);
+    let costs = prop_oneof![Just([0.0, 0.5, 2.0]), Just([0.3, 0.7, 1.1])];
+    (states, transitions, seen, costs).prop_map(|(states, mut transitions, seen, costs)| {
+        for (from, _, to) in &mut transitions {
+            (*from, *to) = (*from % states.len(), *to % states.len());
+        }
+        transitions.sort_unstable();
+        transitions.dedup_by_key(|(from, action, _)| (*from, *action));
+        let model = json!({
+            "attributes": [{"name": "x", "kind": "number"}, {"name": "c", "kind": "category", "weight": 0.3}],
+            "actions": costs.iter().enumerate().map(|(n, cost)| json!({"name": format!("a{n}"), "cost": cost})).collect::<Value>(),
+            "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0, "unsafe": []},
+        });
+        (model, json!(seen), json!({}), None)
+    })
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 1500, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn every_commit_is_what_the_definition_says(
-        (model, demonstration, weights, start) in problem(),
+        (model, demonstration, weights, start) in prop_oneof![problem(), line()],
         lookahead in prop::option::weighted(0.8, 1u32..6),
         turn in 0usize..8,
     ) {
@@ -139,6 +160,76 @@ fn corridor(n: u32) -> Value {
         "actions": [{"name": "right", "cost": 0.3}, {"name": "left", "cost": 0.3}],
         "dynamics": {"kind": "table", "states": states, "transitions": right.chain(left).collect::<Vec<_>>(), "start": 0},
     })
+}
+
+/// There and back again, faster than the body is.
+fn rush(n: u32, n_observations: u32) -> Value {
+    (0..n_observations).map(|i| json!([(i * 3 % (2 * n)).abs_diff(n)])).collect()
+}
+
+fn read<'m>(mapper: &'m Mapper, request: &Value) -> Result<Request<'m>, Faults> {
+    let mut faults = Faults::default();
+    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let read = Request::read(mapper.model(), &object, &mut faults);
+    faults.check(read)
+}
+
+#[test]
+fn where_time_or_expansions_are_up_what_a_lookahead_has_not_decided_is_followed_greedily() {
+    let mapper = Arc::new(mapper(&corridor(30)));
+    let request = json!({"model": "corridor", "demonstration": rush(29, 120), "lookahead": 4});
+    let request = read(&mapper, &request).unwrap();
+    let whole = request.solve(&mapper, &mut Uninterrupted).unwrap();
+    let check = |mapping: &Mapping| {
+        assert_eq!((mapping.status, mapping.lower_bound), (Status::Local, None));
+        assert_eq!(mapping.moves[0], whole.moves[0]);
+        assert_eq!(mapping.moves.last().unwrap().observation, 119);
+        // As legal as any: it can be followed again.
+        let policy = Policy::new(Stamp::default(), &request.problem, mapping);
+        assert!(close(policy.steps.last().unwrap().cost, mapping.cost.total));
+        let n_same = mapping.moves.iter().zip(&whole.moves).take_while(|(step, other)| step == other).count();
+        mapping.moves[n_same.min(mapping.moves.len() - 1)].observation
+    };
+    let after = |n_polls: u32, last: Signal| {
+        let mut n_left = n_polls;
+        request.solve(&mapper, &mut || {
+            n_left = n_left.saturating_sub(1);
+            if n_left > 0 { Signal::Continue } else { last }
+        })
+    };
+    for n_polls in 1..=400 {
+        let mapping = after(n_polls, Signal::Finish).unwrap();
+        // A look before each observation, one in it, and those of repairs.
+        let n_same = check(&mapping);
+        assert!(n_same + 6 >= n_polls / 20, "{n_same} of {n_polls}");
+        assert_eq!(after(n_polls, Signal::Cancel), Err(Cancelled));
+    }
+    for max_expansions in [0, 29, 30, 31, 1000, 2000] {
+        let mut request = read(&mapper, &json!({"model": "corridor", "demonstration": rush(29, 120), "lookahead": 4}));
+        let request = request.as_mut().unwrap();
+        request.settings.budget.max_expansions = max_expansions;
+        let mapping = request.solve(&mapper, &mut Uninterrupted).unwrap();
+        check(&mapping);
+        assert!(mapping.n_expanded <= max_expansions, "{} of {max_expansions}", mapping.n_expanded);
+    }
+}
+
+#[test]
+fn a_lookahead_may_not_span_more_than_memory_holds() {
+    let mapper = mapper(&corridor(2000));
+    let request = |lookahead: u32, n_observations: usize| {
+        let demonstration = vec![json!({}); n_observations];
+        read(&mapper, &json!({"model": "corridor", "demonstration": demonstration, "lookahead": lookahead}))
+    };
+    // The window: 134 million nodes.
+    assert!(request(67_107, 100_000).is_ok());
+    assert!(request(100_000, 67_108).is_ok(), "no more than there is to look ahead to");
+    for (lookahead, n_observations) in [(67_108, 100_000), (100_000, 67_109)] {
+        let faults = request(lookahead, n_observations).unwrap_err();
+        let [fault] = faults.listed() else { panic!("{faults}") };
+        assert_eq!(fault.pointer, "/lookahead");
+        assert!(fault.detail.contains("over 67108 observations") && fault.detail.contains("it may be 67107"));
+    }
 }
 
 #[test]

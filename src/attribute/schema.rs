@@ -185,11 +185,9 @@ fn read_attribute(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Attribut
             Kind::Number { scale: scale? }
         }
         Some("cyclic") => {
-            let period = object.optional("period").map(|place| place.number(Range::Positive, faults));
-            let labels = object.optional("labels").map(|place| read_labels(&place, faults));
-            let cycle = match (period, labels) {
-                (Some(period), None) => period.map(Cycle::Period),
-                (None, Some(labels)) => labels.map(Cycle::Labels),
+            let cycle = match (object.optional("period"), object.optional("labels")) {
+                (Some(period), None) => period.number(Range::Positive, faults).map(Cycle::Period),
+                (None, Some(labels)) => read_labels(&labels, faults).map(Cycle::Labels),
                 (None, None) | (Some(_), Some(_)) => {
                     faults.note(place, "a cyclic attribute needs either `period` or `labels`");
                     None

@@ -8,7 +8,7 @@ use crate::learning::{AlgorithmDocument, LearnerDocument, PerAttributeDocument};
 /// How the experiment is done.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CurvePlan {
-    /// The learner; its seed is the first one, and each further run takes the next.
+    /// The learner; its seed is the first one, and each further run takes the next; after the last there is, 0.
     pub learner: LearnerDocument,
     /// How many runs there are.
     pub n_runs: usize,
@@ -118,7 +118,7 @@ pub fn figure_7<L: Laboratory>(
     let scene = Scene::figure_6();
     let first_seed = plan.learner.seed.unwrap_or(0);
     let mut runs = Vec::with_capacity(plan.n_runs);
-    for seed in (first_seed..).take(plan.n_runs) {
+    for seed in std::iter::successors(Some(first_seed), |seed| Some(seed.wrapping_add(1))).take(plan.n_runs) {
         let definition = LearnerDocument { seed: Some(seed), ..plan.learner.clone() };
         let learner = laboratory.start_learner(&definition)?;
         let rewards = run(laboratory, &learner, &scene, plan.n_trials, &mut on_trial)?;

@@ -8,7 +8,7 @@ use utoipa::ToSchema;
 
 use super::{Algorithm, Distribution, Learner};
 use crate::attribute::Attribute;
-use crate::document::{Faults, Object, Path, Place, Range};
+use crate::document::{Faults, Object, Path, Place, Quoted, Range, list_known};
 
 const DEFAULT_ALPHA: f64 = 0.5;
 const DEFAULT_BETA: f64 = 0.1;
@@ -127,7 +127,7 @@ fn read_attributes(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Arc
             item.mismatch::<()>(&format!("a name of 1 to {} characters", Attribute::MAX_NAME_CHARS), faults);
         }
         if names.iter().any(|other| **other == *name) {
-            faults.note(&item, format!("the attribute {name:?} stands twice"));
+            faults.note(&item, format!("the attribute {} stands twice", Quoted(name)));
         }
         names.push(name.into());
     }
@@ -172,8 +172,8 @@ fn read_per_attribute(
         if let Some(position) = names.iter().position(|other| **other == *name) {
             numbers[position] = number.unwrap_or(default);
         } else {
-            let path = Path::Member(&place.path, name);
-            faults.note_at(&path, format!("unknown attribute {name:?}; the learner has {}", names.join(", ")));
+            let detail = format!("unknown attribute {}; the learner has {}", Quoted(name), list_known(names));
+            faults.note_at(&Path::Member(&place.path, name), detail);
         }
     }
     Some(numbers)
@@ -319,5 +319,17 @@ mod tests {
         let faults = Learner::read(&unknown).unwrap_err();
         let pointers: Vec<_> = faults.listed().iter().map(|fault| fault.pointer.as_str()).collect();
         assert_eq!(pointers, ["/mean/y", "/sd/z", "/sd/z"]);
+    }
+
+    #[test]
+    fn faults_of_a_learner_stay_short_however_many_and_long_its_names_are() {
+        let names: Vec<_> = (0..255).map(|n| format!("{n:0>64}")).chain(["x".repeat(10_000)]).collect();
+        let twice: Vec<_> = names.iter().skip(1).chain(names.last()).collect();
+        let mean: Value = (0..1000).map(|n| (format!("m{n}"), json!(1))).collect();
+        for document in [json!({"attributes": names, "mean": mean}), json!({"attributes": twice})] {
+            let faults = Learner::read(&document).unwrap_err();
+            let longest = faults.listed().iter().map(|fault| fault.detail.len()).max().unwrap();
+            assert!(longest < 1000, "{longest}");
+        }
     }
 }

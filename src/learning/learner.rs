@@ -8,6 +8,7 @@ use rand_distr::{Distribution as _, StandardNormal};
 
 use super::Distribution;
 use crate::attribute::{ByAttribute, MAX_COST, Schema, Weights};
+use crate::document::list_known;
 
 /// A learner as it was registered: checked, with defaults filled in. Outlives models.
 #[derive(Clone, Debug, PartialEq)]
@@ -146,7 +147,7 @@ impl Learner {
 
 /// A model lacks attributes of a learner.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("the model has no attribute {}, of which the learner knows the weight", missing.join(", "))]
+#[error("the model has no attribute {}, of which the learner knows the weight", list_known(missing))]
 pub struct MissingAttributes {
     /// Their names.
     pub missing: Vec<String>,

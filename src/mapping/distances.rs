@@ -4,7 +4,7 @@ use rustc_hash::FxHashMap;
 
 use super::Demonstration;
 use crate::attribute::{Attribute, Schema, Value, Weights};
-use crate::model::{StateIdx, States};
+use crate::model::{Model, StateIdx, States};
 
 /// Weighted terms of the distance for one demonstration. Attributes without weight, and those that were never observed,
 /// take no part.
@@ -105,38 +105,92 @@ impl ActiveAttribute<'_> {
     }
 }
 
-/// Weighted terms of the distance of a single observation.
+/// The distance to a single observation, looked up in tables, or computed once these were dropped.
 #[derive(Debug)]
 pub(crate) struct ObservedDistances {
-    /// Positions of the attributes that were observed and weigh something, ascending, with their terms by the state's
-    /// value. Shape `[domain size]` each.
-    terms: Vec<(usize, Vec<f64>)>,
+    /// Those that were observed and weigh something, in schema order.
+    attributes: Vec<ObservedAttribute>,
+    size_bytes: usize,
+}
+
+/// An attribute that was observed and weighs something.
+#[derive(Debug)]
+struct ObservedAttribute {
+    position: usize,
+    weight: f64,
+    value: Value,
+    /// Terms by the state's value. Shape `[domain size]`; empty if there is no table.
+    table: Vec<f64>,
 }
 
 impl ObservedDistances {
-    pub(crate) fn new(schema: &Schema, states: &States, observation: &[Option<Value>], weights: &Weights) -> Self {
-        let weighted = schema.attributes().iter().zip(weights.as_slice()).zip(observation).enumerate();
-        let terms =
-            weighted.filter(|(_, ((_, weight), _))| **weight > 0.0).filter_map(|(position, (weighted, observed))| {
-                let (attribute, weight) = weighted;
-                let observed = observed.as_ref()?;
-                let terms = states.domain(position).iter().map(|own| attribute.term(*weight, observed, own));
-                Some((position, terms.collect()))
-            });
-        Self { terms: terms.collect() }
+    /// With tables.
+    pub(crate) fn new(model: &Model, observation: &[Option<Value>], weights: &Weights) -> Self {
+        let weighted = weights.as_slice().iter().zip(observation).enumerate().filter(|(_, (weight, _))| **weight > 0.0);
+        let attributes = weighted.filter_map(|(position, (weight, value))| {
+            Some(ObservedAttribute { position, weight: *weight, value: value.clone()?, table: Vec::new() })
+        });
+        let mut distances = Self { attributes: attributes.collect(), size_bytes: 0 };
+        distances.fill_tables(model);
+        distances
+    }
+
+    /// Makes the tables, unless they are there.
+    pub(crate) fn fill_tables(&mut self, model: &Model) {
+        for attribute in self.attributes.iter_mut().filter(|attribute| attribute.table.is_empty()) {
+            let ObservedAttribute { position, weight, value, table } = attribute;
+            let domain = model.states().domain(*position);
+            let attribute = &model.schema().attributes()[*position];
+            *table = domain.iter().map(|own| attribute.term(*weight, value, own)).collect();
+        }
+        self.measure();
+    }
+
+    /// Drops the tables. Few distances will be asked for.
+    pub(crate) fn drop_tables(&mut self) {
+        for attribute in &mut self.attributes {
+            attribute.table = Vec::new();
+        }
+        self.measure();
+    }
+
+    fn measure(&mut self) {
+        let sizes = self.attributes.iter().map(|attribute| {
+            let n_text_bytes = if let Value::Text(text) = &attribute.value { text.len() } else { 0 };
+            size_of::<ObservedAttribute>() + n_text_bytes + attribute.table.capacity() * size_of::<f64>()
+        });
+        self.size_bytes = sizes.sum();
+    }
+
+    /// Approximate size in memory, in bytes.
+    pub(crate) fn size_bytes(&self) -> usize {
+        self.size_bytes
     }
 
     /// `D(o, s)`: the same float as [`Distances::distance`] gives.
     #[inline]
-    pub(crate) fn distance(&self, states: &States, state: StateIdx) -> f64 {
-        let row = states.row(state);
-        self.terms.iter().fold(0.0, |sum, (position, terms)| sum + terms[row[*position] as usize])
+    pub(crate) fn distance(&self, model: &Model, state: StateIdx) -> f64 {
+        let row = model.states().row(state);
+        self.attributes.iter().fold(0.0, |sum, attribute| sum + attribute.term(model, row[attribute.position]))
     }
 
     /// The terms of `D(o, s)`, in schema order; attributes that take no part are left out.
-    pub(crate) fn terms(&self, states: &States, state: StateIdx) -> impl Iterator<Item = (usize, f64)> {
-        let row = states.row(state);
-        self.terms.iter().map(move |(position, terms)| (*position, terms[row[*position] as usize]))
+    pub(crate) fn terms(&self, model: &Model, state: StateIdx) -> impl Iterator<Item = (usize, f64)> {
+        let row = model.states().row(state);
+        self.attributes
+            .iter()
+            .map(move |attribute| (attribute.position, attribute.term(model, row[attribute.position])))
+    }
+}
+
+impl ObservedAttribute {
+    #[inline]
+    fn term(&self, model: &Model, value: u32) -> f64 {
+        if let Some(term) = self.table.get(value as usize) {
+            return *term;
+        }
+        let own = &model.states().domain(self.position)[value as usize];
+        model.schema().attributes()[self.position].term(self.weight, &self.value, own)
     }
 }
 

@@ -11,7 +11,7 @@ use super::cost::{Cost, ROUNDING, cost_of};
 use super::heuristic::paper::Paper;
 use super::heuristic::projected::{MAX_ENTRIES, Projected};
 use super::heuristic::projection::Projections;
-use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
+use super::heuristic::{Blind, Grouping, GroupingPatience, Heuristic, HeuristicName};
 use super::search::best_first::{self, Buffers};
 use super::search::{Found, Move, astar};
 use super::{OnlineMapping, Problem};
@@ -37,6 +37,11 @@ impl Budget {
     /// How much memory a node takes, in bytes.
     const NODE_BYTES: usize = 64;
 
+    /// How much memory its nodes take, in bytes.
+    fn max_bytes(self) -> usize {
+        self.max_nodes.saturating_mul(Self::NODE_BYTES)
+    }
+
     /// Whether there is no more memory: for `n_nodes`, and what was found in `space`.
     #[inline]
     pub(super) fn is_full(self, n_nodes: usize, space: &impl Space) -> bool {
@@ -57,8 +62,8 @@ pub struct Settings {
     pub heuristic: HeuristicName,
     /// What it may spend.
     pub budget: Budget,
-    /// The cost of a mapping that is known already: nothing that costs more is looked at. Has no effect with the paper's
-    /// heuristic.
+    /// The cost of a mapping that is known already: nothing that costs more is looked at. If it is below the optimum, the mapping
+    /// is bounded by it. Has no effect with the paper's heuristic.
     pub upper_bound: Option<f64>,
     /// When the default heuristic projects attributes together.
     pub grouping: Grouping,
@@ -115,6 +120,7 @@ pub struct Mapper {
     projections: Projections,
     /// Of searches that have ended, for those that come: at most as many as ran at the same time.
     buffers: Mutex<Vec<Buffers>>,
+    patience: Patience,
 }
 
 impl Mapper {
@@ -125,7 +131,7 @@ impl Mapper {
     /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
     pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
         let projections = Projections::new(&model, interrupt)?;
-        Ok(Self { model: Arc::new(model), projections, buffers: Mutex::default() })
+        Ok(Self { model: Arc::new(model), projections, buffers: Mutex::default(), patience: Patience::DEFAULT })
     }
 
     /// The model.
@@ -202,7 +208,7 @@ impl Mapper {
             HeuristicName::Default => self.best_first(space, problem, settings, most_f, interrupt),
             HeuristicName::None => {
                 let found = astar::search(problem, space, &Blind, budget, most_f, interrupt)?;
-                conclude(problem, space, &Blind, found, interrupt)
+                conclude(problem, space, &Blind, within(most_f, found, problem), interrupt)
             }
             HeuristicName::Paper => {
                 let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
@@ -237,43 +243,59 @@ impl Mapper {
         let Settings { budget, grouping, .. } = settings;
         let n_nodes =
             space.n_states().map_or(u64::MAX, |n| (n as u64).saturating_mul(problem.demonstration.len() as u64));
-        let may_sweep = space.n_states().is_some_and(|n_states| n_states <= MAX_SWEPT_STATES)
-            && n_nodes.saturating_mul(2) <= budget.max_expansions;
+        let may_be_swept = space.n_states().is_some_and(|n_states| n_states <= MAX_SWEPT_STATES);
         let n_observations = problem.demonstration.len();
         // Where there are not even expansions enough to look at every observation, much depends on good estimates.
         let is_small_budget = budget.max_expansions < n_observations as u64;
-        let few_entries = FEW_ENTRIES.max(n_observations * FEW_ENTRIES_PER_OBSERVATION).min(MAX_ENTRIES);
+        let patience = self.patience;
+        let few_entries = patience.few_entries.max(n_observations * patience.few_entries_per_observation);
+        let few_entries = few_entries.min(MAX_ENTRIES);
         let mut before: Option<(Projected<'_>, Found)> = None;
         for max_entries in [if is_small_budget { MAX_ENTRIES } else { few_entries }, MAX_ENTRIES] {
             let solved = Projected::solve(&self.projections, problem, grouping, max_entries, interrupt)?;
             // No time for estimates, so none for a search with them.
             let Some(mut projected) = solved else { break };
+            projected.set_patience(patience.grouping);
             let n_before = before.as_ref().map_or(0, |(_, found)| found.n_expanded);
             let max_expansions = budget.max_expansions - n_before;
             // What would be done instead, should it take that long.
             let n_untabled = if max_entries < MAX_ENTRIES { projected.n_left_out() } else { 0 };
+            let before_sweep = patience.min_expansions_before_sweep.max(n_nodes / patience.nodes_per_expansion);
+            let may_sweep = may_be_swept && before_sweep.saturating_add(n_nodes) <= max_expansions;
             let enough = match n_untabled {
-                0 if may_sweep => MIN_EXPANSIONS_BEFORE_SWEEP.max(n_nodes / NODES_PER_EXPANSION),
+                0 if may_sweep => before_sweep,
                 0 => u64::MAX,
-                n_untabled => n_untabled / ENTRIES_PER_EXPANSION,
+                n_untabled => n_untabled / patience.entries_per_expansion,
             };
             let capped = Budget { max_expansions: max_expansions.min(enough), ..budget };
             let mut found = self.search(space, problem, &mut projected, capped, most_f, interrupt)?;
             let is_enough = !found.is_complete && enough < max_expansions && found.n_expanded >= enough;
             if let Some((_, before)) = before.take() {
-                found.n_expanded += before.n_expanded;
-                found.n_generated += before.n_generated;
-                found.least_f = found.least_f.max(before.least_f);
-                found.paths.extend(before.paths);
+                found = joined(before, found);
             }
             if is_enough && n_untabled > 0 {
                 before = Some((projected, found));
                 continue;
             }
-            if is_enough && let Some(swept) = self.sweep(problem, &found, budget, interrupt)? {
-                return Ok(swept);
+            if is_enough {
+                let swept = self.sweep(problem, budget, interrupt)?;
+                found.n_expanded += swept.n_expanded;
+                found.n_generated += swept.n_generated;
+                match swept.outcome {
+                    Outcome::Mapped(mapping) => {
+                        let Found { n_expanded, n_generated, .. } = found;
+                        return Ok(Mapping { n_expanded, n_generated, ..mapping });
+                    }
+                    Outcome::CutShort => {}
+                    Outcome::TooLarge => {
+                        let max_expansions = budget.max_expansions - found.n_expanded;
+                        let rest = Budget { max_expansions, ..budget };
+                        let more = self.search(space, problem, &mut projected, rest, most_f, interrupt)?;
+                        found = joined(found, more);
+                    }
+                }
             }
-            return conclude(problem, space, &projected, found, interrupt);
+            return conclude(problem, space, &projected, within(most_f, found, problem), interrupt);
         }
         if let Some((projected, found)) = before {
             return conclude(problem, space, &projected, found, interrupt);
@@ -302,49 +324,111 @@ impl Mapper {
         Ok(found)
     }
 
-    /// The cheapest mapping, from the cheapest ways to all states at each observation after the other. `None` if `interrupt` said
-    /// to finish first, or the ways take more memory than `budget` allows.
-    fn sweep(
+    /// A mapping of `problem` that begins with `moves` and goes on greedily; of whole states, as for a lookahead. Nothing is
+    /// proven of it.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    pub(super) fn complete(
         &self,
         problem: &Problem<'_>,
-        found: &Found,
-        budget: Budget,
+        moves: Vec<Move>,
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Option<Mapping>, Cancelled> {
+    ) -> Result<Mapping, Cancelled> {
+        let found = Found { paths: vec![moves], is_complete: false, least_f: 0.0, n_expanded: 0, n_generated: 0 };
+        let mapping = conclude(problem, &mut Whole::of(&self.model), &Blind, found, interrupt)?;
+        Ok(Mapping { status: Status::Local, lower_bound: None, ..mapping })
+    }
+
+    /// The cheapest mapping, from the cheapest ways to all states at each observation after the other.
+    fn sweep(&self, problem: &Problem<'_>, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Swept, Cancelled> {
         let mut online = OnlineMapping::new(self, problem.weights.clone(), Some(problem.start), None);
+        let mut is_cut_short = None;
         for observation in problem.demonstration.iter() {
-            match interrupt.poll() {
-                Signal::Continue if online.n_nodes() <= budget.max_nodes => online.observe(observation, interrupt)?,
-                Signal::Continue | Signal::Finish => return Ok(None),
+            is_cut_short = match interrupt.poll() {
+                Signal::Continue if online.size_bytes() > budget.max_bytes() => Some(Outcome::TooLarge),
+                Signal::Continue => None,
+                Signal::Finish => Some(Outcome::CutShort),
                 Signal::Cancel => return Err(Cancelled),
             };
+            if is_cut_short.is_some() {
+                break;
+            }
+            online.observe(observation, interrupt)?;
         }
-        let swept = online.end().map(|(_, mapping)| Mapping {
-            n_expanded: found.n_expanded + mapping.n_expanded,
-            n_generated: found.n_generated + mapping.n_generated,
-            ..mapping
-        });
-        Ok(swept)
+        let (n_expanded, n_generated) = (online.n_expanded(), online.n_generated());
+        let end = || online.end().map_or(Outcome::CutShort, |(_, mapping)| Outcome::Mapped(mapping));
+        Ok(Swept { outcome: is_cut_short.unwrap_or_else(end), n_expanded, n_generated })
     }
 }
 
-/// Most entries of the tables of a search's first attempt: they take half a millisecond,
-const FEW_ENTRIES: usize = 1 << 16;
+/// What a sweep gave, and what it took.
+#[derive(Debug)]
+struct Swept {
+    outcome: Outcome,
+    n_expanded: u64,
+    n_generated: u64,
+}
 
-/// or two microseconds per observation if that is more, which is no more than the search is bound to take.
-const FEW_ENTRIES_PER_OBSERVATION: usize = 1 << 8;
+/// How a sweep ended.
+#[derive(Debug, PartialEq)]
+enum Outcome {
+    /// With the cheapest mapping.
+    Mapped(Mapping),
+    /// The interrupt said to finish.
+    CutShort,
+    /// The ways would have taken more memory than the budget allows.
+    TooLarge,
+}
 
-/// How many entries of a table take as long as an expansion.
-const ENTRIES_PER_EXPANSION: u64 = 16;
+/// What two searches for the same mappings found together, of which the later one is `found`.
+fn joined(before: Found, found: Found) -> Found {
+    let mut paths = found.paths;
+    paths.extend(before.paths);
+    Found {
+        paths,
+        least_f: found.least_f.max(before.least_f),
+        n_expanded: before.n_expanded + found.n_expanded,
+        n_generated: before.n_generated + found.n_generated,
+        is_complete: found.is_complete,
+    }
+}
+
+/// When a search that takes long gets more help.
+#[derive(Clone, Copy, Debug)]
+struct Patience {
+    /// Most entries of the tables of a search's first attempt,
+    few_entries: usize,
+    /// or so many per observation, if that is more.
+    few_entries_per_observation: usize,
+    /// How many entries of a table take as long as an expansion.
+    entries_per_expansion: u64,
+    /// After how many expansions all nodes are looked at instead,
+    min_expansions_before_sweep: u64,
+    /// or after one for so many nodes, if that is more.
+    nodes_per_expansion: u64,
+    /// When attributes are projected together.
+    grouping: GroupingPatience,
+}
+
+impl Patience {
+    const DEFAULT: Self = Self {
+        // They take half a millisecond.
+        few_entries: 1 << 16,
+        // Two microseconds, which is no more than the search is bound to take.
+        few_entries_per_observation: 1 << 8,
+        entries_per_expansion: 16,
+        // Nodes of fewer expansions are in the caches, where an expansion takes less time.
+        min_expansions_before_sweep: 1 << 16,
+        // So many are swept in about the time of an expansion, where there are many.
+        nodes_per_expansion: 16,
+        grouping: GroupingPatience::DEFAULT,
+    };
+}
 
 /// Most states of a model whose layers are swept: a layer takes tens of milliseconds then, between two looks at the interrupt.
 const MAX_SWEPT_STATES: usize = 1 << 20;
-
-/// Nodes of fewer expansions are in the caches, where an expansion takes less time.
-const MIN_EXPANSIONS_BEFORE_SWEEP: u64 = 1 << 16;
-
-/// How many nodes a sweep looks at in about the time of an expansion, where there are many.
-const NODES_PER_EXPANSION: u64 = 16;
 
 /// Numbers the states of `moves` anew, in the order in which they are first passed. Gives their former numbers, by the new ones.
 fn renumber(moves: &mut [Move]) -> Vec<StateIdx> {
@@ -364,6 +448,17 @@ fn renumber(moves: &mut [Move]) -> Vec<StateIdx> {
 
 /// How much more than an upper bound a mapping may cost, relatively: more than sums of 100,000 terms differ by rounding.
 const SLACK: f64 = 1e-9;
+
+/// What was found by a search among the mappings that cost at most `most_f`. If it came to its end without one, there is none, so
+/// that is a lower bound.
+fn within(most_f: f64, found: Found, problem: &Problem<'_>) -> Found {
+    let is_whole = |path: &Vec<Move>| path.last().is_some_and(|end| end.observation as usize == problem.last());
+    if found.is_complete && !found.paths.iter().any(is_whole) {
+        Found { is_complete: false, least_f: most_f, ..found }
+    } else {
+        found
+    }
+}
 
 /// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than its `least_f`.
 fn conclude<S: Space, H: Heuristic>(
@@ -399,6 +494,7 @@ fn conclude<S: Space, H: Heuristic>(
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
     use serde_json::{Value, json};
 
     use super::*;
@@ -420,19 +516,135 @@ mod tests {
             "actions": [{"name": "on", "cost": 0.3}, {"name": "back", "cost": 0.3}, {"name": "turn", "cost": 0.3}],
             "dynamics": {"kind": "table", "start": 0, "states": states, "transitions": transitions.collect::<Value>()},
         });
-        let definition = Definition::read(&model, Limits::NONE, &mut Uninterrupted).unwrap();
-        let model = Model::compile(&definition, Limits::NONE, &mut Uninterrupted).unwrap();
         let seen = (0..n_observations).map(|i| json!({"place": i % n_places, "dial": i * 2 % 10}));
-        (
-            Mapper::new(model, &mut Uninterrupted).unwrap(),
-            json!({"model": "belt", "demonstration": seen.collect::<Value>()}),
-        )
+        (prepared(&model), json!({"model": "belt", "demonstration": seen.collect::<Value>()}))
+    }
+
+    fn prepared(model: &Value) -> Mapper {
+        let definition = Definition::read(model, Limits::NONE, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::NONE, &mut Uninterrupted).unwrap();
+        Mapper::new(model, &mut Uninterrupted).unwrap()
     }
 
     fn read<'m>(mapper: &'m Mapper, request: &Value) -> Request<'m> {
         let mut faults = Faults::default();
         let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
         Request::read(mapper.model(), &object, &mut faults).unwrap()
+    }
+
+    /// A body in a world of small numbers, and a demonstration. States look alike now and then, and actions may cost nothing.
+    fn wander() -> impl Strategy<Value = (Value, Value)> {
+        let states = prop::collection::vec((0..6_u32, 0..4_u32, 0..3_u32), 5..60);
+        let transitions = prop::collection::vec((0..60_usize, 0..3_usize, 0..60_usize), 10..200);
+        let seen = (0..8_u32, prop::option::weighted(0.7, 0..4_u32), prop::option::weighted(0.7, 0..3_u32));
+        let costs = prop_oneof![Just([0.0, 0.5, 2.0]), Just([0.3, 0.7, 1.1])];
+        (states, transitions, prop::collection::vec(seen, 3..16), costs).prop_map(
+            |(states, mut transitions, seen, costs)| {
+                for (from, _, to) in &mut transitions {
+                    (*from, *to) = (*from % states.len(), *to % states.len());
+                }
+                transitions.sort_unstable();
+                transitions.dedup_by_key(|(from, action, _)| (*from, *action));
+                let model = json!({
+                    "attributes": [
+                        {"name": "x", "kind": "number"},
+                        {"name": "y", "kind": "number", "weight": 2.5},
+                        {"name": "c", "kind": "category", "weight": 1.3},
+                    ],
+                    "actions": (0..3).map(|n| json!({"name": format!("a{n}"), "cost": costs[n]})).collect::<Value>(),
+                    "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
+                });
+                (model, json!({"model": "wander", "demonstration": seen}))
+            },
+        )
+    }
+
+    /// A body that goes where it looks, in a hall with walls, and a demonstration. Attributes of it are worth projecting together.
+    fn hall() -> impl Strategy<Value = (Value, Value)> {
+        let seen = (0..4_u32, 0..9_u32, prop::option::of(0..4_u32));
+        let walls = prop::collection::vec(prop::bool::weighted(0.1), 4 * 9 * 4);
+        (walls, prop::collection::vec(seen, 3..16)).prop_map(|(walls, seen)| {
+            let state = |x: i32, y: i32, heading: i32| usize::try_from((x * 9 + y) * 4 + heading).unwrap();
+            let places = (0..4).flat_map(|x| (0..9).flat_map(move |y| (0..4).map(move |heading| (x, y, heading))));
+            let transitions = places.clone().flat_map(|(x, y, heading)| {
+                let (ahead_x, ahead_y) = [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)][state(0, 0, heading)];
+                let here = state(x, y, heading);
+                let is_free = (0..4).contains(&ahead_x) && (0..9).contains(&ahead_y) && !walls[here];
+                let ahead = is_free.then(|| json!([here, "forward", state(ahead_x, ahead_y, heading)]));
+                ahead.into_iter().chain([json!([here, "left", state(x, y, (heading + 1) % 4)])])
+            });
+            let model = json!({
+                "attributes": [
+                    {"name": "x", "kind": "number"},
+                    {"name": "y", "kind": "number"},
+                    {"name": "heading", "kind": "cyclic", "period": 4},
+                ],
+                "actions": [{"name": "forward", "cost": 0.3}, {"name": "left", "cost": 0.3}],
+                "dynamics": {
+                    "kind": "table",
+                    "states": places.collect::<Vec<_>>(),
+                    "transitions": transitions.collect::<Value>(),
+                    "start": 0,
+                },
+            });
+            (model, json!({"model": "hall", "demonstration": seen}))
+        })
+    }
+
+    /// Whatever takes long is done as soon as may be.
+    const IMPATIENT: Patience = Patience {
+        few_entries: 0,
+        few_entries_per_observation: 8,
+        entries_per_expansion: 16,
+        min_expansions_before_sweep: 40,
+        nodes_per_expansion: u64::MAX,
+        grouping: GroupingPatience { min_expansions: 8, expansions_per_transition: 0, expansions_per_entry: 0 },
+    };
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 600, failure_persistence: None, ..ProptestConfig::default() })]
+
+        #[test]
+        fn whatever_helps_a_long_search_leads_to_the_optimum_and_to_true_bounds(
+            (model, request) in prop_oneof![wander(), hall()],
+            helps in prop_oneof![
+                Just(IMPATIENT),
+                Just(Patience { min_expansions_before_sweep: u64::MAX, ..IMPATIENT }),
+                Just(Patience { grouping: GroupingPatience::DEFAULT, ..IMPATIENT }),
+            ],
+            few in 0..300_u64,
+            looseness in prop_oneof![Just(None), Just(Some(1.0)), Just(Some(1.3))],
+        ) {
+            let mapper = Mapper { patience: helps, ..prepared(&model) };
+            let request = read(&mapper, &request);
+            let without = Settings { heuristic: HeuristicName::None, ..Settings::default() };
+            let optimum = mapper.map(&request.problem, without, &mut Uninterrupted).unwrap().cost.total;
+            let close = |cost: f64| (cost - optimum).abs() <= 1e-9 * optimum;
+            let settings = Settings { upper_bound: looseness.map(|factor| optimum * factor), ..Settings::default() };
+            let map = |budget, interrupt: &mut dyn Interrupt| {
+                mapper.map(&request.problem, Settings { budget, ..settings }, interrupt).unwrap()
+            };
+            let is_true = |mapping: &Mapping| {
+                let lower_bound = mapping.lower_bound.unwrap();
+                lower_bound <= optimum * (1.0 + 1e-9)
+                    && optimum * (1.0 - 1e-9) <= mapping.cost.total
+                    && (mapping.status == Status::Bounded || close(mapping.cost.total))
+            };
+
+            let mapping = map(Budget::DEFAULT, &mut Uninterrupted);
+            prop_assert!(mapping.status == Status::Optimal && close(mapping.cost.total), "{mapping:?}, not {optimum}");
+            let mapping = map(Budget { max_expansions: few, ..Budget::DEFAULT }, &mut Uninterrupted);
+            prop_assert!(is_true(&mapping) && mapping.n_expanded <= few, "{mapping:?}, of {optimum} and {few}");
+            let max_nodes = usize::try_from(few).unwrap();
+            let mapping = map(Budget { max_nodes, ..Budget::DEFAULT }, &mut Uninterrupted);
+            prop_assert!(is_true(&mapping), "{mapping:?}, of {optimum} in {max_nodes} nodes");
+            let mut n_left = few / 8;
+            let mapping = map(Budget::DEFAULT, &mut || {
+                n_left = n_left.saturating_sub(1);
+                if n_left > 0 { Signal::Continue } else { Signal::Finish }
+            });
+            prop_assert!(is_true(&mapping), "{mapping:?}, of {optimum}");
+        }
     }
 
     #[test]
@@ -444,7 +656,7 @@ mod tests {
             &mapper.projections,
             &request.problem,
             Grouping::WhenItPays,
-            FEW_ENTRIES,
+            Patience::DEFAULT.few_entries,
             &mut Uninterrupted,
         );
         assert!(few.unwrap().unwrap().n_left_out() >= 90_000);
@@ -475,16 +687,58 @@ mod tests {
 
         let (mapper, request) = belt(6, 40);
         let request = read(&mapper, &request);
-        let found = || Found { paths: Vec::new(), is_complete: false, least_f: 0.0, n_expanded: 7, n_generated: 9 };
-        let sweep =
-            |interrupt: &mut dyn Interrupt| mapper.sweep(&request.problem, &found(), Budget::DEFAULT, interrupt);
-        let swept = sweep(&mut Uninterrupted).unwrap().unwrap();
+        let sweep = |interrupt: &mut dyn Interrupt| mapper.sweep(&request.problem, Budget::DEFAULT, interrupt);
+        let swept = sweep(&mut Uninterrupted).unwrap();
+        assert_eq!(swept.n_expanded, 60 * 40);
+        let Outcome::Mapped(swept) = swept.outcome else { panic!("{swept:?}") };
         let settings = Settings { heuristic: HeuristicName::None, ..Settings::default() };
         let without = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
         assert_eq!((swept.cost.total, swept.status), (without.cost.total, Status::Optimal));
         assert_eq!(swept.lower_bound, Some(swept.cost.total));
-        assert_eq!(swept.n_expanded, 7 + 60 * 40);
-        assert_eq!(sweep(&mut || Signal::Finish), Ok(None));
-        assert_eq!(sweep(&mut || Signal::Cancel), Err(Cancelled));
+        assert_eq!(sweep(&mut || Signal::Finish).unwrap().outcome, Outcome::CutShort);
+        assert_eq!(sweep(&mut || Signal::Cancel).unwrap_err(), Cancelled);
+    }
+
+    #[test]
+    fn an_upper_bound_below_the_optimum_proves_that_there_is_no_such_mapping() {
+        let (mapper, request) = belt(6, 40);
+        let request = read(&mapper, &request);
+        let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap().cost.total;
+        for factor in [0.0, 0.5, 0.99, 0.999_999] {
+            let upper_bound = Some(optimum * factor);
+            let settings = Settings { upper_bound, ..Settings::default() };
+            let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+            assert_eq!(mapping.status, Status::Bounded, "{factor}");
+            assert!(mapping.lower_bound.unwrap() <= optimum && optimum <= mapping.cost.total, "{factor}: {mapping:?}");
+            assert!(mapping.lower_bound.unwrap() >= optimum * factor);
+        }
+    }
+
+    #[test]
+    fn a_search_goes_on_where_there_is_no_room_for_a_sweep_and_none_is_begun_that_would_take_too_many_expansions() {
+        let (mapper, request) = belt(3_000, 30);
+        let patience = Patience {
+            few_entries: MAX_ENTRIES,
+            min_expansions_before_sweep: 100,
+            nodes_per_expansion: u64::MAX,
+            ..Patience::DEFAULT
+        };
+        let mapper = Mapper { patience, ..mapper };
+        let request = read(&mapper, &request);
+        let map = |budget| {
+            let settings = Settings { budget, ..Settings::default() };
+            mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap()
+        };
+        let swept = map(Budget::DEFAULT);
+        assert_eq!((swept.status, swept.n_expanded), (Status::Optimal, 100 + 30_000 * 30));
+        // The newest layer alone has 30,000 nodes.
+        let searched = map(Budget { max_nodes: 20_000, ..Budget::DEFAULT });
+        assert_eq!((searched.status, searched.cost.total), (Status::Optimal, swept.cost.total));
+        assert!(searched.n_expanded < swept.n_expanded / 4, "a few layers, and a search: {}", searched.n_expanded);
+
+        let n_all = swept.n_expanded;
+        assert_eq!(map(Budget { max_expansions: n_all, ..Budget::DEFAULT }).n_expanded, n_all);
+        let searched = map(Budget { max_expansions: n_all - 1, ..Budget::DEFAULT });
+        assert!(searched.status == Status::Optimal && searched.n_expanded < 30_000, "{}", searched.n_expanded);
     }
 }

@@ -47,8 +47,9 @@ pub use cost::Cost;
 pub use demonstration::Demonstration;
 pub use heuristic::{Grouping, HeuristicName};
 pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
+pub(crate) use online::longest_lookahead;
 pub use online::{CommittedStep, OnlineMapping};
-pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step};
+pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
 pub use problem::Problem;
 pub use request::{
     ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,

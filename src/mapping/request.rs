@@ -9,11 +9,12 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::{
-    Budget, Demonstration, Grouping, HeuristicName, Mapper, Mapping, OnlineMapping, Policy, Problem, Settings,
+    Budget, Demonstration, Grouping, HeuristicName, Mapper, Mapping, Move, MoveKind, OnlineMapping, Policy, Problem,
+    Settings, longest_lookahead,
 };
 use crate::attribute::{Scalar, Weights};
 use crate::document::{Faults, Object, Place};
-use crate::interrupt::{Cancelled, Interrupt};
+use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::model::{Model, StateIdx};
 
 /// A request for a policy, checked against its model.
@@ -90,6 +91,11 @@ impl<'m> Request<'m> {
         };
         let options = Self::read_options(object, faults);
         Self::check_lookahead(model, object, faults);
+        if let (Some(Options { lookahead: Some(lookahead), .. }), Some(place)) = (options, object.optional("lookahead"))
+        {
+            let n_observations = demonstration.as_ref().map_or(0, Demonstration::len);
+            Self::check_window(model, lookahead, n_observations, &place, faults);
+        }
         let mut weights = base(faults)?;
         for (position, weight) in named? {
             weights.set(position, weight);
@@ -100,7 +106,7 @@ impl<'m> Request<'m> {
     }
 
     /// The mapping that is asked for, of `mapper`'s model: with a lookahead, the one that a stream of the demonstration gives.
-    /// That one is not cut short: a lookahead bounds its work, so `interrupt` is asked once per layer and can only cancel it.
+    /// Where the budget runs out or `interrupt` says to finish before the demonstration has ended, the rest is followed greedily.
     ///
     /// # Errors
     ///
@@ -114,19 +120,82 @@ impl<'m> Request<'m> {
         if self.lookahead.is_none() {
             return mapper.map(problem, self.settings, interrupt);
         }
+        let n_states = problem.model.graph().n_states() as u64;
         let weights = problem.weights.clone();
         let mut online = OnlineMapping::new(mapper, weights, Some(problem.start), self.lookahead);
         for observation in problem.demonstration.iter() {
-            online.observe(observation, interrupt)?;
+            let is_spent = online.n_expanded().saturating_add(n_states) > self.settings.budget.max_expansions;
+            match if is_spent { Signal::Finish } else { interrupt.poll() } {
+                Signal::Continue => {}
+                Signal::Finish => {
+                    let spent = (online.n_expanded(), online.n_generated());
+                    // The cheapest way to what has come so far.
+                    let moves = online.end().map(|(_, mapping)| mapping.moves).unwrap_or_default();
+                    return self.complete(mapper, moves, spent, interrupt);
+                }
+                Signal::Cancel => return Err(Cancelled),
+            }
+            let mut is_over = false;
+            let mut until_over = || match interrupt.poll() {
+                Signal::Finish => {
+                    is_over = true;
+                    Signal::Cancel
+                }
+                signal => signal,
+            };
+            match online.observe(observation, &mut until_over) {
+                Ok(_) => {}
+                Err(Cancelled) if is_over => {
+                    // What is not committed was half changed.
+                    let spent = (online.n_expanded(), online.n_generated());
+                    return self.complete(mapper, online.into_moves(), spent, interrupt);
+                }
+                Err(Cancelled) => return Err(Cancelled),
+            }
         }
         let (_, mapping) = online.end().expect("a demonstration is never empty");
         Ok(mapping)
     }
 
-    /// Notes a lookahead that the model does not allow.
+    /// A mapping that begins with `moves`, for which so many nodes and transitions were looked at, and goes on greedily.
+    fn complete(
+        &self,
+        mapper: &Mapper,
+        mut moves: Vec<Move>,
+        (n_expanded, n_generated): (u64, u64),
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        if moves.is_empty() {
+            moves.push(Move { kind: MoveKind::Start, action: None, observation: 0, state: self.problem.start });
+        }
+        let mapping = mapper.complete(&self.problem, moves, interrupt)?;
+        Ok(Mapping { n_expanded, n_generated, ..mapping })
+    }
+
+    /// Notes a lookahead at all in a world that is searched lazily.
     pub(crate) fn check_lookahead(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
         if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {
             faults.note(&place, "this world is searched lazily, which needs the whole demonstration: leave this out");
+        }
+    }
+
+    /// Notes at `place` a lookahead over so many observations, at most, that would take too much memory.
+    pub(crate) fn check_window(
+        model: &Model,
+        lookahead: NonZeroU32,
+        n_observations: usize,
+        place: &Place<'_, '_>,
+        faults: &mut Faults,
+    ) {
+        let longest = longest_lookahead(model);
+        let reach = usize::try_from(lookahead.get()).unwrap_or(usize::MAX).min(n_observations.saturating_sub(1));
+        if !model.is_lazy() && reach > longest as usize {
+            let n_states = model.states().len();
+            let detail = format!(
+                "a lookahead over {reach} observations is too far for a model of {n_states} states, where it may be {longest}: \
+                 make it shorter, or leave it out"
+            );
+            faults.note(place, detail);
         }
     }
 
@@ -197,8 +266,8 @@ pub struct RequestDocument {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub learner: Option<String>,
     /// How many observations past the current one a decision may wait for; `null`: all. With a number, the policy is what a
-    /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`). Not for a world that is
-    /// searched lazily.
+    /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`). It may reach so far that
+    /// the observations it spans times the model's states are 134 million. Not for a world that is searched lazily.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 1, maximum = 100_000)]
     pub lookahead: Option<u32>,
@@ -208,10 +277,11 @@ pub struct RequestDocument {
     /// What guides the search.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub heuristic: Option<HeuristicName>,
-    /// Most nodes to expand; then the best mapping found so far is answered, with `status` `bounded`.
+    /// Most nodes to expand; then the best mapping found so far is answered, with `status` `bounded`. With a lookahead, each
+    /// observation expands every state once, and again where its layer is made anew; then the rest is followed greedily.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_expansions: Option<u64>,
-    /// Most milliseconds to search, waiting included; then as above. At most a day. Without effect if there is a lookahead.
+    /// Most milliseconds to search, waiting included; then as above. At most a day.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(maximum = 86_400_000)]
     pub deadline_ms: Option<u64>,

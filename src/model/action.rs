@@ -7,7 +7,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
-use crate::document::{Faults, Place, Quoted, Range, list_known};
+use crate::document::{Faults, Path, Place, Quoted, Range, list_known};
 
 /// Index of an action in its model.
 pub type ActionIdx = u16;
@@ -75,7 +75,8 @@ impl<'v> ReadActions<'v> {
                 Some(name) => match read.positions.entry(name) {
                     Entry::Vacant(entry) => drop(entry.insert(index)),
                     Entry::Occupied(_) => {
-                        faults.note(&place, format!("another action is called {} already", Quoted(name)));
+                        let detail = format!("another action is called {} already", Quoted(name));
+                        faults.note_at(&Path::Member(&place.path, "name"), detail);
                     }
                 },
             }

@@ -89,6 +89,9 @@ impl Definition {
     /// Writes the definition as JSON in canonical form: defaults filled in, actions of transitions by name. Reading it gives
     /// the same definition, and equal content gives equal text.
     ///
+    /// The order of lists is part of the content, also that of transitions and of candidates to start in, where it means
+    /// nothing: their texts are hashed, and databases hold hashes of texts that were written in the order that was sent.
+    ///
     /// # Errors
     ///
     /// If `writer` failed.
@@ -322,16 +325,23 @@ mod tests {
     }
 
     #[test]
+    fn a_cyclic_attribute_with_a_period_and_labels_has_one_fault_whatever_these_are() {
+        let mut model = two_states();
+        model["attributes"] = json!([{"name": "x", "kind": "cyclic", "period": 0, "labels": []}]);
+        assert_eq!(faults_of(&model), ["/attributes/0"]);
+    }
+
+    #[test]
     fn a_faulty_action_keeps_its_index_and_its_name() {
         let mut model = two_states();
         model["actions"] = json!([{"name": "a", "cost": -1}, {"name": "b"}, {"name": "a"}]);
         model["dynamics"]["transitions"] = json!([[0, "a", 1], [0, 1, 1], [1, 2, 0], [1, 3, 0], [1, "c", 0]]);
-        let expected = ["/actions/0/cost", "/actions/2", "/dynamics/transitions/3/1", "/dynamics/transitions/4/1"];
+        let expected = ["/actions/0/cost", "/actions/2/name", "/dynamics/transitions/3/1", "/dynamics/transitions/4/1"];
         assert_eq!(faults_of(&model), expected);
         // What an action without a name is called is not known.
         model["actions"] = json!([{"name": 7}, {"name": "b"}, {"cost": 1}, {"name": "b"}]);
         model["dynamics"]["transitions"] = json!([[0, "c", 1]]);
-        assert_eq!(faults_of(&model), ["/actions/0/name", "/actions/2/name", "/actions/3"]);
+        assert_eq!(faults_of(&model), ["/actions/0/name", "/actions/2/name", "/actions/3/name"]);
     }
 
     #[test]

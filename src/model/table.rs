@@ -487,10 +487,12 @@ pub struct TableDocument {
     /// Each state's attribute values, in attribute order.
     #[schema(example = json!([[0, "east", "open"], [1, "east", "open"]]))]
     pub states: Vec<Vec<Scalar>>,
-    /// `[from, action, to]`: states by index, the action by name or index. At most one per state and action.
+    /// `[from, action, to]`: states by index, the action by name or index. At most one per state and action. In another order
+    /// they are other content, though they mean the same.
     pub transitions: Vec<TransitionDocument>,
     /// Where the imitator starts: a state's index, or a list of candidates, of which the one closest to the first
-    /// observation is taken. Left out: every safe state is a candidate.
+    /// observation is taken; in another order they are other content, though they mean the same. Left out: every safe state is
+    /// a candidate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<StartDocument>,
     /// States that must never be entered, in any order.

@@ -435,8 +435,8 @@ impl Cave {
             })
         };
         let cave = cave();
-        if cave.as_ref().is_some_and(|cave| cave.is_deadly(&cave.first_state())) {
-            faults.note_at(&Path::Member(&object.path, "start"), "the start cell holds a pit or a wumpus");
+        if let Some((cell, _)) = start {
+            note_deadly(&object, cell, meter, faults)?;
         }
         Ok(cave)
     }
@@ -519,6 +519,31 @@ fn read_cells(
         cells.extend(x.zip(y));
     }
     Ok((cells.len() == items.len()).then_some(cells))
+}
+
+/// Notes that a pit or a wumpus is where the agent starts: at `start`, unless that is left out.
+fn note_deadly(
+    object: &Object<'_, '_>,
+    (x, y): Cell,
+    meter: &mut Meter<'_>,
+    faults: &mut Faults,
+) -> Result<(), Cancelled> {
+    for (name, thing) in [("pits", "pit"), ("wumpi", "wumpus")] {
+        let Some(list) = object.optional(name) else { continue };
+        for (n, item) in list.value.as_array().into_iter().flatten().enumerate() {
+            meter.spend_or_cancel(1)?;
+            let cell = item.as_array().map(Vec::as_slice).unwrap_or_default();
+            if !cell.iter().map(serde_json::Value::as_u64).eq([Some(x.into()), Some(y.into())]) {
+                continue;
+            }
+            match object.optional("start") {
+                Some(start) => faults.note(&start, format!("this cell holds a {thing}")),
+                None => faults.note(&list.item(n, item), "the agent starts here, as `start` is left out"),
+            }
+            break;
+        }
+    }
+    Ok(())
 }
 
 fn read_coordinate(place: &Place<'_, '_>, side: u16, faults: &mut Faults) -> Option<u16> {

@@ -191,7 +191,8 @@ impl Batch {
             Err(faults) => return Ok(Err(faults.into())),
         };
         let stamp = Stamp { id: Some(Uuid::now_v7().to_string()), ..self.stamp.clone() };
-        follow(&self.mapper, &request, &document, stamp, interrupt)
+        let place = Path::Member(&path, "demonstration");
+        follow(&self.mapper, &request, (&document, &place), stamp, interrupt)
     }
 
     /// The item as a request of its own.
@@ -289,7 +290,7 @@ pub struct BatchRequest {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_expansions: Option<u64>,
     /// Most milliseconds for the whole batch, waiting included; items that are not done by then get the best mapping found,
-    /// with `status` `bounded`. At most a day. Without effect on items with a lookahead.
+    /// with `status` `bounded`, or `local` if they have a lookahead. At most a day.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(maximum = 86_400_000)]
     pub deadline_ms: Option<u64>,

@@ -16,7 +16,7 @@ use super::{Admission, Etude, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{Demonstration, Mapper, Mapping, Problem, Request, Stamp, Status, WrittenPolicy};
+use crate::mapping::{Demonstration, Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
@@ -99,7 +99,7 @@ impl Etude {
                 Request::read_beside(Some(demonstration), model, &object, base, &mut faults)
             });
             let Ok(request) = faults.check(request) else { return Ok(Ok(None)) };
-            let searched = follow(mapper, &request, &document, stamp, interrupt)?;
+            let searched = follow(mapper, &request, (&document, &DEMONSTRATION), stamp, interrupt)?;
             Ok(searched.map(Some))
         };
         place.run_here(deadline, job).await?
@@ -297,6 +297,9 @@ fn is_quick(model: &Model, document: &Value, n_observations: usize) -> bool {
         && n_observations.saturating_mul(step_bytes()) <= MAX_INLINE_BYTES
 }
 
+/// Where a request's demonstration is.
+const DEMONSTRATION: Path<'static> = Path::Member(&Path::Root, "demonstration");
+
 /// What a search gave.
 pub(super) struct Searched {
     /// The policy: JSON.
@@ -341,16 +344,17 @@ pub(super) fn search(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
     match read_request(mapper.model(), document, fields, base) {
-        Ok(request) => follow(mapper, &request, document, stamp, interrupt),
+        Ok(request) => follow(mapper, &request, (document, &DEMONSTRATION), stamp, interrupt),
         Err(faults) => Ok(Err(faults.into())),
     }
 }
 
-/// Searches, and writes the policy. The request was read from `document`.
+/// Searches, and writes the policy, unless that is too large. The request was read from the document, its demonstration from the place
+/// there that a fault would name.
 pub(super) fn follow(
     mapper: &Arc<Mapper>,
     request: &Request<'_>,
-    document: &Value,
+    (document, place): (&Value, &Path<'_>),
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
@@ -358,6 +362,11 @@ pub(super) fn follow(
     let mapping = request.solve(mapper, interrupt)?;
     let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
+    if let Err(error) = Policy::check_steps(mapper.model(), &mapping) {
+        let mut faults = Faults::default();
+        faults.note_at(place, error.to_string());
+        return Ok(Err(faults.into()));
+    }
     let refinement = (mapping.status == Status::Local).then(|| {
         let mut request_for_refined = document.clone();
         // The weights that are used, wherever they came from.

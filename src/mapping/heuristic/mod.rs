@@ -52,6 +52,27 @@ pub enum Grouping {
     Widest,
 }
 
+/// When that is, for [`Grouping::WhenItPays`].
+#[derive(Clone, Copy, Debug)]
+pub(super) struct GroupingPatience {
+    /// After this many expansions,
+    pub(super) min_expansions: u64,
+    /// and after so many for each of the model's transitions: looking at one takes about as long.
+    pub(super) expansions_per_transition: u64,
+    /// How many expansions must have been done for each entry of a level's tables; if 0, these may be of any size.
+    pub(super) expansions_per_entry: u64,
+}
+
+impl GroupingPatience {
+    pub(super) const DEFAULT: Self = Self {
+        min_expansions: 1 << 16,
+        expansions_per_transition: 1,
+        // An entry takes about as long as two; attempts that fail should not take much of the search, and they are repeated
+        // whenever it has doubled.
+        expansions_per_entry: 16,
+    };
+}
+
 /// Which estimate guides a search.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "lowercase")]

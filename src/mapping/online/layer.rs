@@ -82,6 +82,11 @@ pub(super) struct Spare {
 }
 
 impl Spare {
+    /// Approximate size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        self.costs.capacity() * size_of::<f64>() + self.nodes.capacity() * size_of::<Node>()
+    }
+
     /// Arrays that say of states out of reach that no way leads there. As what is within reach only ever shrinks, those
     /// written of as many states as now are have nothing to be cleared.
     fn cleared(mut self, n_states: usize, n_reached: usize) -> Self {
@@ -165,8 +170,21 @@ impl Layer {
         }
     }
 
-    /// Forgets the costs, and where few survivors hang on it, all nodes but theirs. Gives what can be filled again.
+    /// Approximate size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        /// Of a hash table, with the free ones beside it.
+        const ENTRY_BYTES: usize = 16;
+        let n_node_bytes = match &self.nodes {
+            Nodes::Dense(nodes) => nodes.len() * size_of::<Node>(),
+            Nodes::Sparse(nodes) => nodes.capacity() * ENTRY_BYTES,
+        };
+        size_of::<Self>() + n_node_bytes + self.costs.len() * size_of::<f64>() + self.observed.size_bytes()
+    }
+
+    /// Forgets the costs and the tables of distances, and where few survivors hang on it, all nodes but theirs. Gives what can
+    /// be filled again.
     pub(super) fn forget(&mut self) -> Spare {
+        self.observed.drop_tables();
         let nodes = self.thin().unwrap_or_default();
         Spare { costs: std::mem::take(&mut self.costs), nodes, n_reached: self.n_reached }
     }
@@ -219,6 +237,11 @@ impl Sweep {
         Self { action_costs, distances: vec![0.0; model.graph().n_states()], open: OpenList::new() }
     }
 
+    /// Approximate size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        self.distances.len() * size_of::<f64>()
+    }
+
     /// The layer of the root, which costs `cost`: extras lead on from there (Dijkstra's algorithm). They lead to none but
     /// `reached`.
     pub(super) fn begin(
@@ -230,7 +253,7 @@ impl Sweep {
         spare: Spare,
     ) -> Layer {
         for state in reached {
-            self.distances[*state as usize] = observed.distance(model.states(), *state);
+            self.distances[*state as usize] = observed.distance(model, *state);
         }
         let Spare { mut costs, mut nodes, .. } = spare.cleared(model.graph().n_states(), usize::MAX);
         for state in reached.iter().map(|state| *state as usize) {
@@ -280,7 +303,7 @@ impl Sweep {
         }
         for state in reached {
             let at = *state as usize;
-            self.distances[at] = observed.distance(model.states(), *state);
+            self.distances[at] = observed.distance(model, *state);
             costs[at] += self.distances[at];
         }
         let is_lower = |state: StateIdx, cost: f64| cost < before[state as usize];

@@ -33,9 +33,11 @@
 //! - nodes at earlier observations that no survivor hangs on, and in a repair those whose lower bound (what they cost from an
 //!   earlier root) is no less than what a way that is left costs.
 //!
-//! **Memory.** Without a lookahead, older layers keep the nodes that survivors hang on, and no costs. With one, layers are
-//! kept whole so that they can be repaired (16 bytes per state and observation after the root's), unless that would be more
-//! than [`MAX_KEPT`] nodes.
+//! **Memory.** Without a lookahead, older layers keep the observation and the nodes that survivors hang on, at most 8 bytes per
+//! state; but no costs, and no distances: of the few states that steps lead to, these are computed again. With a lookahead,
+//! layers are kept whole so that they can be repaired (16 bytes per state and observation after the root's, and tables of
+//! distances), unless that would be more than [`MAX_KEPT`] nodes or terms of distances; requests with a lookahead beyond
+//! [`longest_lookahead`] are refused.
 //!
 //! **Ties.** The way found first is kept: a skip, then matches, from the lower state first, then extras, from the cheaper state
 //! first; of actions between the same two states the cheapest, the first among equals. In a repair, ways that were not
@@ -82,6 +84,7 @@ pub struct OnlineMapping {
     start: Option<StateIdx>,
     lookahead: Option<NonZeroU32>,
     n_observed: u32,
+    n_swept: u64,
     window: Window,
     /// The cost of the way to the window's root, summed as the layers' costs are.
     root_cost: f64,
@@ -99,8 +102,19 @@ pub struct OnlineMapping {
 /// Where more than one survivor in this many has lost its way, sweeping all layers takes less time than a repair.
 const SWEEPS_FROM: usize = 8;
 
-/// Most nodes of a window whose layers are kept whole, to be repaired; 16 bytes each.
+/// Most nodes of a window whose layers are kept whole, to be repaired, 16 bytes each; and most terms in its tables of distances,
+/// 8 bytes each. Together 48 MB.
 const MAX_KEPT: u64 = 1 << 21;
+
+/// Most nodes of a window, kept whole or not: 1 GB if all are alive, as when nothing tells the ways apart.
+const MAX_WINDOW: u64 = 1 << 27;
+
+/// The longest lookahead that is allowed with `model`: the window that it decides on, of one layer more, has at most 134 million
+/// nodes, which take 1 GB at worst. 0 if not even the shortest one is.
+pub(crate) fn longest_lookahead(model: &Model) -> u32 {
+    let n_layers = MAX_WINDOW / u64::from(model.states().len()).max(1);
+    u32::try_from(n_layers.saturating_sub(1)).unwrap_or(u32::MAX)
+}
 
 impl OnlineMapping {
     /// A mapping of a demonstration of which nothing has come yet. `start` overrides the model's; `lookahead` is how many
@@ -114,7 +128,10 @@ impl OnlineMapping {
         let model = mapper.shared_model();
         assert!(!model.is_lazy(), "each layer needs all states");
         let n_layers = lookahead.map_or(u64::MAX, |lookahead| 1 + u64::from(lookahead.get()));
-        let keeps = n_layers.saturating_mul(u64::from(model.states().len())) <= MAX_KEPT;
+        let weighted = weights.as_slice().iter().enumerate().filter(|(_, weight)| **weight > 0.0);
+        let n_terms: usize = weighted.map(|(position, _)| model.states().domain(position).len()).sum();
+        let n_each = u64::from(model.states().len()).max(n_terms as u64);
+        let keeps = n_layers.saturating_mul(n_each) <= MAX_KEPT;
         let sweep = Sweep::new(&model);
         let window = Window::new(model.states().len(), keeps);
         Self {
@@ -123,6 +140,7 @@ impl OnlineMapping {
             start,
             lookahead,
             n_observed: 0,
+            n_swept: 0,
             window,
             root_cost: 0.0,
             sweep,
@@ -147,10 +165,31 @@ impl OnlineMapping {
         self.moves.len()
     }
 
-    /// How many nodes of observations from the last committed one on survivors hang on.
+    /// How many nodes of observations from the last committed one on survivors hang on. Looks at each of these observations.
     #[must_use]
     pub fn n_nodes(&self) -> usize {
         self.window.n_alive()
+    }
+
+    /// Approximate size in memory, in bytes, without the model and the committed steps.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        self.window.size_bytes() + self.sweep.size_bytes()
+    }
+
+    /// How many nodes were looked at: every state once for each layer that was swept.
+    pub(super) fn n_expanded(&self) -> u64 {
+        self.n_swept * self.model.graph().n_states() as u64
+    }
+
+    /// How many transitions were looked at.
+    pub(super) fn n_generated(&self) -> u64 {
+        self.n_swept * self.model.graph().n_transitions() as u64
+    }
+
+    /// The committed steps, also of a mapping that was cancelled.
+    pub(super) fn into_moves(self) -> Vec<Move> {
+        self.moves
     }
 
     /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits.
@@ -165,12 +204,11 @@ impl OnlineMapping {
     ) -> Result<Vec<CommittedStep>, Cancelled> {
         let mut committed = Vec::new();
         let model = &*Arc::clone(&self.model);
-        let observed = ObservedDistances::new(model.schema(), model.states(), observation, &self.weights);
+        let observed = ObservedDistances::new(model, observation, &self.weights);
         self.n_observed += 1;
         if self.n_observed == 1 {
-            let state =
-                self.start.unwrap_or_else(|| choose_start(model, |state| observed.distance(model.states(), state)));
-            self.root_cost = observed.distance(model.states(), state);
+            let state = self.start.unwrap_or_else(|| choose_start(model, |state| observed.distance(model, state)));
+            self.root_cost = observed.distance(model, state);
             self.begin(state, self.root_cost, observed);
             // There is no other start.
             committed.push(self.commit(Move { kind: MoveKind::Start, action: None, observation: 0, state }, true));
@@ -195,10 +233,7 @@ impl OnlineMapping {
         let committed = path.into_iter().map(|place| self.commit_at(place, true)).collect();
         let status = if self.was_forced { Status::Local } else { Status::Optimal };
         let lower_bound = (status == Status::Optimal).then_some(self.cost.total);
-        // Each observation looks at every state once.
-        let graph = self.model.graph();
-        let n_expanded = u64::from(self.n_observed) * graph.n_states() as u64;
-        let n_generated = u64::from(self.n_observed) * graph.n_transitions() as u64;
+        let (n_expanded, n_generated) = (self.n_expanded(), self.n_generated());
         let mapping =
             Mapping { moves: self.moves, cost: self.cost, status, lower_bound, n_expanded, n_generated, states: None };
         Some((committed, mapping))
@@ -244,9 +279,9 @@ impl OnlineMapping {
         if step.kind != MoveKind::Start {
             let action_cost = step.action.map_or(0.0, |action| model.action(action).cost);
             self.root_cost += action_cost;
-            self.root_cost += layer.observed.distance(model.states(), step.state);
+            self.root_cost += layer.observed.distance(model, step.state);
         }
-        let terms = layer.observed.terms(model.states(), step.state);
+        let terms = layer.observed.terms(model, step.state);
         let written = writer.write(model, model.states(), &step, terms);
         self.cost = writer.cost();
         self.writer = writer;
@@ -268,13 +303,15 @@ impl OnlineMapping {
         }
         let root = self.window.root;
         let mut observed = self.window.clear().into_iter();
-        if let Some(first) = observed.next() {
+        if let Some(mut first) = observed.next() {
+            first.fill_tables(model);
             self.begin(root, self.root_cost, first);
         }
-        for observed in observed {
+        for mut observed in observed {
+            observed.fill_tables(model);
             let layer = self.follow(observed, interrupt)?;
             if self.window.keeps() {
-                self.window.layers.push_back(layer);
+                self.window.add(layer);
             } else {
                 self.window.push(layer);
             }
@@ -286,10 +323,11 @@ impl OnlineMapping {
     }
 
     fn begin(&mut self, root: StateIdx, cost: f64, observed: ObservedDistances) {
+        self.n_swept += 1;
         let spare = self.window.spare();
         let layer = self.sweep.begin(&self.model, (root, cost), &self.window.reached, observed, spare);
         self.window.root = root;
-        self.window.layers.push_back(layer);
+        self.window.add(layer);
         self.window.shrink();
         self.window.recount();
     }
@@ -299,6 +337,7 @@ impl OnlineMapping {
         if interrupt.poll() == Signal::Cancel {
             return Err(Cancelled);
         }
+        self.n_swept += 1;
         let spare = self.window.spare();
         let before = self.window.layers.back().expect("the first observation's layer begins a window");
         Ok(self.sweep.follow(&self.model, &before.costs, &self.window.reached, observed, spare))
@@ -312,10 +351,11 @@ mod tests {
 
     use super::*;
     use crate::interrupt::Uninterrupted;
-    use crate::model::{Definition, Limits, Model};
+    use crate::mapping::{Demonstration, HeuristicName, Problem, Settings};
+    use crate::model::{Definition, Limits, Model, Origin};
 
     /// States on a line, in any order, with any transitions.
-    fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Arc<Mapper> {
+    fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Mapper {
         let states: Vec<_> = places.iter().map(|x| json!([x])).collect();
         let actions = [("a", 0.0), ("b", 0.5), ("c", 2.0)];
         let mut transitions: Vec<_> = transitions
@@ -329,9 +369,48 @@ mod tests {
             "actions": actions.map(|(name, cost)| json!({"name": name, "cost": cost})),
             "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
         });
-        let definition = Definition::read(&document, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        prepared(&document)
+    }
+
+    fn prepared(model: &serde_json::Value) -> Mapper {
+        let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-        Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap())
+        Mapper::new(model, &mut Uninterrupted).unwrap()
+    }
+
+    /// Two loops of as many states each. From state 0 either can be entered, and none is left. All attributes tell all states
+    /// apart.
+    fn loops(n_each: usize, n_attributes: usize) -> Mapper {
+        let on = |first: usize| (0..n_each).map(move |n| json!([first + n, "on", first + (n + 1) % n_each]));
+        let entries = [json!([0, "left", 1]), json!([0, "right", 1 + n_each])];
+        let transitions: Vec<_> = entries.into_iter().chain(on(1)).chain(on(1 + n_each)).collect();
+        let states: Vec<Vec<usize>> = (0..=2 * n_each).map(|state| vec![state; n_attributes]).collect();
+        let attributes = (0..n_attributes).map(|n| json!({"name": format!("a{n}"), "kind": "number"}));
+        prepared(&json!({
+            "attributes": attributes.collect::<Vec<_>>(),
+            "actions": [{"name": "left"}, {"name": "right"}, {"name": "on"}],
+            "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
+        }))
+    }
+
+    #[test]
+    fn without_a_lookahead_an_observation_that_commits_nothing_keeps_no_distances() {
+        let (n_each, n_attributes) = (150, 8);
+        let mapper = loops(n_each, n_attributes);
+        let mut online = OnlineMapping::new(&mapper, mapper.model().schema().weights(), None, None);
+        let mut sizes = Vec::new();
+        for n in 0..900_u32 {
+            let observation = vec![Some(Value::Number(f64::from(1 + n % 150))); n_attributes];
+            online.observe(&observation, &mut Uninterrupted).unwrap();
+            assert!(online.window.knows_its_size());
+            sizes.push(online.size_bytes());
+        }
+        // Nobody knows yet that the other loop is not meant.
+        assert_eq!(online.n_steps(), 1);
+        let per_observation = (sizes[899] - sizes[449]) / 450;
+        assert!(per_observation < 2048, "{per_observation} bytes, where distances would take {}", 301 * 8 * 8);
+        let (_, mapping) = online.end().unwrap();
+        assert_eq!((mapping.status, mapping.moves.len()), (Status::Optimal, 901));
     }
 
     proptest! {
@@ -364,12 +443,76 @@ mod tests {
                 prop_assert_eq!(costs(&swept), costs(&thinned));
                 prop_assert_eq!(swept.n_nodes(), thinned.n_nodes());
                 observe(&mut repaired);
-                // Ties may have been told apart in another way.
+                for online in [&repaired, &swept, &thinned] {
+                    prop_assert!(online.window.knows_its_size());
+                }
+                // Where ties were told apart in another way, they go on from different roots: see below.
                 if repaired.moves != swept.moves {
                     break;
                 }
                 prop_assert_eq!(costs(&repaired), costs(&swept));
             }
+        }
+
+        #[test]
+        fn what_is_decided_after_repairs_is_as_cheap_as_any_search_finds(
+            places in prop::collection::vec(0..12_u32, 5..25),
+            transitions in prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..70),
+            observed in prop::collection::vec(0..12_u32, 5..25),
+            lookahead in 1..7_u32,
+        ) {
+            let mapper = mapper(&places, &transitions);
+            let weights = mapper.model().schema().weights();
+            let observations: Vec<_> = observed.iter().map(|x| vec![Some(Value::Number(f64::from(*x)))]).collect();
+            // What it costs to go on from a node to the observation `to`, by a search of its own.
+            let to_go = |(i, state): (u32, StateIdx), to: u32| {
+                let rest = Demonstration::of(observations[i as usize..=to as usize].to_vec()).unwrap();
+                let problem = Problem::new(mapper.model(), rest, weights.clone(), Some(Origin::State(state)));
+                let settings = Settings { heuristic: HeuristicName::None, ..Settings::default() };
+                let cost = mapper.map(&problem, settings, &mut Uninterrupted).unwrap().cost.total;
+                cost - problem.distances.distance(0, mapper.model().states().row(state))
+            };
+            let new = OnlineMapping::new(&mapper, weights.clone(), None, NonZeroU32::new(lookahead));
+            let mut online = OnlineMapping { sweeps_from: 0, ..new };
+            let mut at = (0, 0);
+            for (i, observation) in (0..).zip(&observations) {
+                let committed = online.observe(observation, &mut Uninterrupted).unwrap();
+                let mut paid = 0.0;
+                let mut from = at;
+                for (n, CommittedStep { step, is_proven, after }) in committed.iter().enumerate() {
+                    at = (step.observation, step.state_index);
+                    prop_assert_eq!(*after, i + 1);
+                    if step.kind == MoveKind::Start {
+                        from = at;
+                        continue;
+                    }
+                    paid += step.action_cost + step.distance;
+                    // What the lookahead decides is decided up to the step that advances.
+                    let next = committed.get(n + 1);
+                    if !is_proven && at.0 == from.0 && next.is_some_and(|next| !next.is_proven) {
+                        continue;
+                    }
+                    let (best, taken) = (to_go(from, i), paid + to_go(at, i));
+                    prop_assert!((best - taken).abs() <= 1e-9 * (1.0 + best), "{taken} where {best} was possible");
+                    (from, paid) = (at, 0.0);
+                }
+                // Every survivor's way, also where no commit depends on it: as that of a sweep that begins at the root.
+                let (first, root) = (online.window.first as usize, online.window.root);
+                let mut swept = OnlineMapping::new(&mapper, weights.clone(), Some(root), None);
+                for observation in &observations[first..=i as usize] {
+                    swept.observe(observation, &mut Uninterrupted).unwrap();
+                }
+                let before = online.root_cost - online.window.layers[0].observed.distance(mapper.model(), root);
+                let newest = |online: &OnlineMapping| online.window.layers.back().unwrap().costs.clone();
+                for (cost, swept) in newest(&online).into_iter().zip(newest(&swept)) {
+                    let is_same = cost == before + swept || (cost - before - swept).abs() <= 1e-9 * (1.0 + cost);
+                    prop_assert!(is_same, "{cost}, not {before} + {swept}");
+                }
+            }
+            let cost = online.cost.total;
+            let rest = to_go(at, u32::try_from(observations.len()).unwrap() - 1);
+            let (_, mapping) = online.end().unwrap();
+            prop_assert!((mapping.cost.total - cost - rest).abs() <= 1e-9 * (1.0 + cost + rest));
         }
     }
 }

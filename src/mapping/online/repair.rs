@@ -158,7 +158,7 @@ impl<'r> Repair<'r> {
     }
 
     fn distance(&self, (index, state): Place) -> f64 {
-        self.window.layers[index].observed.distance(self.model.states(), state)
+        self.window.layers[index].observed.distance(self.model, state)
     }
 
     /// Whether a node's way leads from the root and costs what it says. Every node of the way is noted as what it is.

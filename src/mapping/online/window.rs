@@ -23,17 +23,31 @@ pub(super) struct Window {
     /// Whether older layers keep the costs of their nodes, and the nodes that no survivor hangs on.
     keeps: bool,
     spare: Vec<Spare>,
+    /// Of all layers.
+    layer_bytes: usize,
 }
 
 impl Window {
     pub(super) fn new(n_states: StateIdx, keeps: bool) -> Self {
         let reached = (0..n_states).collect();
-        Self { layers: VecDeque::new(), first: 0, root: 0, reached, keeps, spare: Vec::new() }
+        Self { layers: VecDeque::new(), first: 0, root: 0, reached, keeps, spare: Vec::new(), layer_bytes: 0 }
     }
 
-    /// How many nodes survivors hang on.
+    /// Approximate size in memory, in bytes. Looks at no layer.
+    pub(super) fn size_bytes(&self) -> usize {
+        let spare: usize = self.spare.iter().map(Spare::size_bytes).sum();
+        self.layer_bytes + spare + self.reached.capacity() * size_of::<StateIdx>()
+    }
+
+    /// How many nodes survivors hang on. Looks at every layer.
     pub(super) fn n_alive(&self) -> usize {
         self.layers.iter().map(Layer::n_alive).sum()
+    }
+
+    /// Whether the running total is right.
+    #[cfg(test)]
+    pub(super) fn knows_its_size(&self) -> bool {
+        self.layer_bytes == self.layers.iter().map(Layer::size_bytes).sum::<usize>()
     }
 
     pub(super) fn keeps(&self) -> bool {
@@ -47,6 +61,7 @@ impl Window {
 
     /// Drops all layers, and gives the distances to their observations.
     pub(super) fn clear(&mut self) -> Vec<ObservedDistances> {
+        self.layer_bytes = 0;
         let layers = std::mem::take(&mut self.layers);
         let observed = layers.into_iter().map(|layer| {
             let (spare, observed) = layer.into_spare();
@@ -77,9 +92,24 @@ impl Window {
         }
     }
 
+    /// Adds a layer, of whose nodes nothing is counted yet.
+    pub(super) fn add(&mut self, layer: Layer) {
+        self.layer_bytes += layer.size_bytes();
+        self.layers.push_back(layer);
+    }
+
+    /// Has the layer at `index` keep less.
+    fn lighten<T>(&mut self, index: usize, lighten: impl FnOnce(&mut Layer) -> T) -> T {
+        let layer = &mut self.layers[index];
+        self.layer_bytes -= layer.size_bytes();
+        let freed = lighten(layer);
+        self.layer_bytes += layer.size_bytes();
+        freed
+    }
+
     /// Adds a layer, whose nodes hang on those of the layer before or on each other.
     pub(super) fn push(&mut self, layer: Layer) {
-        self.layers.push_back(layer);
+        self.add(layer);
         let newest = self.layers.len() - 1;
         let reached = std::mem::take(&mut self.reached);
         for state in reached.iter().copied() {
@@ -92,7 +122,7 @@ impl Window {
                 }
             }
             if !self.keeps {
-                let spare = self.layers[newest - 1].forget();
+                let spare = self.lighten(newest - 1, Layer::forget);
                 self.recycle(spare);
             }
         }
@@ -124,7 +154,7 @@ impl Window {
             self.layers[index].kill(state);
             if !self.keeps && index != held {
                 // It is left to the allocator: there is one for the next layer already.
-                drop(self.layers[index].thin());
+                drop(self.lighten(index, Layer::thin));
             }
             let Some(source) = source else { return };
             if self.layers[source.0].remove_child(source.1) > 0 {
@@ -170,6 +200,7 @@ impl Window {
         }
         for _ in 0..index {
             if let Some(layer) = self.layers.pop_front() {
+                self.layer_bytes -= layer.size_bytes();
                 let (spare, _) = layer.into_spare();
                 self.recycle(spare);
                 self.first += 1;

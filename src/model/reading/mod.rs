@@ -78,6 +78,8 @@ pub(super) struct Reader<'m, 'i> {
     /// About how much memory the values take that are kept as they are.
     n_held_bytes: usize,
     max_held_bytes: usize,
+    /// Members of the line that is read that stand on it twice, if it is not the model's.
+    twice: Vec<String>,
     /// Why an error was raised that is not the text's.
     stop: Option<Stop>,
     /// The way to where an error was met, innermost step first.
@@ -115,6 +117,7 @@ impl<'m, 'i> Reader<'m, 'i> {
             line: None,
             n_held_bytes: 0,
             max_held_bytes: MAX_HELD_BYTES,
+            twice: Vec::new(),
             stop: None,
             trace: Vec::new(),
         }
@@ -173,6 +176,10 @@ impl<'m, 'i> Reader<'m, 'i> {
                 root = Some(read);
             } else {
                 check_chunk(&read, number, &mut faults);
+                for name in self.twice.drain(..) {
+                    // What a list adds to those before it cannot be told from them later.
+                    faults.note_at(&Path::Member(&Path::Line(number), &name), "stands twice on this line");
+                }
             }
         }
         self.line = model_line;

@@ -169,6 +169,9 @@ impl<'de> Take<'de> for Seed<'_, '_, '_> {
             reader.hold(size_of::<String>() + name.len())?;
             let member = members.next_value_seed(Seed::new(reader, position.of_member(&name)));
             let member = reader.traced(member, || Step::Member(name.clone()))?;
+            if position == Position::Chunk && held.contains_key(&name) {
+                reader.twice.push(name.clone());
+            }
             held.insert(name, member);
         }
         Ok(Value::Object(held))

@@ -225,6 +225,16 @@ fn of_members_that_stand_twice_the_last_one_counts() {
 }
 
 #[test]
+fn a_list_that_stands_twice_on_a_later_line_is_a_fault() {
+    let model = r#"{"attributes": [{"name": "x", "kind": "number"}], "actions": [], "dynamics": {"kind": "table"}}"#;
+    let read = |chunk: &str| outcome(parse(&format!("{model}\n{chunk}\n"), Format::Ndjson));
+    assert!(read(r#"{"states": [[0], [1]], "transitions": []}"#).is_ok());
+    let faults = read(r#"{"states": [[0], [1]], "transitions": [], "states": [[2]]}"#).unwrap_err();
+    let [fault] = &faults[..] else { panic!("{faults:?}") };
+    assert_eq!((fault.line, fault.pointer.as_str()), (Some(2), "/states"));
+}
+
+#[test]
 fn what_is_wrong_is_said_as_it_always_was() {
     let text = r#"{
         "attributes": [{"name": "x", "kind": "number"}, {"name": "c", "kind": "category"}],

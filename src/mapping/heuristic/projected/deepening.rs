@@ -6,9 +6,9 @@ use super::shares::{Parts, Way, Ways};
 use super::{Column, Projected};
 use crate::interrupt::{Cancelled, Meter, Signal};
 use crate::mapping::Problem;
-use crate::mapping::heuristic::Grouping;
 use crate::mapping::heuristic::bounded::{Basis, Bounded, Unsolved};
 use crate::mapping::heuristic::projection::Projections;
+use crate::mapping::heuristic::{Grouping, GroupingPatience};
 use crate::mapping::open_list::CheapestFirst;
 
 /// What is known for making tables of groups of several attributes.
@@ -22,6 +22,7 @@ pub(super) struct Deepening<'p> {
     /// After how many expansions it is worth a try.
     due: u64,
     grouping: Grouping,
+    patience: GroupingPatience,
     forward: Option<Forward>,
 }
 
@@ -33,13 +34,23 @@ impl<'p> Deepening<'p> {
         used: Vec<bool>,
         grouping: Grouping,
     ) -> Self {
-        let due = match grouping {
+        let patience = GroupingPatience::DEFAULT;
+        Self { projections, used, level: 0, due: patience.due(grouping, problem), grouping, patience, forward: None }
+    }
+}
+
+impl GroupingPatience {
+    /// After how many expansions of a search for `problem` a first level is worth a try.
+    fn due(self, grouping: Grouping, problem: &Problem<'_>) -> u64 {
+        match grouping {
             // Groups are chosen by looking at states and transitions.
             _ if problem.model.is_lazy() => u64::MAX,
             Grouping::Widest => 0,
-            Grouping::WhenItPays => MIN_EXPANSIONS.max(problem.model.graph().n_transitions() as u64),
-        };
-        Self { projections, used, level: 0, due, grouping, forward: None }
+            Grouping::WhenItPays => {
+                let n_transitions = problem.model.graph().n_transitions() as u64;
+                self.min_expansions.max(n_transitions * self.expansions_per_transition)
+            }
+        }
     }
 }
 
@@ -63,14 +74,6 @@ pub(in crate::mapping) enum Deepened {
     CutShort,
 }
 
-/// Groups of several attributes are projected after this many expansions, and after as many as the model has transitions: looking at
-/// these takes about as long.
-const MIN_EXPANSIONS: u64 = 1 << 16;
-
-/// How many expansions must have been done for each entry of a level's tables. An entry takes about as long as two; attempts that
-/// fail should not take much of the search, and they are repeated whenever it has doubled.
-const EXPANSIONS_PER_ENTRY: u64 = 16;
-
 /// Most entries of the tables of a level: 256 MB with the room in hash tables.
 const MAX_JOINT_ENTRIES: usize = 1 << 22;
 
@@ -78,6 +81,14 @@ const MAX_JOINT_ENTRIES: usize = 1 << 22;
 const SLACK: f64 = 1e-9;
 
 impl<'p> Projected<'p> {
+    /// Sets when attributes are projected together, before any were.
+    pub(in crate::mapping) fn set_patience(&mut self, patience: GroupingPatience) {
+        if let Some(deepening) = &mut self.deepening {
+            deepening.patience = patience;
+            deepening.due = patience.due(deepening.grouping, self.problem);
+        }
+    }
+
     /// After how many expansions better estimates are worth a try.
     pub(in crate::mapping) fn deepening_due(&self) -> u64 {
         self.deepening.as_ref().map_or(u64::MAX, |deepening| deepening.due)
@@ -98,7 +109,10 @@ impl<'p> Projected<'p> {
         let Some(mut deepening) = self.deepening.take() else { return Ok(Deepened::No) };
         let most_entries = match deepening.grouping {
             Grouping::Widest => MAX_JOINT_ENTRIES,
-            Grouping::WhenItPays => usize::try_from(n_expanded / EXPANSIONS_PER_ENTRY).unwrap_or(usize::MAX),
+            Grouping::WhenItPays => {
+                let n_entries = n_expanded.checked_div(deepening.patience.expansions_per_entry);
+                n_entries.and_then(|n_entries| usize::try_from(n_entries).ok()).unwrap_or(usize::MAX)
+            }
         };
         let most_entries = most_entries.min(MAX_JOINT_ENTRIES);
         match self.solve_level(&mut deepening, limit, most_entries, meter) {
