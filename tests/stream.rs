@@ -417,6 +417,34 @@ async fn a_thousand_observations_fit_into_a_frame() {
     assert_eq!(steps(&frames).last().unwrap()["observation"], 999);
 }
 
+/// With thousands of actions of long names, `done` is larger than any frame that a client may send.
+#[tokio::test]
+async fn the_policy_of_a_long_session_arrives_over_a_websocket() {
+    let service = Service::start(&[]).await;
+    // Four bytes a character, of which a name has 64 at most.
+    let step = "\u{1f463}".repeat(64);
+    let toggle = json!({
+        "attributes": [{"name": "x", "kind": "number"}],
+        "actions": [{"name": step, "cost": 0}],
+        "dynamics": {"kind": "table", "states": [[0], [1]], "transitions": [[0, step, 1], [1, step, 0]], "start": 0},
+    });
+    assert_eq!(service.put("/v1/models/toggle", &toggle).await.0, 201);
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "toggle", "lookahead": 1})).await;
+    let states: Vec<Value> = (0..6000).map(|n| json!([n % 2])).collect();
+    client.send(json!({"type": "observe", "seq": 0, "states": states})).await;
+    client.send(json!({"type": "end", "seq": states.len()})).await;
+    let done = client.receive_until("done").await.pop().unwrap();
+    assert_eq!(done["actions"].as_array().unwrap().len(), states.len() - 1);
+    assert!(done.to_string().len() > 4 * 262_144);
+    assert_eq!(client.closed().await, 1000);
+    // And once more to who has lost it.
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": session, "step": states.len() - 1})).await;
+    assert_eq!(client.receive_until("done").await.last().unwrap(), &done);
+    assert_eq!(client.closed().await, 1000);
+}
+
 #[tokio::test]
 async fn pings_are_answered() {
     let (service, _) = figure_4().await;

@@ -62,7 +62,9 @@ pub(super) async fn websocket(
         .protocols([PROTOCOL])
         .max_message_size(limit * MAX_OVERSIZE)
         .max_frame_size(limit * MAX_OVERSIZE)
-        .max_write_buffer_size(limit * MAX_OVERSIZE)
+        // A limit would be one on the size of `done`. There is no need for it: once more waits there than is written at once,
+        // the next frame is not taken from the queue until that has gone.
+        .max_write_buffer_size(usize::MAX)
         .read_buffer_size(READ_BUFFER_BYTES);
     let span = tracing::Span::current();
     Ok(upgrade.on_upgrade(move |socket| {
@@ -143,29 +145,36 @@ async fn read_websocket(mut source: SplitStream<WebSocket>, came: mpsc::Sender<I
 }
 
 async fn write_websocket(mut sink: SplitSink<WebSocket, Message>, mut goes: mpsc::Receiver<Outgoing>) {
+    let closed = write_frames(&mut sink, &mut goes).await;
+    if let Some(closed) = closed {
+        let (code, reason) = closed.code();
+        let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
+        // A client that does not read does not hear this either.
+        let _ = tokio::time::timeout(CLOSE_TIMEOUT, sink.send(close)).await;
+    }
+}
+
+/// Writes what goes to the client, until nothing more will. Gives how to close, if there is still something to be closed.
+async fn write_frames(sink: &mut SplitSink<WebSocket, Message>, goes: &mut mpsc::Receiver<Outgoing>) -> Option<Closed> {
     while let Some(first) = goes.recv().await {
         // What waits together is written together: a write, and a wakeup of the client, cost more than a frame.
         let mut next = Some(first);
         while let Some(outgoing) = next {
-            let fed = match outgoing {
-                Outgoing::Frame(text) => sink.feed(Message::Text(text.into())).await,
-                Outgoing::Close(closed) => {
-                    let (code, reason) = closed.code();
-                    let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
-                    // A client that does not read does not hear this either.
-                    let _ = tokio::time::timeout(CLOSE_TIMEOUT, sink.send(close)).await;
-                    return;
+            match outgoing {
+                Outgoing::Frame(text) => {
+                    if let Err(error) = sink.feed(Message::Text(text.into())).await {
+                        tracing::debug!(error = &error as &dyn std::error::Error, "a frame could not be written");
+                        // Where the client is gone, it does not hear this; a frame must not vanish without a word.
+                        return Some(Closed::Failed);
+                    }
                 }
-            };
-            if fed.is_err() {
-                return;
+                Outgoing::Close(closed) => return Some(closed),
             }
             next = goes.try_recv().ok();
         }
-        if sink.flush().await.is_err() {
-            return;
-        }
+        sink.flush().await.ok()?;
     }
+    None
 }
 
 /// Stream a demonstration as NDJSON, both ways at the same time.
