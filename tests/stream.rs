@@ -666,6 +666,56 @@ async fn a_stream_follows_a_learners_weights_or_explores_and_is_rewarded() {
     assert_eq!(client.closed().await, 4404);
 }
 
+#[tokio::test]
+async fn an_exploring_session_ends_with_its_policy_if_no_reward_is_to_come_any_more() {
+    let (service, demonstration) = figure_4().await;
+    let learner = json!({"attributes": ["x", "gold"], "seed": 7});
+    assert_eq!(service.put("/v1/learners/gold", &learner).await.0, 201);
+    let explore = json!({"type": "open", "model": "figure-4", "learner": "gold", "explore": true});
+    let observe = json!({"type": "observe", "seq": 0, "states": demonstration});
+    let resume = async |session: &str| {
+        let mut client = Client::connect(&service).await;
+        client.send(json!({"type": "resume", "session": session})).await;
+        client
+    };
+
+    // Rewarded before its end.
+    let mut client = Client::connect(&service).await;
+    let session = client.open(explore.clone()).await;
+    client.send(observe.clone()).await;
+    client.send(json!({"type": "reward", "reward": 3})).await;
+    let rewarded = client.receive_until("rewarded").await.pop().unwrap();
+    client.send(json!({"type": "end", "seq": 16})).await;
+    client.receive_until("done").await;
+    assert_eq!(client.closed().await, 1000);
+    let mut again = resume(&session).await;
+    again.receive_until("done").await;
+    assert_eq!(again.receive().await, rewarded, "it may not have been heard");
+    assert_eq!(again.closed().await, 1000);
+
+    // Failed before its end.
+    let mut client = Client::connect(&service).await;
+    client.send(explore.clone()).await;
+    let opened = client.receive().await;
+    let fail = format!("/v1/trials/{}/fail", opened["trial"].as_str().unwrap());
+    assert_eq!(service.post(&fail, &json!({"reason": "it fell"})).await.0, 200);
+    client.send(observe.clone()).await;
+    client.send(json!({"type": "end", "seq": 16})).await;
+    client.receive_until("done").await;
+    assert_eq!(client.closed().await, 1000);
+
+    // The learner is deleted after its end.
+    let mut client = Client::connect(&service).await;
+    let session = client.open(explore).await;
+    client.send(observe).await;
+    client.send(json!({"type": "end", "seq": 16})).await;
+    client.receive_until("done").await;
+    assert_eq!(service.delete("/v1/learners/gold").await.0, 204);
+    let mut again = resume(&session).await;
+    again.receive_until("done").await;
+    assert_eq!(again.closed().await, 1000);
+}
+
 /// A client that reads nothing: the session's own search waits for it, and is given up.
 #[tokio::test]
 async fn who_stays_slow_is_closed_as_overloaded() {

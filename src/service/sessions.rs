@@ -24,7 +24,8 @@ use crate::mapping::{
 };
 use crate::model::Origin;
 use crate::store::{
-    NewObservations, NewRefinement, NewSession, Page, SessionEnd, SessionRow, SessionStatus, StoreError,
+    AcceptedReward, NewObservations, NewRefinement, NewSession, Page, SessionEnd, SessionRow, SessionStatus,
+    StoreError, TrialRow,
 };
 
 /// Why a session could not do as told.
@@ -128,6 +129,22 @@ pub struct Ended {
     pub steps: Vec<CommittedStep>,
     /// The policy of the whole, stored.
     pub policy: Policy,
+}
+
+/// What has become of the reward of a session.
+#[derive(Clone, Debug, PartialEq)]
+pub enum RewardState {
+    /// It is still to come.
+    Awaited,
+    /// It is on disk.
+    Accepted {
+        /// The trial that earned it.
+        trial: String,
+        /// The reward.
+        reward: AcceptedReward,
+    },
+    /// None will come: the session does not explore, its trial has failed, or its learner was deleted.
+    Never,
 }
 
 impl Etude {
@@ -340,6 +357,20 @@ impl Session {
     /// Completes when another connection takes the session over.
     pub async fn taken_over(&self) {
         self.ownership.taken_over.cancelled().await;
+    }
+
+    /// What has become of its reward.
+    ///
+    /// # Errors
+    ///
+    /// If the store failed.
+    pub async fn reward(&self, etude: &Etude) -> Result<RewardState, SessionError> {
+        let Some(trial) = &self.source.trial_id else { return Ok(RewardState::Never) };
+        Ok(match etude.store.trial(trial).await? {
+            Some(TrialRow { reward: Some(reward), id, .. }) => RewardState::Accepted { trial: id, reward },
+            Some(TrialRow { failed: None, .. }) => RewardState::Awaited,
+            Some(_) | None => RewardState::Never,
+        })
     }
 
     /// Takes the states from `seq` on, of which those received before are ignored: they are durable when this returns. What

@@ -11,7 +11,8 @@ use tokio_util::sync::CancellationToken;
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem};
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
-use crate::service::{Ended, Etude, PoolError, Received, Resumed, ServiceError, Session, SessionError};
+use crate::service::{Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError};
+use crate::store::AcceptedReward;
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
@@ -117,7 +118,7 @@ pub async fn run(
     outgoing: &mpsc::Sender<Outgoing>,
     stopping: &CancellationToken,
 ) -> Closed {
-    let mut connection = Connection { etude, limits, outgoing, session: None };
+    let mut connection = Connection { etude, limits, outgoing, session: None, is_reward_told: false };
     let ended = connection.speak(incoming, stopping).await;
     let closed = match ended {
         Ok(closed) => closed,
@@ -153,6 +154,8 @@ struct Connection<'c> {
     limits: Limits,
     outgoing: &'c mpsc::Sender<Outgoing>,
     session: Option<Session>,
+    /// Whether the client was told here that its reward is accepted.
+    is_reward_told: bool,
 }
 
 impl Connection<'_> {
@@ -210,7 +213,7 @@ impl Connection<'_> {
                 self.send_steps(steps.get(step as usize..).unwrap_or_default()).await?;
                 let Some(policy) = policy else { return Ok(None) };
                 self.send(&ServerFrame::from(&policy)).await?;
-                Ok(self.done())
+                self.done().await
             }
             (ClientFrame::Observe { .. } | ClientFrame::End { .. }, None) => {
                 Err(not_allowed("open or resume a session first"))
@@ -221,6 +224,7 @@ impl Connection<'_> {
                     Ok(trial) => {
                         let order = trial.row.reward.as_ref().map(|reward| reward.reward_order);
                         self.send(&ServerFrame::Rewarded { trial: &trial.row.id, reward, reward_order: order }).await?;
+                        self.is_reward_told = true;
                         Ok(has_ended.then_some(Closed::Done))
                     }
                     Err(error) => self.go_on_or_end(&error.into()).await,
@@ -249,17 +253,29 @@ impl Connection<'_> {
                 Ok(Ended { steps, policy }) => {
                     self.send_steps(&steps).await?;
                     self.send(&ServerFrame::from(&policy)).await?;
-                    Ok(self.done())
+                    self.done().await
                 }
                 Err(error) => self.go_on_or_end(&error).await,
             },
         }
     }
 
-    /// How the connection ends when the policy is done: an exploring session waits for its reward.
-    fn done(&self) -> Option<Closed> {
-        let explores = self.session.as_ref().is_some_and(|session| session.trial_id().is_some());
-        (!explores).then_some(Closed::Done)
+    /// How the connection ends once the policy is done, unless a reward is still to come.
+    async fn done(&mut self) -> Result<Option<Closed>, Over> {
+        let Some(session) = &self.session else { return Ok(Some(Closed::Done)) };
+        match session.reward(self.etude).await.map_err(|error| ends(&error))? {
+            RewardState::Awaited => Ok(None),
+            RewardState::Never => Ok(Some(Closed::Done)),
+            RewardState::Accepted { trial, reward } => {
+                // Whoever was cut off may not have heard it.
+                if !self.is_reward_told {
+                    let AcceptedReward { reward, reward_order } = reward;
+                    let frame = ServerFrame::Rewarded { trial: &trial, reward, reward_order: Some(reward_order) };
+                    self.send(&frame).await?;
+                }
+                Ok(Some(Closed::Done))
+            }
+        }
     }
 
     async fn opened(&mut self, session: Session) -> Result<(), Over> {
