@@ -626,6 +626,36 @@ async fn no_more_streams_run_than_may() {
 }
 
 #[tokio::test]
+async fn a_service_with_too_much_to_do_opens_no_session_and_goes_on_with_those_that_are_open() {
+    let service = Service::start(&["--search-threads", "1", "--search-queue", "0"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let demonstration = example("figure-4/demonstration.json").as_array().unwrap().clone();
+    let open = json!({"type": "open", "model": "figure-4"});
+    let mut before = Client::connect(&service).await;
+    before.open(open.clone()).await;
+
+    // A request that takes minutes: the paper's heuristic looks at every observation ahead, for every node.
+    let long: Vec<&Value> = demonstration.iter().cycle().take(20_000).collect();
+    let request = json!({"model": "figure-4", "demonstration": long, "heuristic": "paper"});
+    let request = service.client.post(service.url("/v1/policies")).json(&request);
+    let searching = tokio::spawn(request.send());
+    while service.measurement("etude_search_jobs").await < 1.0 {
+        tokio::task::yield_now().await;
+    }
+    let mut refused = Client::connect(&service).await;
+    refused.send(open.clone()).await;
+    assert_eq!(refused.receive().await["problem"]["type"], "/problems/overloaded");
+    assert_eq!(refused.closed().await, 1013);
+    before.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    assert_eq!(before.receive().await, json!({"type": "received", "seq": 16}));
+    before.send(json!({"type": "end", "seq": 16})).await;
+
+    searching.abort();
+    before.receive_until("done").await;
+    Client::connect(&service).await.open(open).await;
+}
+
+#[tokio::test]
 async fn a_stream_follows_a_learners_weights_or_explores_and_is_rewarded() {
     let (service, demonstration) = figure_4().await;
     let learner = json!({"attributes": ["x", "gold"], "mean": {"x": 2, "gold": 3}, "sd": 0.5, "seed": 7});

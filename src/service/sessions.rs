@@ -148,12 +148,14 @@ pub enum RewardState {
 }
 
 impl Etude {
-    /// Opens a session as `request` says: an object with the fields [`Session::OPEN_FIELDS`].
+    /// Opens a session as `request` says: an object with the fields [`Session::OPEN_FIELDS`]. Where as much waits to be searched
+    /// as may, it is refused; once it is open, it waits for its turn.
     ///
     /// # Errors
     ///
-    /// If the request has faults or names what is unknown.
+    /// If the request has faults or names what is unknown, or the service cannot do it now.
     pub async fn open_session(&self, request: &Value, now: Timestamp) -> Result<Session, SessionError> {
+        let place = self.pool.admit()?;
         let mut faults = Faults::default();
         let root = Place::root(request);
         let object = root.object(&Session::OPEN_FIELDS, &mut faults);
@@ -163,7 +165,8 @@ impl Etude {
             Some(learner) => Some(self.ready(&learner, Some("/learner")).await?),
             None => None,
         };
-        let (model_hash, mapper) = self.mapper(&model, "/model", None).await?;
+        let (model_hash, mapper) = self.known_mapper(&model, "/model", &place).await?;
+        drop(place);
         let opening = object.as_ref().and_then(|object| Opening::read(&mapper, learner.as_ref(), object, &mut faults));
         let Opening { mut weights, lookahead, start } = faults.check(opening)?;
 
