@@ -322,6 +322,21 @@ async fn whatever_cannot_be_understood_has_its_answer() {
         assert_eq!(error["problem"]["type"], format!("/problems/{slug}"), "{shown:?}: {error}");
         assert_eq!(client.closed().await, code, "{shown:?}: {error}");
     }
+    // Of a request to open a session, everything that is wrong.
+    let faulty = json!({
+        "type": "open", "model": "figure-4", "learner": 7, "explore": 1, "lookahead": 0, "weights": {"z": -1}, "start": 9999,
+        "hurry": true,
+    });
+    let everywhere = json!({"type": "open", "model": "nothing", "lookahead": 0, "hurry": true});
+    let pointers = ["/hurry", "/learner", "/explore", "/lookahead", "/weights/z", "/weights/z", "/start"];
+    for (open, expected) in [(faulty, &pointers[..]), (everywhere, &["/hurry", "/lookahead", "/model"])] {
+        let mut client = Client::connect(&service).await;
+        client.send(open).await;
+        let problem = client.receive().await["problem"].take();
+        let found: Vec<_> = problem["errors"].as_array().unwrap().iter().map(|error| &error["pointer"]).collect();
+        assert_eq!(found, expected, "{problem}");
+        assert_eq!((&problem["type"], client.closed().await), (&json!("/problems/invalid"), 4400));
+    }
     // Text that is not UTF-8, byte by byte: a masked text frame of two bytes.
     let mut client = Client::connect(&service).await;
     {

@@ -14,7 +14,7 @@ use uuid::Uuid;
 
 use super::learners::Ready;
 use super::owners::Ownership;
-use super::policies::{PolicyText, as_micros, report};
+use super::policies::{Envelope, Named, PolicyText, as_micros, base_weights, report};
 use super::{Etude, PoolError, ServiceError};
 use crate::attribute::{ByAttribute, Weights};
 use crate::document::{self, Faults, Object, Path, Place};
@@ -54,18 +54,27 @@ pub enum SessionError {
     NotOpen,
     /// Whatever else can go wrong.
     #[error(transparent)]
-    Service(#[from] ServiceError),
+    Service(ServiceError),
+}
+
+impl From<ServiceError> for SessionError {
+    fn from(error: ServiceError) -> Self {
+        match error {
+            ServiceError::Faults(faults) => Self::Faults(faults),
+            error => Self::Service(error),
+        }
+    }
 }
 
 impl From<StoreError> for SessionError {
     fn from(error: StoreError) -> Self {
-        Self::Service(error.into())
+        ServiceError::from(error).into()
     }
 }
 
 impl From<PoolError> for SessionError {
     fn from(error: PoolError) -> Self {
-        Self::Service(error.into())
+        ServiceError::from(error).into()
     }
 }
 
@@ -157,18 +166,15 @@ impl Etude {
     pub async fn open_session(&self, request: &Value, now: Timestamp) -> Result<Session, SessionError> {
         let place = self.pool.admit()?;
         let mut faults = Faults::default();
-        let root = Place::root(request);
-        let object = root.object(&Session::OPEN_FIELDS, &mut faults);
-        let names = object.as_ref().and_then(|object| read_names(object, &mut faults));
-        let Names { model, learner, explores } = faults.clone().check(names)?;
-        let learner = match learner {
-            Some(learner) => Some(self.ready(&learner, Some("/learner")).await?),
-            None => None,
-        };
-        let (model_hash, mapper) = self.known_mapper(&model, "/model", &place).await?;
+        let object = Place::root(request).object(&Session::OPEN_FIELDS, &mut faults);
+        let names = object.as_ref().and_then(|object| Names::read(object, &mut faults));
+        // With the help of the model, more faults may be found; so those found without it wait.
+        let Some(Names { envelope, explores, lookahead }) = names else { return Err(faults.into()) };
+        let Named { learner, model_hash, mapper } = self.find(&envelope, faults.clone(), &place).await?;
         drop(place);
         let opening = object.as_ref().and_then(|object| Opening::read(&mapper, learner.as_ref(), object, &mut faults));
-        let Opening { mut weights, lookahead, start } = faults.check(opening)?;
+        let Opening { mut weights, start } = faults.check(opening)?;
+        let model = envelope.model;
 
         let mut trial = None;
         if let (true, Some(ready)) = (explores, &learner) {
@@ -584,39 +590,46 @@ fn read_stored(mapper: &Mapper, texts: &[String]) -> Result<Vec<Observation>, Se
     Ok(observations)
 }
 
-/// The names in a request to open a session.
+/// What can be read of a request to open a session before its model is at hand. Where a fault was noted, something else than
+/// what the request says.
 struct Names {
-    model: String,
-    learner: Option<String>,
+    envelope: Envelope,
     explores: bool,
+    lookahead: Option<NonZeroU32>,
 }
 
-fn read_names(object: &Object<'_, '_>, faults: &mut Faults) -> Option<Names> {
-    let model = object.required("model", faults).and_then(|place| place.string(faults));
-    let learner = object.optional("learner").map(|place| place.string(faults));
-    let explores = match object.optional("explore") {
-        Some(place) => {
+impl Names {
+    /// Gives the names if the model's could be read. Faults may have been found either way.
+    fn read(object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
+        let model = object.required("model", faults).and_then(|place| place.string(faults));
+        let learner = object.optional("learner").map(|place| place.string(faults));
+        let explores = object.optional("explore").and_then(|place| {
             let explores = place.boolean(faults);
             if explores == Some(true) && learner.is_none() {
                 faults.note(&place, "exploring needs a learner");
             }
             explores
+        });
+        let explores = explores == Some(true);
+        if let (true, Some(place)) = (explores, object.optional("weights"))
+            && place.value.as_object().is_some_and(|weights| !weights.is_empty())
+        {
+            faults.note(&place, "an exploring session draws its weights");
         }
-        None => Some(false),
-    };
-    if let (Some(true), Some(place)) = (explores, object.optional("weights"))
-        && place.value.as_object().is_some_and(|weights| !weights.is_empty())
-    {
-        faults.note(&place, "an exploring session draws its weights");
+        let lookahead = match (object.optional("lookahead"), object.members.contains_key("lookahead")) {
+            (Some(place), _) => read_lookahead(&place, faults),
+            (None, true) => None,
+            (None, false) => NonZeroU32::new(DEFAULT_LOOKAHEAD),
+        };
+        let learner = learner.flatten().map(str::to_owned);
+        let envelope = Envelope { model: model?.to_owned(), learner, deadline: None };
+        Some(Self { envelope, explores, lookahead })
     }
-    let learner = learner.map_or(Some(None), |learner| learner.map(Some));
-    Some(Names { model: model?.to_owned(), learner: learner?.map(str::to_owned), explores: explores? })
 }
 
 /// What a session is opened with.
 struct Opening {
     weights: Weights,
-    lookahead: Option<NonZeroU32>,
     start: Option<u32>,
 }
 
@@ -627,15 +640,7 @@ impl Opening {
             let detail = "this world is searched lazily, which needs the whole demonstration: ask for a policy instead";
             faults.note_at(&Path::Member(&Path::Root, "model"), detail);
         }
-        let base = match learner {
-            None => Some(model.schema().weights()),
-            Some(Ready { learner, weights, .. }) => {
-                let learned = learner.weights_for(model.schema(), &weights.distribution.mean);
-                learned
-                    .map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string()))
-                    .ok()
-            }
-        };
+        let base = base_weights(model, learner, faults);
         let named = match object.optional("weights") {
             Some(place) => model.schema().read_named_weights(&place, faults),
             None => Some(Vec::new()),
@@ -646,15 +651,10 @@ impl Opening {
             }
             weights
         });
-        let lookahead = match (object.optional("lookahead"), object.members.contains_key("lookahead")) {
-            (Some(place), _) => read_lookahead(&place, faults).map(Some),
-            (None, true) => Some(None),
-            (None, false) => Some(NonZeroU32::new(DEFAULT_LOOKAHEAD)),
-        };
         let start = match object.optional("start") {
             Some(place) => model.read_start(&place, faults).map(Origin::state),
             None => Some(None),
         };
-        Some(Self { weights: weights?, lookahead: lookahead?, start: start? })
+        Some(Self { weights: weights?, start: start? })
     }
 }
