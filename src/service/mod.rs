@@ -14,6 +14,7 @@ mod learner_task;
 mod learners;
 mod models;
 mod name;
+mod opening;
 mod owners;
 mod pipe;
 mod policies;

@@ -12,16 +12,14 @@ use serde_json::Value;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::learners::Ready;
+use super::opening::{Names, Opening};
 use super::owners::Ownership;
-use super::policies::{Envelope, Named, PolicyText, as_micros, base_weights, report};
+use super::policies::{Named, PolicyText, as_micros, report};
 use super::{Etude, PoolError, ServiceError};
 use crate::attribute::{ByAttribute, Weights};
-use crate::document::{self, Faults, Object, Path, Place};
+use crate::document::{self, Faults, Place};
 use crate::interrupt::{Interrupt, Uninterrupted};
-use crate::mapping::{
-    CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, read_lookahead,
-};
+use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status};
 use crate::model::Origin;
 use crate::store::{
     AcceptedReward, NewObservations, NewRefinement, NewSession, Page, SessionEnd, SessionRow, SessionStatus,
@@ -81,9 +79,6 @@ impl From<PoolError> for SessionError {
 /// Work up to this many states times layers is done where it arrives, which takes less than a millisecond; more in the
 /// pool.
 const MAX_INLINE_WORK: usize = 1 << 14;
-
-/// Lookahead of a session that names none.
-const DEFAULT_LOOKAHEAD: u32 = 8;
 
 /// An open session, and the right to drive it.
 #[derive(Debug)]
@@ -588,73 +583,4 @@ fn read_stored(mapper: &Mapper, texts: &[String]) -> Result<Vec<Observation>, Se
         faults.check(Some(())).map_err(|faults| corrupt(faults.into()))?;
     }
     Ok(observations)
-}
-
-/// What can be read of a request to open a session before its model is at hand. Where a fault was noted, something else than
-/// what the request says.
-struct Names {
-    envelope: Envelope,
-    explores: bool,
-    lookahead: Option<NonZeroU32>,
-}
-
-impl Names {
-    /// Gives the names if the model's could be read. Faults may have been found either way.
-    fn read(object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
-        let model = object.required("model", faults).and_then(|place| place.string(faults));
-        let learner = object.optional("learner").map(|place| place.string(faults));
-        let explores = object.optional("explore").and_then(|place| {
-            let explores = place.boolean(faults);
-            if explores == Some(true) && learner.is_none() {
-                faults.note(&place, "exploring needs a learner");
-            }
-            explores
-        });
-        let explores = explores == Some(true);
-        if let (true, Some(place)) = (explores, object.optional("weights"))
-            && place.value.as_object().is_some_and(|weights| !weights.is_empty())
-        {
-            faults.note(&place, "an exploring session draws its weights");
-        }
-        let lookahead = match (object.optional("lookahead"), object.members.contains_key("lookahead")) {
-            (Some(place), _) => read_lookahead(&place, faults),
-            (None, true) => None,
-            (None, false) => NonZeroU32::new(DEFAULT_LOOKAHEAD),
-        };
-        let learner = learner.flatten().map(str::to_owned);
-        let envelope = Envelope { model: model?.to_owned(), learner, deadline: None };
-        Some(Self { envelope, explores, lookahead })
-    }
-}
-
-/// What a session is opened with.
-struct Opening {
-    weights: Weights,
-    start: Option<u32>,
-}
-
-impl Opening {
-    fn read(mapper: &Mapper, learner: Option<&Ready>, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
-        let model = mapper.model();
-        if model.is_lazy() {
-            let detail = "this world is searched lazily, which needs the whole demonstration: ask for a policy instead";
-            faults.note_at(&Path::Member(&Path::Root, "model"), detail);
-        }
-        let base = base_weights(model, learner, faults);
-        let named = match object.optional("weights") {
-            Some(place) => model.schema().read_named_weights(&place, faults),
-            None => Some(Vec::new()),
-        };
-        let weights = base.zip(named).map(|(mut weights, named)| {
-            for (position, weight) in named {
-                weights.set(position, weight);
-            }
-            weights
-        });
-        let start = match object.optional("start") {
-            Some(place) => model.read_start(&place, faults).map(Origin::state),
-            None => Some(None),
-        };
-        Some(Self { weights: weights?, start: start? })
-    }
 }
