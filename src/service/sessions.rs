@@ -13,7 +13,7 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::opening::{Names, Opening};
-use super::owners::Ownership;
+use super::owners::{Ownership, TakenOver};
 use super::policies::{Named, PolicyText, as_micros, report};
 use super::{Etude, PoolError, ServiceError};
 use crate::attribute::{ByAttribute, Weights};
@@ -50,6 +50,9 @@ pub enum SessionError {
     /// The session has expired, or was ended or taken over by another connection.
     #[error("the session is not open any more")]
     NotOpen,
+    /// Another connection has taken the session over.
+    #[error("the session was resumed on another connection")]
+    TakenOver,
     /// Whatever else can go wrong.
     #[error(transparent)]
     Service(ServiceError),
@@ -61,6 +64,12 @@ impl From<ServiceError> for SessionError {
             ServiceError::Faults(faults) => Self::Faults(faults),
             error => Self::Service(error),
         }
+    }
+}
+
+impl From<TakenOver> for SessionError {
+    fn from(TakenOver: TakenOver) -> Self {
+        Self::TakenOver
     }
 }
 
@@ -178,7 +187,7 @@ impl Etude {
             trial = Some(draw.trial);
         }
         let id = Uuid::now_v7().to_string();
-        let ownership = self.owners.take(&id).await;
+        let ownership = self.owners.take(&id).await?;
         let source = Source {
             learner: learner.as_ref().map(|ready| ready.name.clone()),
             weights_version: learner.as_ref().map(|ready| ready.weights.version),
@@ -230,7 +239,7 @@ impl Etude {
     pub async fn resume_session(&self, id: &str) -> Result<Resumed, SessionError> {
         // Looked up first, so that nobody is bothered for what does not exist.
         self.session(id).await?;
-        let ownership = self.owners.take(id).await;
+        let ownership = self.owners.take(id).await?;
         let row = self.session(id).await?;
         if row.status == SessionStatus::Expired {
             return Err(SessionError::NotOpen);

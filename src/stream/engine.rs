@@ -178,8 +178,7 @@ impl Connection<'_> {
                     return Err(Over::because(Closed::GoingAway, problem));
                 }
                 () = taken_over(self.session.as_ref()) => {
-                    let problem = StreamProblem::new("taken-over", "the session was resumed on another connection");
-                    return Err(Over::because(Closed::NotAllowed, problem));
+                    return Err(ends(&SessionError::TakenOver));
                 }
                 came = tokio::time::timeout(self.limits.idle_after, incoming.recv()) => came,
             };
@@ -317,7 +316,7 @@ impl Connection<'_> {
                 problem.detail = format!("none of the frame's states was taken: {}", problem.detail);
                 problem
             }
-            SessionError::NotOpen | SessionError::Service(_) => return Err(ends(error)),
+            SessionError::NotOpen | SessionError::TakenOver | SessionError::Service(_) => return Err(ends(error)),
         };
         self.send(&ServerFrame::Error { problem }).await?;
         Ok(None)
@@ -379,6 +378,7 @@ fn ends(error: &SessionError) -> Over {
     match error {
         SessionError::Faults(faults) => Over::because(Closed::BadFrame, StreamProblem::of("invalid", faults)),
         SessionError::NotOpen => Over::because(Closed::Unknown, StreamProblem::new("expired", detail)),
+        SessionError::TakenOver => Over::because(Closed::NotAllowed, StreamProblem::new("taken-over", detail)),
         SessionError::Gap { .. } | SessionError::TooMany | SessionError::Empty | SessionError::Ended => {
             not_allowed(&detail)
         }
