@@ -7,13 +7,16 @@ mod service;
 
 use std::time::Duration;
 
+use etude::document::Place;
 use etude::service::Etude;
 use etude::stream::{Closed, Incoming, Outgoing};
 use futures_util::{SinkExt, StreamExt};
+use jiff::Timestamp;
 use process::Process;
 use reqwest::Body;
 use serde_json::{Value, json};
 use service::{Service, example};
+use tempfile::TempDir;
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
 use tokio_tungstenite::tungstenite::Message;
@@ -761,22 +764,54 @@ async fn an_exploring_session_ends_with_its_policy_if_no_reward_is_to_come_any_m
     assert_eq!(again.closed().await, 1000);
 }
 
+/// The application that was a service, without the service.
+async fn without_service(service: Service, abort: &CancellationToken) -> (Etude, TempDir) {
+    let directory = service.stop().await;
+    let database = directory.path().join("etude.db");
+    let flags = service::flags(&["--database", database.to_str().unwrap()]);
+    (Etude::open(&flags.settings(), &TaskTracker::new(), abort.clone()).await.unwrap(), directory)
+}
+
+#[tokio::test]
+async fn resuming_and_repeating_keep_a_session_from_expiring() {
+    let (service, demonstration) = figure_4().await;
+    let (etude, _directory) = without_service(service, &CancellationToken::new()).await;
+    let at = |minute: i64| Timestamp::from_second(60 * minute).unwrap();
+    let states = json!(demonstration);
+    let states = Place::root(&states);
+    let open = json!({"type": "open", "model": "figure-4"});
+    let mut session = etude.open_session(&open, at(0)).await.unwrap();
+    let id = session.id().to_owned();
+    let active_at = async || etude.session(&id).await.unwrap().active_at;
+    session.receive(&etude, 0, &states, at(1)).await.unwrap();
+    assert_eq!(active_at().await, at(1));
+    session.receive(&etude, 0, &states, at(2)).await.unwrap();
+    assert_eq!(active_at().await, at(2));
+    drop(session);
+    let mut resumed = etude.resume_session(&id, at(3)).await.unwrap();
+    assert_eq!((active_at().await, resumed.session.n_received()), (at(3), 16));
+    // What is not settled yet came before.
+    let more = json!([demonstration[0]]);
+    resumed.session.receive(&etude, 16, &Place::root(&more), at(4)).await.unwrap();
+    drop(resumed);
+    assert_eq!(etude.resume_session(&id, at(5)).await.unwrap().session.n_received(), 17);
+    assert_eq!(active_at().await, at(5));
+    etude.close().await;
+}
+
 /// A client that reads nothing: the session's own search waits for it, and is given up.
 #[tokio::test]
 async fn who_stays_slow_is_closed_as_overloaded() {
-    let service = Service::start(&[]).await;
-    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
-    let directory = service.stop().await;
-    let database = directory.path().join("etude.db");
-    let flags = service::flags(&["--database", database.to_str().unwrap(), "--slow-reader-timeout", "100ms"]);
-    let (tasks, abort) = (TaskTracker::new(), CancellationToken::new());
-    let etude = Etude::open(&flags.settings(), &tasks, abort.clone()).await.unwrap();
+    let (service, _) = figure_4().await;
+    let abort = CancellationToken::new();
+    let (etude, _directory) = without_service(service, &abort).await;
+    let limits = service::flags(&["--slow-reader-timeout", "100ms"]).stream_limits();
     let (came, mut incoming) = mpsc::channel(1);
     // Room for `hello` alone.
     let (outgoing, mut goes) = mpsc::channel(1);
     let open = json!({"type": "open", "model": "figure-4"}).to_string();
     came.send(Incoming::Frame(open.into_bytes())).await.unwrap();
-    let closed = etude::stream::run(&etude, flags.stream_limits(), &mut incoming, &outgoing, &abort).await;
+    let closed = etude::stream::run(&etude, limits, &mut incoming, &outgoing, &abort).await;
     assert_eq!((closed, closed.code().0), (Closed::Overloaded, 1013));
     assert!(matches!(goes.try_recv(), Ok(Outgoing::Frame(hello)) if hello.contains("hello")));
     etude.close().await;

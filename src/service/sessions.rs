@@ -236,10 +236,12 @@ impl Etude {
     /// # Errors
     ///
     /// If there is none, it has expired, or its model is gone.
-    pub async fn resume_session(&self, id: &str) -> Result<Resumed, SessionError> {
+    pub async fn resume_session(&self, id: &str, now: Timestamp) -> Result<Resumed, SessionError> {
         // Looked up first, so that nobody is bothered for what does not exist.
         self.session(id).await?;
         let ownership = self.owners.take(id).await?;
+        // It may be done already.
+        let _is_open = self.store.touch_session(id, now).await?;
         let row = self.session(id).await?;
         if row.status == SessionStatus::Expired {
             return Err(SessionError::NotOpen);
@@ -411,6 +413,9 @@ impl Session {
         let n_known = (self.n_received - seq) as usize;
         let new = items.get(n_known..).unwrap_or_default();
         if new.is_empty() {
+            if !etude.store.touch_session(&self.id, now).await? {
+                return Err(SessionError::NotOpen);
+            }
             return Ok(Received::Mapped(Vec::new()));
         }
         if self.n_received as usize + new.len() > Demonstration::MAX_OBSERVATIONS {

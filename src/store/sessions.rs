@@ -145,6 +145,15 @@ impl Store {
         self.done(Write::AddObservations(observations)).await
     }
 
+    /// Notes that something came for a session at `at`, once all that was written before is done. Says whether it is open.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn touch_session(&self, id: &str, at: Timestamp) -> Result<bool, StoreError> {
+        self.done(Write::TouchSession { id: id.to_owned(), at }).await
+    }
+
     /// Ends a session: stores its policy and links them. Says whether it was open.
     ///
     /// # Errors
@@ -290,7 +299,8 @@ pub(super) async fn add(
     let rows = Value::Array(rows.collect()).to_string();
     // Only what comes next, and only once, whatever is retried or raced.
     let updated = sqlx::query_scalar::<_, String>(
-        "UPDATE sessions SET n_observations = n_observations + (new.value ->> 2), active_at_ms = new.value ->> 4
+        "UPDATE sessions
+         SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 4)
          FROM json_each($1) AS new
          WHERE sessions.id = new.value ->> 0 AND status = 'open' AND n_observations = new.value ->> 1
          RETURNING sessions.id",
@@ -318,6 +328,14 @@ pub(super) async fn add(
     .execute(connection)
     .await?;
     Ok(is_updated)
+}
+
+/// Observations that came before but are not settled yet do not undo this.
+pub(super) async fn touch(connection: &mut SqliteConnection, id: &str, at: Timestamp) -> Result<bool, StoreError> {
+    let query =
+        sqlx::query("UPDATE sessions SET active_at_ms = MAX(active_at_ms, $2) WHERE id = $1 AND status = 'open'");
+    let updated = query.bind(id).bind(at.as_millisecond()).execute(connection).await?;
+    Ok(updated.rows_affected() > 0)
 }
 
 pub(super) async fn end(connection: &mut SqliteConnection, end: &SessionEnd) -> Result<bool, StoreError> {

@@ -207,7 +207,7 @@ impl Connection<'_> {
             }
             (ClientFrame::Resume { session, step }, None) => {
                 let Resumed { session, steps, policy } =
-                    self.etude.resume_session(&session).await.map_err(|error| ends(&error))?;
+                    self.etude.resume_session(&session, now).await.map_err(|error| ends(&error))?;
                 self.opened(session).await?;
                 self.send_steps(steps.get(step as usize..).unwrap_or_default()).await?;
                 let Some(policy) = policy else { return Ok(None) };
