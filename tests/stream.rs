@@ -5,6 +5,7 @@
 mod process;
 mod service;
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use etude::document::Place;
@@ -19,6 +20,7 @@ use service::{Service, example};
 use tempfile::TempDir;
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::protocol::frame::Frame;
@@ -422,6 +424,45 @@ async fn a_session_that_is_resumed_elsewhere_is_taken_over() {
     assert_eq!(second.receive_until("done").await.last().unwrap()["type"], "done");
 }
 
+/// Those it is taken from are cut off wherever they are: in the middle of writing, mapping or sending.
+#[tokio::test]
+async fn a_session_that_goes_from_hand_to_hand_loses_and_doubles_nothing() {
+    let (service, demonstration) = figure_4().await;
+    let demonstration: Vec<&Value> = demonstration.iter().cycle().take(60).collect();
+    let open = json!({"type": "open", "model": "figure-4", "lookahead": 3});
+    let mut undisturbed = Client::connect(&service).await;
+    undisturbed.open(open.clone()).await;
+    undisturbed.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    undisturbed.send(json!({"type": "end", "seq": 60})).await;
+    let expected = steps(&undisturbed.receive_until("done").await);
+
+    let mut first = Client::connect(&service).await;
+    let session = first.open(open).await;
+    let (mut hands, mut n_durable) = (vec![first], 0);
+    for n_awaited in (0..4).cycle() {
+        let mut client = Client::connect(&service).await;
+        client.send(json!({"type": "resume", "session": session})).await;
+        let opened = client.receive().await;
+        let received = opened["received"].as_u64().unwrap();
+        assert!(received >= n_durable, "{opened}, and {n_durable} were durable");
+        n_durable = received;
+        for (seq, state) in demonstration.iter().enumerate().skip(usize::try_from(received).unwrap()) {
+            client.send(json!({"type": "observe", "seq": seq, "states": [state]})).await;
+        }
+        if received == 60 {
+            client.send(json!({"type": "end", "seq": 60})).await;
+            let told = client.receive_until("done").await;
+            assert_eq!(steps(&told), expected);
+            break;
+        }
+        for _ in 0..n_awaited.min(60 - received) {
+            n_durable = client.receive_until("received").await.last().unwrap()["seq"].as_u64().unwrap();
+        }
+        hands.push(client);
+    }
+    assert_eq!(undisturbed.closed().await, 1000);
+}
+
 #[tokio::test]
 async fn a_thousand_observations_fit_into_a_frame() {
     let (service, demonstration) = figure_4().await;
@@ -814,6 +855,72 @@ async fn who_stays_slow_is_closed_as_overloaded() {
     let closed = etude::stream::run(&etude, limits, &mut incoming, &outgoing, &abort).await;
     assert_eq!((closed, closed.code().0), (Closed::Overloaded, 1013));
     assert!(matches!(goes.try_recv(), Ok(Outgoing::Frame(hello)) if hello.contains("hello")));
+    etude.close().await;
+}
+
+/// A connection of the application alone, without a transport: as much fits into its queues as is told.
+struct Wire {
+    to_server: mpsc::Sender<Incoming>,
+    from_server: mpsc::Receiver<Outgoing>,
+    running: JoinHandle<Closed>,
+}
+
+impl Wire {
+    fn connect(etude: &Arc<Etude>, stopping: &CancellationToken) -> Self {
+        let (to_server, mut incoming) = mpsc::channel(8);
+        let (outgoing, from_server) = mpsc::channel(1);
+        let (etude, stopping) = (Arc::clone(etude), stopping.clone());
+        let limits = service::flags(&["--slow-reader-timeout", "1h"]).stream_limits();
+        let running =
+            tokio::spawn(async move { etude::stream::run(&etude, limits, &mut incoming, &outgoing, &stopping).await });
+        Self { to_server, from_server, running }
+    }
+
+    async fn send(&self, frame: Value) {
+        self.to_server.send(Incoming::Frame(frame.to_string().into_bytes())).await.unwrap();
+    }
+
+    async fn receive_until(&mut self, kind: &str) -> Value {
+        loop {
+            let came = tokio::time::timeout(PATIENCE, self.from_server.recv()).await.unwrap();
+            let Some(Outgoing::Frame(text)) = came else { panic!("{came:?} instead of {kind}") };
+            let frame: Value = serde_json::from_str(&text).unwrap();
+            if frame["type"] == kind {
+                return frame;
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_slow_reader_holds_up_neither_who_resumes_its_session_nor_a_shutdown() {
+    let (service, demonstration) = figure_4().await;
+    let (etude, _directory) = without_service(service, &CancellationToken::new()).await;
+    let (etude, stopping) = (Arc::new(etude), CancellationToken::new());
+    let mut slow = Wire::connect(&etude, &stopping);
+    slow.send(json!({"type": "open", "model": "figure-4", "lookahead": 1})).await;
+    let session = slow.receive_until("opened").await["session"].take();
+    slow.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    // From here on it reads nothing, and the server is in the middle of sending steps.
+    slow.receive_until("step").await;
+
+    let resume = json!({"type": "resume", "session": session});
+    let mut next = Wire::connect(&etude, &stopping);
+    next.send(resume.clone()).await;
+    assert_eq!(next.receive_until("opened").await["received"], 16);
+    assert_eq!(slow.receive_until("error").await["problem"]["type"], "/problems/taken-over");
+    assert_eq!(slow.running.await.unwrap(), Closed::NotAllowed);
+
+    // Now this one reads nothing.
+    next.receive_until("step").await;
+    stopping.cancel();
+    assert_eq!(next.receive_until("error").await["problem"]["type"], "/problems/stopping");
+    assert_eq!(next.running.await.unwrap(), Closed::GoingAway);
+    let mut last = Wire::connect(&etude, &CancellationToken::new());
+    last.send(resume).await;
+    last.receive_until("opened").await;
+    last.send(json!({"type": "end", "seq": 16})).await;
+    last.receive_until("done").await;
     etude.close().await;
 }
 

@@ -235,12 +235,21 @@ impl Etude {
     ///
     /// # Errors
     ///
-    /// If there is none, it has expired, or its model is gone.
+    /// If there is none, it has expired, its model is gone, or it is taken over meanwhile.
     pub async fn resume_session(&self, id: &str, now: Timestamp) -> Result<Resumed, SessionError> {
         // Looked up first, so that nobody is bothered for what does not exist.
         self.session(id).await?;
         let ownership = self.owners.take(id).await?;
-        // It may be done already.
+        let taken_over = ownership.taken_over.clone();
+        tokio::select! {
+            biased;
+            () = taken_over.cancelled() => Err(SessionError::TakenOver),
+            resumed = self.resume_owned(id, ownership, now) => resumed,
+        }
+    }
+
+    async fn resume_owned(&self, id: &str, ownership: Ownership, now: Timestamp) -> Result<Resumed, SessionError> {
+        // Behind whatever is still to be written for the owner before. It may be done already.
         let _is_open = self.store.touch_session(id, now).await?;
         let row = self.session(id).await?;
         if row.status == SessionStatus::Expired {
@@ -274,6 +283,8 @@ impl Etude {
         let policy = match row.policy_id {
             None => None,
             Some(policy_id) => {
+                // Whoever ended it may have been gone before there was something to refine.
+                self.refiner.wake();
                 let rest = session.online.take().and_then(OnlineMapping::end);
                 steps.extend(rest.map(|(rest, _)| rest).unwrap_or_default());
                 session.n_steps = steps.len();
@@ -369,9 +380,10 @@ impl Session {
         self.n_steps
     }
 
-    /// Completes when another connection takes the session over.
-    pub async fn taken_over(&self) {
-        self.ownership.taken_over.cancelled().await;
+    /// Cancelled when another connection takes the session over.
+    #[must_use]
+    pub fn taken_over(&self) -> &CancellationToken {
+        &self.ownership.taken_over
     }
 
     /// What has become of its reward.

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use serde_json::Value;
-use tokio::sync::mpsc;
+use tokio::sync::{SetOnce, mpsc};
 use tokio_util::sync::CancellationToken;
 
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem};
@@ -109,8 +109,11 @@ impl Closed {
     }
 }
 
-/// Speaks the protocol until the connection is over, and says why it is. Dropping the future at any time leaves a session
-/// that can be resumed.
+/// How long the last words may wait for a client that does not read.
+const GOODBYE_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Speaks the protocol until the connection is over, and says why it is: at once if the session is taken over or the server
+/// shuts down, whatever is under way. Dropping the future at any time leaves a session that can be resumed.
 pub async fn run(
     etude: &Etude,
     limits: Limits,
@@ -118,22 +121,35 @@ pub async fn run(
     outgoing: &mpsc::Sender<Outgoing>,
     stopping: &CancellationToken,
 ) -> Closed {
-    let mut connection = Connection { etude, limits, outgoing, session: None, is_reward_told: false };
-    let ended = connection.speak(incoming, stopping).await;
-    let closed = match ended {
-        Ok(closed) => closed,
-        Err(Over { closed, problem }) => {
-            if let Some(problem) = problem {
-                // Where this does not get through, the close code says it too.
-                let _ = connection.send(&ServerFrame::Error { problem }).await;
-            }
-            closed
+    let taken_over = SetOnce::new();
+    let mut connection =
+        Connection { etude, limits, outgoing, session: None, taken_over: &taken_over, is_reward_told: false };
+    let ended = tokio::select! {
+        biased;
+        () = stopping.cancelled() => {
+            let problem = StreamProblem::new("stopping", "the server shuts down; resume the session later");
+            Err(Over::because(Closed::GoingAway, problem))
         }
+        () = async { taken_over.wait().await.cancelled().await } => Err(ends(&SessionError::TakenOver)),
+        ended = connection.speak(incoming) => ended,
+    };
+    // Given back now: whoever takes it over does not wait for the goodbye.
+    let session = connection.session.take().map(|session| session.id().to_owned());
+    let (closed, problem) = match ended {
+        Ok(closed) => (closed, None),
+        Err(Over { closed, problem }) => (closed, problem),
     };
     let (code, _) = closed.code();
-    tracing::info!(code, session = connection.session.as_ref().map(Session::id), "stream closed");
-    // A client that is gone or stuck does not hear this.
-    let _ = outgoing.send_timeout(Outgoing::Close(closed), limits.slow_after).await;
+    tracing::info!(code, session, "stream closed");
+    let goodbye = async {
+        if let Some(problem) = problem {
+            // Where this does not get through, the close code says it too.
+            let _ = connection.send(&ServerFrame::Error { problem }).await;
+        }
+        // A client that is gone or stuck does not hear this.
+        let _ = outgoing.send(Outgoing::Close(closed)).await;
+    };
+    let _ = tokio::time::timeout(limits.slow_after.min(GOODBYE_TIMEOUT), goodbye).await;
     closed
 }
 
@@ -154,16 +170,14 @@ struct Connection<'c> {
     limits: Limits,
     outgoing: &'c mpsc::Sender<Outgoing>,
     session: Option<Session>,
+    /// Tells when another connection takes the session over, once there is one.
+    taken_over: &'c SetOnce<CancellationToken>,
     /// Whether the client was told here that its reward is accepted.
     is_reward_told: bool,
 }
 
 impl Connection<'_> {
-    async fn speak(
-        &mut self,
-        incoming: &mut mpsc::Receiver<Incoming>,
-        stopping: &CancellationToken,
-    ) -> Result<Closed, Over> {
+    async fn speak(&mut self, incoming: &mut mpsc::Receiver<Incoming>) -> Result<Closed, Over> {
         self.send(&ServerFrame::Hello {
             protocol: PROTOCOL,
             server: env!("CARGO_PKG_VERSION"),
@@ -171,18 +185,7 @@ impl Connection<'_> {
         })
         .await?;
         loop {
-            let came = tokio::select! {
-                biased;
-                () = stopping.cancelled() => {
-                    let problem = StreamProblem::new("stopping", "the server shuts down; resume the session later");
-                    return Err(Over::because(Closed::GoingAway, problem));
-                }
-                () = taken_over(self.session.as_ref()) => {
-                    return Err(ends(&SessionError::TakenOver));
-                }
-                came = tokio::time::timeout(self.limits.idle_after, incoming.recv()) => came,
-            };
-            let Ok(came) = came else {
+            let Ok(came) = tokio::time::timeout(self.limits.idle_after, incoming.recv()).await else {
                 return Err(Over::because(Closed::NotAllowed, StreamProblem::new("idle", "nothing came for too long")));
             };
             let Some(came) = came else { return Ok(Closed::ByClient) };
@@ -280,6 +283,8 @@ impl Connection<'_> {
     async fn opened(&mut self, session: Session) -> Result<(), Over> {
         tracing::info!(session = session.id(), received = session.n_received(), "stream opened");
         let session = self.session.insert(session);
+        // A connection has one session.
+        let _ = self.taken_over.set(session.taken_over().clone());
         let frame = ServerFrame::Opened {
             session: session.id(),
             trial: session.trial_id(),
@@ -335,13 +340,6 @@ async fn send(outgoing: &mpsc::Sender<Outgoing>, limits: Limits, frame: &ServerF
         mpsc::error::SendTimeoutError::Timeout(_) => Over { closed: Closed::Overloaded, problem: None },
         mpsc::error::SendTimeoutError::Closed(_) => Over { closed: Closed::ByClient, problem: None },
     })
-}
-
-async fn taken_over(session: Option<&Session>) {
-    match session {
-        Some(session) => session.taken_over().await,
-        None => std::future::pending().await,
-    }
 }
 
 fn not_allowed(detail: &str) -> Over {
