@@ -85,8 +85,8 @@ impl From<PoolError> for SessionError {
     }
 }
 
-/// Work up to this many states times layers is done where it arrives, which takes less than a millisecond; more in the
-/// pool.
+/// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
+/// in the pool.
 const MAX_INLINE_WORK: usize = 1 << 14;
 
 /// An open session, and the right to drive it.
@@ -471,8 +471,8 @@ impl Session {
 
     /// Whether so many observations are mapped where they arrive.
     fn is_inline(&self, n_observations: usize) -> bool {
-        let n_layers = n_observations * self.lookahead.map_or(1, |lookahead| lookahead.get() as usize);
-        n_layers.saturating_mul(self.mapper.model().graph().n_states()) <= MAX_INLINE_WORK
+        let graph = self.mapper.model().graph();
+        is_inline(graph.n_states() + graph.n_transitions(), self.lookahead, n_observations)
     }
 
     /// Maps observations that were received, and gives the steps that they commit.
@@ -550,6 +550,12 @@ impl Session {
     }
 }
 
+/// Whether so many observations are mapped where they arrive, in a model of `size` states and transitions.
+fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) -> bool {
+    let n_layers = n_observations.saturating_mul(lookahead.map_or(1, |lookahead| lookahead.get() as usize));
+    n_layers.saturating_mul(size) <= MAX_INLINE_WORK
+}
+
 /// An observation as it was read. Shape `[n_attributes]`; `None` where an attribute was not observed.
 pub type Observation = Vec<Option<crate::attribute::Value>>;
 
@@ -609,4 +615,36 @@ fn read_stored(mapper: &Mapper, texts: &[String]) -> Result<Vec<Observation>, Se
         faults.check(Some(())).map_err(|faults| corrupt(faults.into()))?;
     }
     Ok(observations)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::model::{Definition, Limits, Model};
+
+    #[test]
+    fn what_is_mapped_where_it_arrives_is_measured_by_transitions_too() {
+        let size = |definition: &Value| {
+            let definition = Definition::read(definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+            let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+            model.graph().n_states() + model.graph().n_transitions()
+        };
+        let lookahead = NonZeroU32::new(8);
+        let cave = size(&json!({"dynamics": {"kind": "wumpus", "width": 7, "height": 4, "gold": [[5, 0]]}}));
+        assert!(is_inline(cave, lookahead, 1) && !is_inline(cave, lookahead, 1000), "{cave}");
+        // Few states, between any two of which an action leads.
+        let n_states = 100;
+        let action = |n: usize| json!({"name": format!("to {n}")});
+        let transitions = (0..n_states).flat_map(|from| (0..n_states).map(move |to| json!([from, to, to])));
+        let complete = json!({
+            "attributes": [{"name": "x", "kind": "number"}], "actions": (0..n_states).map(action).collect::<Vec<_>>(),
+            "dynamics": {
+                "kind": "table", "states": (0..n_states).map(|x| json!([x])).collect::<Vec<_>>(),
+                "transitions": transitions.collect::<Vec<_>>(),
+            },
+        });
+        assert!(!is_inline(size(&complete), lookahead, 1));
+    }
 }
