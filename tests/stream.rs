@@ -715,6 +715,24 @@ async fn a_service_with_too_much_to_do_opens_no_session_and_goes_on_with_those_t
 }
 
 #[tokio::test]
+async fn a_database_that_another_process_holds_is_no_internal_error() {
+    use sqlx::{ConnectOptions, Connection};
+    let (service, demonstration) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "figure-4"})).await;
+    let path = service.directory.path().join("etude.db");
+    let mut other = sqlx::sqlite::SqliteConnectOptions::new().filename(path).connect().await.unwrap();
+    let held = other.begin_with("BEGIN IMMEDIATE").await.unwrap();
+    client.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/overloaded");
+    assert_eq!(client.closed().await, 1013);
+    held.rollback().await.unwrap();
+    let mut again = Client::connect(&service).await;
+    again.send(json!({"type": "resume", "session": session})).await;
+    assert_eq!(again.receive().await["received"], 0);
+}
+
+#[tokio::test]
 async fn a_stream_follows_a_learners_weights_or_explores_and_is_rewarded() {
     let (service, demonstration) = figure_4().await;
     let learner = json!({"attributes": ["x", "gold"], "mean": {"x": 2, "gold": 3}, "sd": 0.5, "seed": 7});

@@ -12,7 +12,7 @@ use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem};
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
 use crate::service::{Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError};
-use crate::store::AcceptedReward;
+use crate::store::{AcceptedReward, StoreError};
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
@@ -383,10 +383,10 @@ fn ends(error: &SessionError) -> Over {
         SessionError::Service(ServiceError::Unknown { kind, .. }) => {
             Over::because(Closed::Unknown, StreamProblem::new(&format!("unknown-{kind}"), detail))
         }
-        SessionError::Service(ServiceError::Pool(PoolError::Stopped)) => {
+        SessionError::Service(ServiceError::Pool(PoolError::Stopped) | ServiceError::Store(StoreError::Closed)) => {
             Over::because(Closed::GoingAway, StreamProblem::new("stopping", detail))
         }
-        SessionError::Service(ServiceError::Pool(PoolError::Busy)) => {
+        SessionError::Service(ServiceError::Pool(PoolError::Busy) | ServiceError::Store(StoreError::Locked)) => {
             Over::because(Closed::Overloaded, StreamProblem::new("overloaded", detail))
         }
         SessionError::Service(_) => {
