@@ -226,6 +226,22 @@ async fn lines_go_both_ways_at_the_same_time() {
 }
 
 #[tokio::test]
+async fn lines_are_not_compressed() {
+    let service = Service::start(&[]).await;
+    let request = service.client.post(service.url("/v1/stream")).header("content-encoding", "gzip").body("\u{1f}");
+    let response = tokio::time::timeout(PATIENCE, request.send()).await.unwrap().unwrap();
+    assert_eq!(
+        (response.status().as_u16(), &response.headers()["accept-encoding"]),
+        (415, &"identity".parse().unwrap())
+    );
+    let problem: Value = serde_json::from_str(&response.text().await.unwrap()).unwrap();
+    assert_eq!(problem["type"], "/problems/unsupported-encoding");
+    let identity = service.client.post(service.url("/v1/stream")).header("content-encoding", "identity");
+    let answer = identity.body("{}\n").send().await.unwrap().text().await.unwrap();
+    assert!(answer.contains("hello") && answer.contains("bad-frame"), "{answer}");
+}
+
+#[tokio::test]
 async fn what_was_received_is_ignored_and_what_is_missing_is_asked_for() {
     let (service, demonstration) = figure_4().await;
     let mut client = Client::connect(&service).await;

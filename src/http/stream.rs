@@ -21,6 +21,7 @@ use utoipa::ToSchema;
 
 use super::Context;
 use super::body::json;
+use super::encoding::Encoding;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{Problem, ProblemKind};
@@ -180,16 +181,22 @@ async fn write_frames(sink: &mut SplitSink<WebSocket, Message>, goes: &mut mpsc:
 /// Stream a demonstration as NDJSON, both ways at the same time.
 ///
 /// The same frames as over the websocket, one per line. The answer begins at once and ends when the session is done or
-/// an error ends it; a session that is not done can be resumed.
+/// an error ends it; a session that is not done can be resumed. The frames are not compressed.
 #[utoipa::path(
     post, path = "/v1/stream", tag = "streams",
     request_body(content = String, content_type = "application/x-ndjson", description = "Client frames, one per line"),
     responses(
         (status = 200, description = "Server frames, one per line", body = String, content_type = "application/x-ndjson"),
+        (status = 415, description = "`unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn ndjson(State(context): State<Context>, request: Request) -> Result<Response, Problem> {
+    // A decoder gives what it has when it likes, and each would keep a window of megabytes for as long as its stream runs.
+    if Encoding::declared(request.headers()) != Ok(Encoding::Identity) {
+        let detail = "the frames of a stream are sent as they are, without `Content-Encoding`";
+        return Err(Problem::new(ProblemKind::CompressedStream, detail));
+    }
     let place = context.admit_stream()?;
     let (came, mut incoming) = mpsc::channel(MAX_WAITING);
     let (outgoing, goes) = mpsc::channel(MAX_WAITING);
