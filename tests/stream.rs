@@ -14,7 +14,7 @@ use etude::stream::{Closed, Incoming, Outgoing};
 use futures_util::{SinkExt, StreamExt};
 use jiff::Timestamp;
 use process::Process;
-use reqwest::Body;
+use reqwest::{Body, Method};
 use serde_json::{Value, json};
 use service::{Service, example};
 use tempfile::TempDir;
@@ -696,8 +696,15 @@ async fn no_more_streams_run_than_may() {
     let error = second.unwrap_err().to_string();
     assert!(error.contains("503"), "{error}");
     drop(first);
-    let (status, problem) = service.get("/v1/stream").await;
-    assert_eq!((status, &problem["type"]), (422, &json!("/problems/invalid")), "not a websocket: {problem}");
+}
+
+#[tokio::test]
+async fn who_asks_for_a_stream_without_a_websocket_is_told_to_upgrade() {
+    let service = Service::start(&[]).await;
+    let response = service.send(Method::GET, "/v1/stream", &Value::Null).await;
+    assert_eq!(response.headers()["upgrade"], "websocket");
+    let (status, problem) = service::answer(response).await;
+    assert_eq!((status, &problem["type"]), (426, &json!("/problems/upgrade-required")), "{problem}");
 }
 
 #[tokio::test]

@@ -2,7 +2,7 @@
 
 use std::error::Error;
 
-use axum::http::header::{ACCEPT_ENCODING, CONTENT_TYPE, RETRY_AFTER};
+use axum::http::header::{ACCEPT_ENCODING, CONTENT_TYPE, RETRY_AFTER, SEC_WEBSOCKET_VERSION, UPGRADE};
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
@@ -36,6 +36,7 @@ pub(super) enum ProblemKind {
     UnsupportedMediaType,
     UnsupportedEncoding,
     CompressedStream,
+    UpgradeRequired,
     Invalid,
     Internal,
     Busy,
@@ -74,6 +75,7 @@ impl ProblemKind {
             Self::CompressedStream => {
                 ("unsupported-encoding", "A stream is not compressed", StatusCode::UNSUPPORTED_MEDIA_TYPE)
             }
+            Self::UpgradeRequired => ("upgrade-required", "This is a websocket", StatusCode::UPGRADE_REQUIRED),
             Self::Invalid => ("invalid", "The request has faults", StatusCode::UNPROCESSABLE_ENTITY),
             Self::Internal => ("internal", "Something went wrong here", StatusCode::INTERNAL_SERVER_ERROR),
             Self::Busy => ("busy", "Too many requests are waiting", StatusCode::SERVICE_UNAVAILABLE),
@@ -155,6 +157,10 @@ impl Problem {
         };
         if let Some(accepted) = accepted {
             response.headers_mut().insert(ACCEPT_ENCODING, HeaderValue::from_static(accepted));
+        }
+        if status == StatusCode::UPGRADE_REQUIRED {
+            response.headers_mut().insert(UPGRADE, HeaderValue::from_static("websocket"));
+            response.headers_mut().insert(SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
         }
         if status == StatusCode::SERVICE_UNAVAILABLE {
             response.headers_mut().insert(RETRY_AFTER, service::RETRY_AFTER.as_secs().into());

@@ -48,7 +48,7 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
     get, path = "/v1/stream", tag = "streams",
     responses(
         (status = 101, description = "The websocket is open; the server speaks first"),
-        (status = 422, description = "`invalid`: not a websocket request", body = Problem, content_type = "application/problem+json"),
+        (status = 426, description = "`upgrade-required`: not a websocket request", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
@@ -56,7 +56,7 @@ pub(super) async fn websocket(
     State(context): State<Context>,
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
-    let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::Invalid, rejection.body_text()))?;
+    let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::UpgradeRequired, rejection.body_text()))?;
     let place = context.admit_stream()?;
     let limit = context.stream_limits.frame_bytes;
     let upgrade = upgrade
