@@ -150,6 +150,7 @@ async fn a_demonstration_is_followed_while_it_runs() {
     let (_, stored) = service.get(&format!("/v1/sessions/{session}")).await;
     assert_eq!((&stored["status"], &stored["observations"]), (&json!("done"), &json!(16)));
     assert_eq!(stored["policy_id"], done["policy_id"]);
+    assert_eq!((&stored["weights"], &stored["weights"]["outside"]), (&policy["weights"], &json!(4.0)));
     assert_eq!(service.get("/v1/sessions").await.1["items"], json!([stored]));
     assert_eq!(service.get("/v1/sessions/nothing").await.1["type"], "/problems/unknown-session");
 
@@ -423,6 +424,30 @@ async fn a_cut_connection_and_a_restarted_server_lose_and_double_nothing() {
     let again = client.receive_until("done").await;
     assert_eq!((steps(&again), again.last()), (expected, frames.last()));
     assert_eq!(client.closed().await, 1000);
+}
+
+/// As sessions were stored once: weights without the names of their attributes.
+#[tokio::test]
+async fn a_session_of_an_earlier_version_is_resumed_with_its_weights() {
+    use sqlx::{ConnectOptions, Connection};
+    let (service, _) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "figure-4", "weights": {"x": 2.5}})).await;
+    let (_, stored) = service.get(&format!("/v1/sessions/{session}")).await;
+    assert_eq!(stored["weights"]["x"], 2.5);
+    drop(client);
+    let path = service.directory.path().join("etude.db");
+    let mut database = sqlx::sqlite::SqliteConnectOptions::new().filename(path).connect().await.unwrap();
+    let n_attributes = stored["weights"].as_object().unwrap().len();
+    let weights: Vec<f64> = std::iter::once(2.5).chain(std::iter::repeat_n(1.5, n_attributes - 1)).collect();
+    let update = sqlx::query("UPDATE sessions SET weights = $1").bind(json!(weights).to_string());
+    update.execute(&mut database).await.unwrap();
+    database.close().await.unwrap();
+    assert_eq!(service.get(&format!("/v1/sessions/{session}")).await.1["weights"], Value::Null);
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": session})).await;
+    let opened = client.receive().await;
+    assert_eq!((&opened["weights"]["x"], &opened["weights"]["outside"]), (&json!(2.5), &json!(1.5)));
 }
 
 #[tokio::test]

@@ -25,7 +25,8 @@ use super::encoding::Encoding;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{Problem, ProblemKind};
-use crate::store::SessionRow;
+use crate::attribute::ByAttribute;
+use crate::store::{SessionRow, SessionWeights};
 use crate::stream::{self, Closed, Incoming, Outgoing, PROTOCOL};
 
 /// Frames that wait to be answered, and answers that wait to be read: enough to keep both ends busy.
@@ -284,8 +285,9 @@ struct SessionBody {
     model: String,
     /// Hash of its model's content.
     model_hash: String,
-    /// One weight per attribute, in the model's order.
-    weights: Vec<f64>,
+    /// The weights of the distance; `null` for a session that was opened before they were stored by attribute.
+    #[schema(value_type = Option<BTreeMap<String, f64>>)]
+    weights: Option<ByAttribute<f64>>,
     /// How many observations past the current one a decision may wait for; `null`: all.
     lookahead: Option<u32>,
     /// The learner whose weights are used, if any.
@@ -314,7 +316,10 @@ impl From<SessionRow> for SessionBody {
             id: row.id,
             model: row.model,
             model_hash: row.model_hash,
-            weights: row.weights,
+            weights: match row.weights {
+                SessionWeights::Named(weights) => Some(weights),
+                SessionWeights::InOrder(_) => None,
+            },
             lookahead: row.lookahead,
             learner: row.learner,
             weights_version: row.weights_version,

@@ -16,14 +16,14 @@ use super::opening::{Names, Opening};
 use super::owners::{Ownership, TakenOver};
 use super::policies::{Named, PolicyText, as_micros, report};
 use super::{Etude, PoolError, ServiceError};
-use crate::attribute::{ByAttribute, Weights};
+use crate::attribute::{ByAttribute, Schema, Weights};
 use crate::document::{self, Faults, Place};
 use crate::interrupt::{Interrupt, Uninterrupted};
 use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status};
 use crate::model::Origin;
 use crate::store::{
     AcceptedReward, NewObservations, NewRefinement, NewSession, Page, SessionEnd, SessionRow, SessionStatus,
-    StoreError, TrialRow,
+    SessionWeights, StoreError, TrialRow,
 };
 
 /// Why a session could not do as told.
@@ -199,7 +199,7 @@ impl Etude {
                 id: id.clone(),
                 model: model.clone(),
                 model_hash: model_hash.clone(),
-                weights: weights.as_slice().to_vec(),
+                weights: mapper.model().schema().by_attribute(weights.as_slice().iter().copied()),
                 lookahead: lookahead.map(NonZeroU32::get),
                 start,
                 learner: source.learner.clone(),
@@ -261,7 +261,7 @@ impl Etude {
             let name = format!("{} with hash {}", row.model, row.model_hash);
             return Err(ServiceError::Unknown { kind: "model", name, pointer: None }.into());
         }
-        let weights = Weights::of(row.weights);
+        let weights = read_weights(row.weights, mapper.model().schema())?;
         let lookahead = row.lookahead.and_then(NonZeroU32::new);
         let mut session = Session {
             id: row.id,
@@ -595,6 +595,23 @@ fn conclude(
         }
     });
     Ok((steps, policy, row, refinement))
+}
+
+/// Reads weights that were stored.
+fn read_weights(weights: SessionWeights, schema: &Schema) -> Result<Weights, SessionError> {
+    let missing = |name: &str| StoreError::Corrupt {
+        table: "sessions",
+        column: "weights",
+        source: format!("the weight of {name:?} is missing").into(),
+    };
+    let weights: Result<Vec<f64>, _> = match weights {
+        SessionWeights::InOrder(weights) => Ok(weights),
+        SessionWeights::Named(weights) => {
+            let names = schema.attributes().iter().map(|attribute| &attribute.name);
+            names.map(|name| weights.get(name).copied().ok_or_else(|| missing(name))).collect()
+        }
+    };
+    Ok(Weights::of(weights?))
 }
 
 /// Reads observations that were stored, which were read without faults before.

@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 
 use jiff::Timestamp;
+use serde::Deserialize;
 use serde_json::Value;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
@@ -12,6 +13,7 @@ use super::refinements::NewRefinement;
 use super::trials::{self, NewTrial};
 use super::writer::{Write, Written};
 use super::{Page, Store, StoreError, corrupt, policies, refinements, timestamp};
+use crate::attribute::ByAttribute;
 
 /// How far a session has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,8 +53,8 @@ pub struct SessionRow {
     pub model: String,
     /// Hash of its model's content.
     pub model_hash: String,
-    /// One weight per attribute, in the model's order.
-    pub weights: Vec<f64>,
+    /// The weights of its distance.
+    pub weights: SessionWeights,
     /// How many observations past the current one a decision may wait for; `None` for all.
     pub lookahead: Option<u32>,
     /// Index of the start state, if the request named one.
@@ -75,6 +77,16 @@ pub struct SessionRow {
     pub active_at: Timestamp,
 }
 
+/// The weights of a session's distance, as they are stored.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(untagged)]
+pub enum SessionWeights {
+    /// By attribute.
+    Named(ByAttribute<f64>),
+    /// Of a session that was opened before attributes were stored: one for each, in the model's order.
+    InOrder(Vec<f64>),
+}
+
 /// A session to be opened.
 #[derive(Clone, Debug)]
 pub struct NewSession {
@@ -84,8 +96,8 @@ pub struct NewSession {
     pub model: String,
     /// Hash of its model's content.
     pub model_hash: String,
-    /// One weight per attribute, in the model's order.
-    pub weights: Vec<f64>,
+    /// The weights of its distance.
+    pub weights: ByAttribute<f64>,
     /// How many observations past the current one a decision may wait for; `None` for all.
     pub lookahead: Option<u32>,
     /// Index of the start state, if the request named one.
