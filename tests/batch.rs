@@ -225,6 +225,41 @@ async fn a_batch_that_is_too_large_is_refused_before_it_is_searched() {
 }
 
 #[tokio::test]
+async fn a_policy_of_more_steps_than_can_be_stored_is_a_fault_of_its_demonstration() {
+    let service = figure_4(&[]).await;
+    // A long way from end to end, of which nothing is observed but the ends.
+    let n = 60;
+    let attribute = |n: usize| json!({"name": format!("{n:0>64}"), "kind": "number", "weight": 1e6});
+    let end = |state: usize| if state == 0 { 1 } else { u32::from(state == n - 1) * 2 };
+    let way = (1..n).flat_map(|state| [json!([state - 1, "on", state]), json!([state, "back", state - 1])]);
+    let wide = json!({
+        "attributes": (0..256).map(attribute).collect::<Vec<_>>(),
+        "actions": [{"name": "on", "cost": 0.3}, {"name": "back", "cost": 0.3}],
+        "dynamics": {
+            "kind": "table",
+            "states": (0..n).map(|state| vec![end(state); 256]).collect::<Vec<_>>(),
+            "transitions": way.collect::<Vec<_>>(),
+            "start": 0,
+        },
+    });
+    assert_eq!(service.put("/v1/models/wide", &wide).await.0, 201);
+    let name = format!("{:0>64}", 0);
+    let item = |n_observations| {
+        let seen = [json!({name.clone(): 1}), json!({}), json!({name.clone(): 2}), json!({})];
+        json!({"demonstration": seen.iter().cycle().take(n_observations).collect::<Vec<_>>()})
+    };
+    let mut request = item(200);
+    request["model"] = json!("wide");
+    let (status, problem) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, pointers(&problem)), (422, vec!["/demonstration"]), "{}", problem["detail"]);
+    assert!(problem["detail"].as_str().unwrap().contains(" steps"), "{problem}");
+    let batch = json!({"model": "wide", "items": [item(5), item(200)]});
+    let answered = items(&service, &batch).await;
+    assert!(answered[0]["id"].is_string());
+    assert_eq!(pointers(&answered[1]["problem"]), ["/items/1/demonstration"]);
+}
+
+#[tokio::test]
 async fn a_batch_uses_the_means_of_a_learner() {
     let service = figure_4(&[]).await;
     let learner = json!({"attributes": ["x", "gold"], "mean": {"x": 0.5, "gold": 7}});

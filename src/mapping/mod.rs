@@ -47,7 +47,7 @@ pub use demonstration::Demonstration;
 pub use heuristic::{Grouping, HeuristicName};
 pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
 pub use online::{CommittedStep, OnlineMapping};
-pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step};
+pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
 pub use problem::Problem;
 pub use request::{
     ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::cost::{Cost, CostSum};
-use super::{Mapping, Move, MoveKind, Problem, Status};
+use super::{Demonstration, Mapping, Move, MoveKind, Problem, Status};
 use crate::attribute::{ByAttribute, Scalar};
 use crate::document::{Faults, Place};
 use crate::model::{Model, States};
@@ -185,13 +185,45 @@ pub struct SearchReport {
 /// database takes no value over 1 GB.
 const MAX_STATES_BYTES: usize = 64 << 20;
 
+/// About how many bytes of a step are not its state's.
+const STEP_BYTES: usize = 200;
+
+/// Most bytes of a policy's steps: as many as the largest demonstration gives that acts once for each observation, 83 MB.
+const MAX_STEPS_BYTES: usize = MAX_STATES_BYTES + Demonstration::MAX_OBSERVATIONS * STEP_BYTES;
+
+/// A mapping has more steps than a policy may have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "the policy would have {n_steps} steps, which take about {} MB, and {} MB is the most: as the body needs many actions for \
+     an observation, split the demonstration",
+    n_bytes >> 20,
+    MAX_STEPS_BYTES >> 20
+)]
+pub struct TooManySteps {
+    /// How many there are.
+    pub n_steps: usize,
+    /// About how many bytes of JSON they are.
+    pub n_bytes: usize,
+}
+
 impl Policy {
+    /// Checks how large the policy of `mapping`, which must be of `model`, would be: what is known of it only when it was found.
+    /// An observation may take as many actions as there are states, where they lead through what it does not tell apart.
+    ///
+    /// # Errors
+    ///
+    /// [`TooManySteps`] if it would be too large to be written and stored.
+    pub fn check_steps(model: &Model, mapping: &Mapping) -> Result<(), TooManySteps> {
+        let n_steps = mapping.moves.len();
+        let n_bytes = n_steps.saturating_mul(STEP_BYTES.saturating_add(state_bytes(model)));
+        if n_bytes > MAX_STEPS_BYTES { Err(TooManySteps { n_steps, n_bytes }) } else { Ok(()) }
+    }
+
     /// Notes at `place` that a policy of `n_observations`, each of which has a step at least, would be too large; says
     /// whether it would not.
     /// What is estimated is what a step says of the imitator's state.
     pub(crate) fn check_size(model: &Model, n_observations: usize, place: &Place<'_, '_>, faults: &mut Faults) -> bool {
-        let step_bytes = serde_json::to_string(&model.describe(0)).map_or(0, |text| text.len());
-        let n_bytes = n_observations.saturating_mul(step_bytes);
+        let n_bytes = n_observations.saturating_mul(state_bytes(model));
         if n_bytes > MAX_STATES_BYTES {
             let detail = format!(
                 "the states of a policy of {n_observations} observations would take about {} MB, and {} MB is the most: \
@@ -240,6 +272,11 @@ impl Policy {
             refined_by: None,
         }
     }
+}
+
+/// About how many bytes of JSON a state is.
+fn state_bytes(model: &Model) -> usize {
+    serde_json::to_string(&model.describe(0)).map_or(0, |text| text.len())
 }
 
 fn steps(problem: &Problem<'_>, mapping: &Mapping) -> Vec<Step> {
@@ -296,5 +333,42 @@ impl StepWriter {
     /// What the steps cost so far.
     pub(super) fn cost(&self) -> Cost {
         self.cost
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::interrupt::Uninterrupted;
+    use crate::model::{Definition, Limits};
+
+    #[test]
+    fn a_policy_may_have_as_many_steps_as_fit_into_83_mb() {
+        let document = serde_json::json!({
+            "attributes": [{"name": "x", "kind": "number"}],
+            "actions": [],
+            "dynamics": {"kind": "table", "states": [[10]], "transitions": []},
+        });
+        let definition = Definition::read(&document, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let step = Move { kind: MoveKind::Skip, action: None, observation: 0, state: 0 };
+        let check = |n_steps| {
+            let mapping = Mapping {
+                moves: vec![step; n_steps],
+                cost: Cost::default(),
+                status: Status::Optimal,
+                lower_bound: None,
+                n_expanded: 0,
+                n_generated: 0,
+                states: None,
+            };
+            Policy::check_steps(&model, &mapping)
+        };
+        // A state is {"x":10}.
+        let most = ((64 << 20) + 100_000 * 200) / (200 + 8);
+        assert_eq!(check(most), Ok(()));
+        let error = check(most + 1).unwrap_err();
+        assert_eq!((error.n_steps, error.n_bytes >> 20), (most + 1, 83));
+        assert!(error.to_string().contains("418793 steps"), "{error}");
     }
 }

@@ -191,7 +191,14 @@ impl Batch {
             Err(faults) => return Ok(Err(faults.into())),
         };
         let stamp = Stamp { id: Some(Uuid::now_v7().to_string()), ..self.stamp.clone() };
-        Ok(searched(&follow(&self.mapper, &request, stamp, interrupt)?, &document))
+        Ok(match follow(&self.mapper, &request, stamp, interrupt)? {
+            Ok(policy) => searched(&policy, &document),
+            Err(error) => {
+                let mut faults = Faults::default();
+                faults.note_at(&Path::Member(&path, "demonstration"), error.to_string());
+                Err(faults.into())
+            }
+        })
     }
 
     /// The item as a request of its own.

@@ -15,7 +15,7 @@ use super::{Admission, Etude, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Status};
+use crate::mapping::{Mapper, Mapping, Policy, PolicySummary, Request, Stamp, Status, TooManySteps};
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
@@ -234,23 +234,27 @@ pub(super) fn search(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
     match read_request(mapper.model(), document, fields, base) {
-        Ok(request) => Ok(searched(&follow(mapper, &request, stamp, interrupt)?, document)),
+        Ok(request) => Ok(match follow(mapper, &request, stamp, interrupt)? {
+            Ok(policy) => searched(&policy, document),
+            Err(error) => Err(Faults::one("/demonstration", error.to_string()).into()),
+        }),
         Err(faults) => Ok(Err(faults.into())),
     }
 }
 
-/// Searches, and gives the policy.
+/// Searches, and gives the policy, unless that is too large.
 pub(super) fn follow(
     mapper: &Arc<Mapper>,
     request: &Request<'_>,
     stamp: Stamp,
     interrupt: &mut dyn Interrupt,
-) -> Result<Policy, Cancelled> {
+) -> Result<Result<Policy, TooManySteps>, Cancelled> {
     let started = Instant::now();
     let mapping = request.solve(mapper, interrupt)?;
     let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
-    Ok(Policy::new(stamp, &request.problem, &mapping))
+    let checked = Policy::check_steps(mapper.model(), &mapping);
+    Ok(checked.map(|()| Policy::new(stamp, &request.problem, &mapping)))
 }
 
 /// The weights from which a request starts: the means of its learner, or the model's own.

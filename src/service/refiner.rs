@@ -93,7 +93,7 @@ impl Etude {
 }
 
 /// Searches for the global optimum, knowing a mapping of cost `local_cost`. Nothing if the budget ran out before anything
-/// better was found.
+/// better was found, or if what was found is too large.
 fn refine(
     mapper: &Mapper,
     document: &serde_json::Value,
@@ -108,7 +108,8 @@ fn refine(
     let started = Instant::now();
     let settings = Settings { upper_bound: Some(local_cost), ..request.settings };
     let mapping = mapper.map(&request.problem, settings, interrupt)?;
-    if mapping.status != Status::Optimal && mapping.cost.total >= local_cost {
+    let is_no_better = mapping.status != Status::Optimal && mapping.cost.total >= local_cost;
+    if is_no_better || Policy::check_steps(mapper.model(), &mapping).is_err() {
         return Ok(Ok(None));
     }
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
