@@ -669,15 +669,17 @@ async fn a_shutdown_ends_streams_so_that_they_can_be_resumed() {
 
 #[tokio::test]
 async fn idle_sessions_expire() {
-    let service = Service::start(&["--session-idle-timeout", "100ms"]).await;
-    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
-    let mut client = Client::connect(&service).await;
-    let session = client.open(json!({"type": "open", "model": "figure-4"})).await;
-    assert_eq!(client.receive().await["problem"]["type"], "/problems/idle");
-    assert_eq!(client.closed().await, 1008);
+    // Opened while there is time enough, and expired by a service that has less.
+    let (service, _) = figure_4().await;
+    let session = Client::connect(&service).await.open(json!({"type": "open", "model": "figure-4"})).await;
+    let service = Service::start_in(service.stop().await, &["--session-idle-timeout", "100ms"]).await;
     while service.get(&format!("/v1/sessions/{session}")).await.1["status"] != "expired" {
         tokio::task::yield_now().await;
     }
+    let mut client = Client::connect(&service).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/idle");
+    assert_eq!(client.closed().await, 1008);
+    let service = Service::start_in(service.stop().await, &[]).await;
     let mut client = Client::connect(&service).await;
     client.send(json!({"type": "resume", "session": session})).await;
     assert_eq!(client.receive().await["problem"]["type"], "/problems/expired");
@@ -992,7 +994,7 @@ async fn a_slow_reader_holds_up_neither_who_resumes_its_session_nor_a_shutdown()
 
 #[tokio::test]
 async fn pings_are_answered_while_the_service_searches() {
-    let service = Service::start(&[]).await;
+    let service = Service::start(&["--search-threads", "1", "--drain-timeout", "1h"]).await;
     let cave = json!({
         "actions": [{"name": "forward"}, {"name": "turn_left"}, {"name": "grab"}],
         "dynamics": {"kind": "wumpus", "width": 20, "height": 20, "gold": [[5, 5], [9, 2], [3, 12]]},
@@ -1000,13 +1002,16 @@ async fn pings_are_answered_while_the_service_searches() {
     assert_eq!(service.put("/v1/models/cave", &cave).await.0, 201);
     let mut client = Client::connect(&service).await;
     client.open(json!({"type": "open", "model": "cave"})).await;
-    let states: Vec<Value> = (0..1000).map(|n| json!({"x": n % 20, "y": n / 20 % 20})).collect();
+    let states: Vec<Value> = (0..10_000).map(|n| json!({"x": n % 20, "y": n / 20 % 20})).collect();
     client.send(json!({"type": "observe", "seq": 0, "states": states})).await;
-    assert_eq!(client.receive().await, json!({"type": "received", "seq": 1000}));
-    // A thousand layers are under way, none of whose steps is sent before all of them are done.
+    assert_eq!(client.receive().await, json!({"type": "received", "seq": 10_000}));
+    // Ten thousand layers are under way, none of whose steps is sent before all of them are done.
     client.socket.send(Message::Ping(b"there?".as_slice().into())).await.unwrap();
     assert_eq!(client.next().await, Message::Pong(b"there?".as_slice().into()));
-    // Who vanishes now ends the search: the service stops at once.
+    // Who vanishes now ends the search, so that another has its turn, and a shutdown waits for neither.
     drop(client);
+    let request = json!({"model": "cave", "demonstration": [{"x": 0}]});
+    let other = tokio::time::timeout(PATIENCE, service.post("/v1/policies", &request)).await.unwrap();
+    assert_eq!(other.0, 201);
     tokio::time::timeout(PATIENCE, service.stop()).await.unwrap();
 }
