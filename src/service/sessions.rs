@@ -19,7 +19,9 @@ use super::{Etude, PoolError, ServiceError};
 use crate::attribute::{ByAttribute, Schema, Weights};
 use crate::document::{self, Faults, Place};
 use crate::interrupt::{Interrupt, Uninterrupted};
-use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status};
+use crate::mapping::{
+    CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, TooManySteps,
+};
 use crate::model::Origin;
 use crate::store::{
     AcceptedReward, NewObservations, NewRefinement, NewSession, Page, SessionEnd, SessionRow, SessionStatus,
@@ -44,6 +46,9 @@ pub enum SessionError {
     /// The demonstration has ended already.
     #[error("the demonstration has ended")]
     Ended,
+    /// The demonstration has ended, but its policy cannot be stored. What was observed stays.
+    #[error("the demonstration cannot be ended: {0}")]
+    TooManySteps(#[from] TooManySteps),
     /// Something is wrong with the frame.
     #[error("{0}")]
     Faults(#[from] Faults),
@@ -508,7 +513,7 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// If observations are missing, or the service ends.
+    /// If observations are missing, or the service ends. After [`SessionError::TooManySteps`] the session is to be dropped.
     pub async fn end(&mut self, etude: &Etude, seq: u32, now: Timestamp) -> Result<Ended, SessionError> {
         if self.has_ended() {
             return Err(SessionError::Ended);
@@ -572,6 +577,7 @@ fn conclude(
 ) -> Result<Concluded, SessionError> {
     let started = Instant::now();
     let (steps, mapping) = online.end().ok_or(SessionError::Empty)?;
+    Policy::check_steps(mapper.model(), &mapping)?;
     let demonstration = Demonstration::of(read_stored(mapper, texts)?).ok_or(SessionError::Empty)?;
     let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };

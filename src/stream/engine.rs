@@ -79,7 +79,7 @@ pub enum Closed {
     NotText,
     /// Not allowed now.
     NotAllowed,
-    /// A frame over the limit.
+    /// A frame over the limit, or a policy.
     TooLarge,
     /// The server failed; the session is to be resumed.
     Failed,
@@ -100,7 +100,7 @@ impl Closed {
             Self::GoingAway => (1001, "the server shuts down; resume"),
             Self::NotText => (1007, "not JSON"),
             Self::NotAllowed => (1008, "not allowed"),
-            Self::TooLarge => (1009, "frame too large"),
+            Self::TooLarge => (1009, "too large"),
             Self::Failed => (1011, "the server failed; resume"),
             Self::Overloaded => (1013, "overloaded or too slow a reader; resume"),
             Self::BadFrame => (4400, "bad frame"),
@@ -321,7 +321,10 @@ impl Connection<'_> {
                 problem.detail = format!("none of the frame's states was taken: {}", problem.detail);
                 problem
             }
-            SessionError::NotOpen | SessionError::TakenOver | SessionError::Service(_) => return Err(ends(error)),
+            SessionError::NotOpen
+            | SessionError::TakenOver
+            | SessionError::TooManySteps(_)
+            | SessionError::Service(_) => return Err(ends(error)),
         };
         self.send(&ServerFrame::Error { problem }).await?;
         Ok(None)
@@ -377,6 +380,9 @@ fn ends(error: &SessionError) -> Over {
         SessionError::Faults(faults) => Over::because(Closed::BadFrame, StreamProblem::of("invalid", faults)),
         SessionError::NotOpen => Over::because(Closed::Unknown, StreamProblem::new("expired", detail)),
         SessionError::TakenOver => Over::because(Closed::NotAllowed, StreamProblem::new("taken-over", detail)),
+        SessionError::TooManySteps(_) => {
+            Over::because(Closed::TooLarge, StreamProblem::new("policy-too-large", detail))
+        }
         SessionError::Gap { .. } | SessionError::TooMany | SessionError::Empty | SessionError::Ended => {
             not_allowed(&detail)
         }
