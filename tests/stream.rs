@@ -5,17 +5,22 @@
 mod process;
 mod service;
 
+use std::sync::Arc;
 use std::time::Duration;
 
+use etude::document::Place;
 use etude::service::Etude;
 use etude::stream::{Closed, Incoming, Outgoing};
 use futures_util::{SinkExt, StreamExt};
+use jiff::Timestamp;
 use process::Process;
-use reqwest::Body;
+use reqwest::{Body, Method};
 use serde_json::{Value, json};
 use service::{Service, example};
+use tempfile::TempDir;
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::protocol::frame::Frame;
@@ -145,6 +150,7 @@ async fn a_demonstration_is_followed_while_it_runs() {
     let (_, stored) = service.get(&format!("/v1/sessions/{session}")).await;
     assert_eq!((&stored["status"], &stored["observations"]), (&json!("done"), &json!(16)));
     assert_eq!(stored["policy_id"], done["policy_id"]);
+    assert_eq!((&stored["weights"], &stored["weights"]["outside"]), (&policy["weights"], &json!(4.0)));
     assert_eq!(service.get("/v1/sessions").await.1["items"], json!([stored]));
     assert_eq!(service.get("/v1/sessions/nothing").await.1["type"], "/problems/unknown-session");
 
@@ -218,6 +224,22 @@ async fn lines_go_both_ways_at_the_same_time() {
     };
     assert_eq!((&done["status"], &done["cost"]["total"]), (&json!("optimal"), &json!(48.0)));
     assert_eq!(receive().await, None, "the answer ends by itself");
+}
+
+#[tokio::test]
+async fn lines_are_not_compressed() {
+    let service = Service::start(&[]).await;
+    let request = service.client.post(service.url("/v1/stream")).header("content-encoding", "gzip").body("\u{1f}");
+    let response = tokio::time::timeout(PATIENCE, request.send()).await.unwrap().unwrap();
+    assert_eq!(
+        (response.status().as_u16(), &response.headers()["accept-encoding"]),
+        (415, &"identity".parse().unwrap())
+    );
+    let problem: Value = serde_json::from_str(&response.text().await.unwrap()).unwrap();
+    assert_eq!(problem["type"], "/problems/unsupported-encoding");
+    let identity = service.client.post(service.url("/v1/stream")).header("content-encoding", "identity");
+    let answer = identity.body("{}\n").send().await.unwrap().text().await.unwrap();
+    assert!(answer.contains("hello") && answer.contains("bad-frame"), "{answer}");
 }
 
 #[tokio::test]
@@ -322,6 +344,21 @@ async fn whatever_cannot_be_understood_has_its_answer() {
         assert_eq!(error["problem"]["type"], format!("/problems/{slug}"), "{shown:?}: {error}");
         assert_eq!(client.closed().await, code, "{shown:?}: {error}");
     }
+    // Of a request to open a session, everything that is wrong.
+    let faulty = json!({
+        "type": "open", "model": "figure-4", "learner": 7, "explore": 1, "lookahead": 0, "weights": {"z": -1}, "start": 9999,
+        "hurry": true,
+    });
+    let everywhere = json!({"type": "open", "model": "nothing", "lookahead": 0, "hurry": true});
+    let pointers = ["/hurry", "/learner", "/explore", "/lookahead", "/weights/z", "/weights/z", "/start"];
+    for (open, expected) in [(faulty, &pointers[..]), (everywhere, &["/hurry", "/lookahead", "/model"])] {
+        let mut client = Client::connect(&service).await;
+        client.send(open).await;
+        let problem = client.receive().await["problem"].take();
+        let found: Vec<_> = problem["errors"].as_array().unwrap().iter().map(|error| &error["pointer"]).collect();
+        assert_eq!(found, expected, "{problem}");
+        assert_eq!((&problem["type"], client.closed().await), (&json!("/problems/invalid"), 4400));
+    }
     // Text that is not UTF-8, byte by byte: a masked text frame of two bytes.
     let mut client = Client::connect(&service).await;
     {
@@ -389,6 +426,30 @@ async fn a_cut_connection_and_a_restarted_server_lose_and_double_nothing() {
     assert_eq!(client.closed().await, 1000);
 }
 
+/// As sessions were stored once: weights without the names of their attributes.
+#[tokio::test]
+async fn a_session_of_an_earlier_version_is_resumed_with_its_weights() {
+    use sqlx::{ConnectOptions, Connection};
+    let (service, _) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "figure-4", "weights": {"x": 2.5}})).await;
+    let (_, stored) = service.get(&format!("/v1/sessions/{session}")).await;
+    assert_eq!(stored["weights"]["x"], 2.5);
+    drop(client);
+    let path = service.directory.path().join("etude.db");
+    let mut database = sqlx::sqlite::SqliteConnectOptions::new().filename(path).connect().await.unwrap();
+    let n_attributes = stored["weights"].as_object().unwrap().len();
+    let weights: Vec<f64> = std::iter::once(2.5).chain(std::iter::repeat_n(1.5, n_attributes - 1)).collect();
+    let update = sqlx::query("UPDATE sessions SET weights = $1").bind(json!(weights).to_string());
+    update.execute(&mut database).await.unwrap();
+    database.close().await.unwrap();
+    assert_eq!(service.get(&format!("/v1/sessions/{session}")).await.1["weights"], Value::Null);
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": session})).await;
+    let opened = client.receive().await;
+    assert_eq!((&opened["weights"]["x"], &opened["weights"]["outside"]), (&json!(2.5), &json!(1.5)));
+}
+
 #[tokio::test]
 async fn a_session_that_is_resumed_elsewhere_is_taken_over() {
     let (service, demonstration) = figure_4().await;
@@ -404,6 +465,45 @@ async fn a_session_that_is_resumed_elsewhere_is_taken_over() {
     assert_eq!(second.receive_until("done").await.last().unwrap()["type"], "done");
 }
 
+/// Those it is taken from are cut off wherever they are: in the middle of writing, mapping or sending.
+#[tokio::test]
+async fn a_session_that_goes_from_hand_to_hand_loses_and_doubles_nothing() {
+    let (service, demonstration) = figure_4().await;
+    let demonstration: Vec<&Value> = demonstration.iter().cycle().take(60).collect();
+    let open = json!({"type": "open", "model": "figure-4", "lookahead": 3});
+    let mut undisturbed = Client::connect(&service).await;
+    undisturbed.open(open.clone()).await;
+    undisturbed.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    undisturbed.send(json!({"type": "end", "seq": 60})).await;
+    let expected = steps(&undisturbed.receive_until("done").await);
+
+    let mut first = Client::connect(&service).await;
+    let session = first.open(open).await;
+    let (mut hands, mut n_durable) = (vec![first], 0);
+    for n_awaited in (0..4).cycle() {
+        let mut client = Client::connect(&service).await;
+        client.send(json!({"type": "resume", "session": session})).await;
+        let opened = client.receive().await;
+        let received = opened["received"].as_u64().unwrap();
+        assert!(received >= n_durable, "{opened}, and {n_durable} were durable");
+        n_durable = received;
+        for (seq, state) in demonstration.iter().enumerate().skip(usize::try_from(received).unwrap()) {
+            client.send(json!({"type": "observe", "seq": seq, "states": [state]})).await;
+        }
+        if received == 60 {
+            client.send(json!({"type": "end", "seq": 60})).await;
+            let told = client.receive_until("done").await;
+            assert_eq!(steps(&told), expected);
+            break;
+        }
+        for _ in 0..n_awaited.min(60 - received) {
+            n_durable = client.receive_until("received").await.last().unwrap()["seq"].as_u64().unwrap();
+        }
+        hands.push(client);
+    }
+    assert_eq!(undisturbed.closed().await, 1000);
+}
+
 #[tokio::test]
 async fn a_thousand_observations_fit_into_a_frame() {
     let (service, demonstration) = figure_4().await;
@@ -415,6 +515,34 @@ async fn a_thousand_observations_fit_into_a_frame() {
     client.send(json!({"type": "end", "seq": 1000})).await;
     let frames = client.receive_until("done").await;
     assert_eq!(steps(&frames).last().unwrap()["observation"], 999);
+}
+
+/// With thousands of actions of long names, `done` is larger than any frame that a client may send.
+#[tokio::test]
+async fn the_policy_of_a_long_session_arrives_over_a_websocket() {
+    let service = Service::start(&[]).await;
+    // Four bytes a character, of which a name has 64 at most.
+    let step = "\u{1f463}".repeat(64);
+    let toggle = json!({
+        "attributes": [{"name": "x", "kind": "number"}],
+        "actions": [{"name": step, "cost": 0}],
+        "dynamics": {"kind": "table", "states": [[0], [1]], "transitions": [[0, step, 1], [1, step, 0]], "start": 0},
+    });
+    assert_eq!(service.put("/v1/models/toggle", &toggle).await.0, 201);
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "toggle", "lookahead": 1})).await;
+    let states: Vec<Value> = (0..6000).map(|n| json!([n % 2])).collect();
+    client.send(json!({"type": "observe", "seq": 0, "states": states})).await;
+    client.send(json!({"type": "end", "seq": states.len()})).await;
+    let done = client.receive_until("done").await.pop().unwrap();
+    assert_eq!(done["actions"].as_array().unwrap().len(), states.len() - 1);
+    assert!(done.to_string().len() > 4 * 262_144);
+    assert_eq!(client.closed().await, 1000);
+    // And once more to who has lost it.
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": session, "step": states.len() - 1})).await;
+    assert_eq!(client.receive_until("done").await.last().unwrap(), &done);
+    assert_eq!(client.closed().await, 1000);
 }
 
 #[tokio::test]
@@ -541,15 +669,17 @@ async fn a_shutdown_ends_streams_so_that_they_can_be_resumed() {
 
 #[tokio::test]
 async fn idle_sessions_expire() {
-    let service = Service::start(&["--session-idle-timeout", "100ms"]).await;
-    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
-    let mut client = Client::connect(&service).await;
-    let session = client.open(json!({"type": "open", "model": "figure-4"})).await;
-    assert_eq!(client.receive().await["problem"]["type"], "/problems/idle");
-    assert_eq!(client.closed().await, 1008);
+    // Opened while there is time enough, and expired by a service that has less.
+    let (service, _) = figure_4().await;
+    let session = Client::connect(&service).await.open(json!({"type": "open", "model": "figure-4"})).await;
+    let service = Service::start_in(service.stop().await, &["--session-idle-timeout", "100ms"]).await;
     while service.get(&format!("/v1/sessions/{session}")).await.1["status"] != "expired" {
         tokio::task::yield_now().await;
     }
+    let mut client = Client::connect(&service).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/idle");
+    assert_eq!(client.closed().await, 1008);
+    let service = Service::start_in(service.stop().await, &[]).await;
     let mut client = Client::connect(&service).await;
     client.send(json!({"type": "resume", "session": session})).await;
     assert_eq!(client.receive().await["problem"]["type"], "/problems/expired");
@@ -593,8 +723,63 @@ async fn no_more_streams_run_than_may() {
     let error = second.unwrap_err().to_string();
     assert!(error.contains("503"), "{error}");
     drop(first);
-    let (status, problem) = service.get("/v1/stream").await;
-    assert_eq!((status, &problem["type"]), (422, &json!("/problems/invalid")), "not a websocket: {problem}");
+}
+
+#[tokio::test]
+async fn who_asks_for_a_stream_without_a_websocket_is_told_to_upgrade() {
+    let service = Service::start(&[]).await;
+    let response = service.send(Method::GET, "/v1/stream", &Value::Null).await;
+    assert_eq!(response.headers()["upgrade"], "websocket");
+    let (status, problem) = service::answer(response).await;
+    assert_eq!((status, &problem["type"]), (426, &json!("/problems/upgrade-required")), "{problem}");
+}
+
+#[tokio::test]
+async fn a_service_with_too_much_to_do_opens_no_session_and_goes_on_with_those_that_are_open() {
+    let service = Service::start(&["--search-threads", "1", "--search-queue", "0"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let demonstration = example("figure-4/demonstration.json").as_array().unwrap().clone();
+    let open = json!({"type": "open", "model": "figure-4"});
+    let mut before = Client::connect(&service).await;
+    before.open(open.clone()).await;
+
+    // A request that takes minutes: the paper's heuristic looks at every observation ahead, for every node.
+    let long: Vec<&Value> = demonstration.iter().cycle().take(20_000).collect();
+    let request = json!({"model": "figure-4", "demonstration": long, "heuristic": "paper"});
+    let request = service.client.post(service.url("/v1/policies")).json(&request);
+    let searching = tokio::spawn(request.send());
+    while service.measurement("etude_search_jobs").await < 1.0 {
+        tokio::task::yield_now().await;
+    }
+    let mut refused = Client::connect(&service).await;
+    refused.send(open.clone()).await;
+    assert_eq!(refused.receive().await["problem"]["type"], "/problems/overloaded");
+    assert_eq!(refused.closed().await, 1013);
+    before.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    assert_eq!(before.receive().await, json!({"type": "received", "seq": 16}));
+    before.send(json!({"type": "end", "seq": 16})).await;
+
+    searching.abort();
+    before.receive_until("done").await;
+    Client::connect(&service).await.open(open).await;
+}
+
+#[tokio::test]
+async fn a_database_that_another_process_holds_is_no_internal_error() {
+    use sqlx::{ConnectOptions, Connection};
+    let (service, demonstration) = figure_4().await;
+    let mut client = Client::connect(&service).await;
+    let session = client.open(json!({"type": "open", "model": "figure-4"})).await;
+    let path = service.directory.path().join("etude.db");
+    let mut other = sqlx::sqlite::SqliteConnectOptions::new().filename(path).connect().await.unwrap();
+    let held = other.begin_with("BEGIN IMMEDIATE").await.unwrap();
+    client.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    assert_eq!(client.receive().await["problem"]["type"], "/problems/overloaded");
+    assert_eq!(client.closed().await, 1013);
+    held.rollback().await.unwrap();
+    let mut again = Client::connect(&service).await;
+    again.send(json!({"type": "resume", "session": session})).await;
+    assert_eq!(again.receive().await["received"], 0);
 }
 
 #[tokio::test]
@@ -638,30 +823,220 @@ async fn a_stream_follows_a_learners_weights_or_explores_and_is_rewarded() {
     assert_eq!(client.closed().await, 4404);
 }
 
+#[tokio::test]
+async fn an_exploring_session_ends_with_its_policy_if_no_reward_is_to_come_any_more() {
+    let (service, demonstration) = figure_4().await;
+    let learner = json!({"attributes": ["x", "gold"], "seed": 7});
+    assert_eq!(service.put("/v1/learners/gold", &learner).await.0, 201);
+    let explore = json!({"type": "open", "model": "figure-4", "learner": "gold", "explore": true});
+    let observe = json!({"type": "observe", "seq": 0, "states": demonstration});
+    let resume = async |session: &str| {
+        let mut client = Client::connect(&service).await;
+        client.send(json!({"type": "resume", "session": session})).await;
+        client
+    };
+
+    // Rewarded before its end.
+    let mut client = Client::connect(&service).await;
+    let session = client.open(explore.clone()).await;
+    client.send(observe.clone()).await;
+    client.send(json!({"type": "reward", "reward": 3})).await;
+    let rewarded = client.receive_until("rewarded").await.pop().unwrap();
+    client.send(json!({"type": "end", "seq": 16})).await;
+    client.receive_until("done").await;
+    assert_eq!(client.closed().await, 1000);
+    let mut again = resume(&session).await;
+    again.receive_until("done").await;
+    assert_eq!(again.receive().await, rewarded, "it may not have been heard");
+    assert_eq!(again.closed().await, 1000);
+
+    // Failed before its end.
+    let mut client = Client::connect(&service).await;
+    client.send(explore.clone()).await;
+    let opened = client.receive().await;
+    let fail = format!("/v1/trials/{}/fail", opened["trial"].as_str().unwrap());
+    assert_eq!(service.post(&fail, &json!({"reason": "it fell"})).await.0, 200);
+    client.send(observe.clone()).await;
+    client.send(json!({"type": "end", "seq": 16})).await;
+    client.receive_until("done").await;
+    assert_eq!(client.closed().await, 1000);
+
+    // The learner is deleted after its end.
+    let mut client = Client::connect(&service).await;
+    let session = client.open(explore).await;
+    client.send(observe).await;
+    client.send(json!({"type": "end", "seq": 16})).await;
+    client.receive_until("done").await;
+    assert_eq!(service.delete("/v1/learners/gold").await.0, 204);
+    let mut again = resume(&session).await;
+    again.receive_until("done").await;
+    assert_eq!(again.closed().await, 1000);
+}
+
+/// The application that was a service, without the service.
+async fn without_service(service: Service, abort: &CancellationToken) -> (Etude, TempDir) {
+    let directory = service.stop().await;
+    let database = directory.path().join("etude.db");
+    let flags = service::flags(&["--database", database.to_str().unwrap()]);
+    (Etude::open(&flags.settings(), &TaskTracker::new(), abort.clone()).await.unwrap(), directory)
+}
+
+#[tokio::test]
+async fn resuming_and_repeating_keep_a_session_from_expiring() {
+    let (service, demonstration) = figure_4().await;
+    let (etude, _directory) = without_service(service, &CancellationToken::new()).await;
+    let at = |minute: i64| Timestamp::from_second(60 * minute).unwrap();
+    let states = json!(demonstration);
+    let states = Place::root(&states);
+    let open = json!({"type": "open", "model": "figure-4"});
+    let mut session = etude.open_session(&open, at(0)).await.unwrap();
+    let id = session.id().to_owned();
+    let active_at = async || etude.session(&id).await.unwrap().active_at;
+    session.receive(&etude, 0, &states, at(1)).await.unwrap();
+    assert_eq!(active_at().await, at(1));
+    session.receive(&etude, 0, &states, at(2)).await.unwrap();
+    assert_eq!(active_at().await, at(2));
+    drop(session);
+    let mut resumed = etude.resume_session(&id, at(3)).await.unwrap();
+    assert_eq!((active_at().await, resumed.session.n_received()), (at(3), 16));
+    // What is not settled yet came before.
+    let more = json!([demonstration[0]]);
+    resumed.session.receive(&etude, 16, &Place::root(&more), at(4)).await.unwrap();
+    drop(resumed);
+    assert_eq!(etude.resume_session(&id, at(5)).await.unwrap().session.n_received(), 17);
+    assert_eq!(active_at().await, at(5));
+    etude.close().await;
+}
+
 /// A client that reads nothing: the session's own search waits for it, and is given up.
 #[tokio::test]
 async fn who_stays_slow_is_closed_as_overloaded() {
-    let service = Service::start(&[]).await;
-    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
-    let directory = service.stop().await;
-    let database = directory.path().join("etude.db");
-    let flags = service::flags(&["--database", database.to_str().unwrap(), "--slow-reader-timeout", "100ms"]);
-    let (tasks, abort) = (TaskTracker::new(), CancellationToken::new());
-    let etude = Etude::open(&flags.settings(), &tasks, abort.clone()).await.unwrap();
+    let (service, _) = figure_4().await;
+    let abort = CancellationToken::new();
+    let (etude, _directory) = without_service(service, &abort).await;
+    let limits = service::flags(&["--slow-reader-timeout", "100ms"]).stream_limits();
     let (came, mut incoming) = mpsc::channel(1);
     // Room for `hello` alone.
     let (outgoing, mut goes) = mpsc::channel(1);
     let open = json!({"type": "open", "model": "figure-4"}).to_string();
     came.send(Incoming::Frame(open.into_bytes())).await.unwrap();
-    let closed = etude::stream::run(&etude, flags.stream_limits(), &mut incoming, &outgoing, &abort).await;
+    let closed = etude::stream::run(&etude, limits, &mut incoming, &outgoing, &abort).await;
     assert_eq!((closed, closed.code().0), (Closed::Overloaded, 1013));
     assert!(matches!(goes.try_recv(), Ok(Outgoing::Frame(hello)) if hello.contains("hello")));
     etude.close().await;
 }
 
+/// A connection of the application alone, without a transport: as much fits into its queues as is told.
+struct Wire {
+    to_server: mpsc::Sender<Incoming>,
+    from_server: mpsc::Receiver<Outgoing>,
+    running: JoinHandle<Closed>,
+}
+
+impl Wire {
+    fn connect(etude: &Arc<Etude>, stopping: &CancellationToken) -> Self {
+        let (to_server, mut incoming) = mpsc::channel(8);
+        let (outgoing, from_server) = mpsc::channel(1);
+        let (etude, stopping) = (Arc::clone(etude), stopping.clone());
+        let limits = service::flags(&["--slow-reader-timeout", "1h"]).stream_limits();
+        let running =
+            tokio::spawn(async move { etude::stream::run(&etude, limits, &mut incoming, &outgoing, &stopping).await });
+        Self { to_server, from_server, running }
+    }
+
+    async fn send(&self, frame: Value) {
+        self.to_server.send(Incoming::Frame(frame.to_string().into_bytes())).await.unwrap();
+    }
+
+    async fn receive_until(&mut self, kind: &str) -> Value {
+        loop {
+            let came = tokio::time::timeout(PATIENCE, self.from_server.recv()).await.unwrap();
+            let Some(Outgoing::Frame(text)) = came else { panic!("{came:?} instead of {kind}") };
+            let frame: Value = serde_json::from_str(&text).unwrap();
+            if frame["type"] == kind {
+                return frame;
+            }
+        }
+    }
+}
+
+#[tokio::test]
+async fn a_session_whose_policy_is_too_large_says_so_and_can_still_be_read() {
+    let service = Service::start(&[]).await;
+    // A long way from end to end, of which nothing is observed but the ends.
+    let n = 60;
+    let attribute = |n: usize| json!({"name": format!("{n:0>64}"), "kind": "number", "weight": 1e6});
+    let end = |state: usize| if state == 0 { 1 } else { u32::from(state == n - 1) * 2 };
+    let way = (1..n).flat_map(|state| [json!([state - 1, "on", state]), json!([state, "back", state - 1])]);
+    let wide = json!({
+        "attributes": (0..256).map(attribute).collect::<Vec<_>>(),
+        "actions": [{"name": "on", "cost": 0.3}, {"name": "back", "cost": 0.3}],
+        "dynamics": {
+            "kind": "table", "states": (0..n).map(|state| vec![end(state); 256]).collect::<Vec<_>>(),
+            "transitions": way.collect::<Vec<_>>(), "start": 0,
+        },
+    });
+    assert_eq!(service.put("/v1/models/wide", &wide).await.0, 201);
+    let stopping = CancellationToken::new();
+    let (etude, _directory) = without_service(service, &stopping).await;
+    let etude = Arc::new(etude);
+    let mut wire = Wire::connect(&etude, &stopping);
+    wire.send(json!({"type": "open", "model": "wide", "lookahead": null})).await;
+    let session = wire.receive_until("opened").await["session"].take();
+    let name = format!("{:0>64}", 0);
+    let seen = [json!({name.clone(): 1}), json!({}), json!({name.clone(): 2}), json!({})];
+    let states: Vec<&Value> = seen.iter().cycle().take(200).collect();
+    wire.send(json!({"type": "observe", "seq": 0, "states": states})).await;
+    wire.send(json!({"type": "end", "seq": 200})).await;
+    let problem = wire.receive_until("error").await["problem"].take();
+    assert_eq!(problem["type"], "/problems/policy-too-large", "{problem}");
+    assert!(problem["detail"].as_str().unwrap().contains(" steps"), "{problem}");
+    assert_eq!(wire.running.await.unwrap(), Closed::TooLarge);
+
+    let id = session.as_str().unwrap();
+    let row = etude.session(id).await.unwrap();
+    assert_eq!((row.status.name(), row.n_observations, row.policy_id), ("open", 200, None));
+    let mut again = Wire::connect(&etude, &stopping);
+    again.send(json!({"type": "resume", "session": id, "step": 1_000_000})).await;
+    assert_eq!(again.receive_until("opened").await["received"], 200);
+    etude.close().await;
+}
+
+#[tokio::test]
+async fn a_slow_reader_holds_up_neither_who_resumes_its_session_nor_a_shutdown() {
+    let (service, demonstration) = figure_4().await;
+    let (etude, _directory) = without_service(service, &CancellationToken::new()).await;
+    let (etude, stopping) = (Arc::new(etude), CancellationToken::new());
+    let mut slow = Wire::connect(&etude, &stopping);
+    slow.send(json!({"type": "open", "model": "figure-4", "lookahead": 1})).await;
+    let session = slow.receive_until("opened").await["session"].take();
+    slow.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+    // From here on it reads nothing, and the server is in the middle of sending steps.
+    slow.receive_until("step").await;
+
+    let resume = json!({"type": "resume", "session": session});
+    let mut next = Wire::connect(&etude, &stopping);
+    next.send(resume.clone()).await;
+    assert_eq!(next.receive_until("opened").await["received"], 16);
+    assert_eq!(slow.receive_until("error").await["problem"]["type"], "/problems/taken-over");
+    assert_eq!(slow.running.await.unwrap(), Closed::NotAllowed);
+
+    // Now this one reads nothing.
+    next.receive_until("step").await;
+    stopping.cancel();
+    assert_eq!(next.receive_until("error").await["problem"]["type"], "/problems/stopping");
+    assert_eq!(next.running.await.unwrap(), Closed::GoingAway);
+    let mut last = Wire::connect(&etude, &CancellationToken::new());
+    last.send(resume).await;
+    last.receive_until("opened").await;
+    last.send(json!({"type": "end", "seq": 16})).await;
+    last.receive_until("done").await;
+    etude.close().await;
+}
+
 #[tokio::test]
 async fn pings_are_answered_while_the_service_searches() {
-    let service = Service::start(&[]).await;
+    let service = Service::start(&["--search-threads", "1", "--drain-timeout", "1h"]).await;
     let cave = json!({
         "actions": [{"name": "forward"}, {"name": "turn_left"}, {"name": "grab"}],
         "dynamics": {"kind": "wumpus", "width": 20, "height": 20, "gold": [[5, 5], [9, 2], [3, 12]]},
@@ -669,13 +1044,16 @@ async fn pings_are_answered_while_the_service_searches() {
     assert_eq!(service.put("/v1/models/cave", &cave).await.0, 201);
     let mut client = Client::connect(&service).await;
     client.open(json!({"type": "open", "model": "cave"})).await;
-    let states: Vec<Value> = (0..1000).map(|n| json!({"x": n % 20, "y": n / 20 % 20})).collect();
+    let states: Vec<Value> = (0..10_000).map(|n| json!({"x": n % 20, "y": n / 20 % 20})).collect();
     client.send(json!({"type": "observe", "seq": 0, "states": states})).await;
-    assert_eq!(client.receive().await, json!({"type": "received", "seq": 1000}));
-    // A thousand layers are under way, none of whose steps is sent before all of them are done.
+    assert_eq!(client.receive().await, json!({"type": "received", "seq": 10_000}));
+    // Ten thousand layers are under way, none of whose steps is sent before all of them are done.
     client.socket.send(Message::Ping(b"there?".as_slice().into())).await.unwrap();
     assert_eq!(client.next().await, Message::Pong(b"there?".as_slice().into()));
-    // Who vanishes now ends the search: the service stops at once.
+    // Who vanishes now ends the search, so that another has its turn, and a shutdown waits for neither.
     drop(client);
+    let request = json!({"model": "cave", "demonstration": [{"x": 0}]});
+    let other = tokio::time::timeout(PATIENCE, service.post("/v1/policies", &request)).await.unwrap();
+    assert_eq!(other.0, 201);
     tokio::time::timeout(PATIENCE, service.stop()).await.unwrap();
 }

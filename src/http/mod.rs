@@ -78,7 +78,7 @@ impl Context {
         description = "A service by which an agent learns a task by watching it done: it finds the policy, in the agent's own \
                        actions, whose effects follow a demonstration most closely.\n\nEvery error is a problem document \
                        (RFC 9457) whose `type` is listed under its status; for 422 it lists all faults of the body, each \
-                       with its JSON pointer. Every body may be compressed (`Content-Encoding: gzip` or `zstd`). Every answer carries an `x-request-id`, taken from the request if that has \
+                       with its JSON pointer. Every body but that of a stream may be compressed (`Content-Encoding: gzip` or `zstd`). Every answer carries an `x-request-id`, taken from the request if that has \
                        one.\n\nLists are read in pages: `limit` items, then `after` the `next` of the page before.",
     ),
     tags(

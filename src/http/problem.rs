@@ -2,7 +2,7 @@
 
 use std::error::Error;
 
-use axum::http::header::{ACCEPT_ENCODING, CONTENT_TYPE, RETRY_AFTER};
+use axum::http::header::{ACCEPT_ENCODING, CONTENT_TYPE, RETRY_AFTER, SEC_WEBSOCKET_VERSION, UPGRADE};
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
@@ -35,6 +35,8 @@ pub(super) enum ProblemKind {
     TooLarge,
     UnsupportedMediaType,
     UnsupportedEncoding,
+    CompressedStream,
+    UpgradeRequired,
     Invalid,
     Internal,
     Busy,
@@ -70,6 +72,10 @@ impl ProblemKind {
             Self::UnsupportedEncoding => {
                 ("unsupported-encoding", "The body's compression is not supported", StatusCode::UNSUPPORTED_MEDIA_TYPE)
             }
+            Self::CompressedStream => {
+                ("unsupported-encoding", "A stream is not compressed", StatusCode::UNSUPPORTED_MEDIA_TYPE)
+            }
+            Self::UpgradeRequired => ("upgrade-required", "This is a websocket", StatusCode::UPGRADE_REQUIRED),
             Self::Invalid => ("invalid", "The request has faults", StatusCode::UNPROCESSABLE_ENTITY),
             Self::Internal => ("internal", "Something went wrong here", StatusCode::INTERNAL_SERVER_ERROR),
             Self::Busy => ("busy", "Too many requests are waiting", StatusCode::SERVICE_UNAVAILABLE),
@@ -96,6 +102,8 @@ pub(super) struct Problem {
     detail: String,
     /// Under which the service has logged this request.
     request_id: String,
+    #[serde(skip)]
+    of: ProblemKind,
     /// Every fault of the request, with its place; up to 1000 are listed.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[schema(required = false)]
@@ -111,6 +119,7 @@ impl Problem {
             status: status.as_u16(),
             detail: detail.into(),
             request_id: String::new(),
+            of: kind,
             errors: Vec::new(),
         }
     }
@@ -141,8 +150,17 @@ impl Problem {
         let body = serde_json::to_vec(&self).unwrap_or_default();
         let mut response = (status, body).into_response();
         response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
-        if self.kind == Self::new(ProblemKind::UnsupportedEncoding, "").kind {
-            response.headers_mut().insert(ACCEPT_ENCODING, HeaderValue::from_static(Encoding::ACCEPTED));
+        let accepted = match self.of {
+            ProblemKind::UnsupportedEncoding => Some(Encoding::ACCEPTED),
+            ProblemKind::CompressedStream => Some("identity"),
+            _ => None,
+        };
+        if let Some(accepted) = accepted {
+            response.headers_mut().insert(ACCEPT_ENCODING, HeaderValue::from_static(accepted));
+        }
+        if status == StatusCode::UPGRADE_REQUIRED {
+            response.headers_mut().insert(UPGRADE, HeaderValue::from_static("websocket"));
+            response.headers_mut().insert(SEC_WEBSOCKET_VERSION, HeaderValue::from_static("13"));
         }
         if status == StatusCode::SERVICE_UNAVAILABLE {
             response.headers_mut().insert(RETRY_AFTER, service::RETRY_AFTER.as_secs().into());

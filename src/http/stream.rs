@@ -21,10 +21,12 @@ use utoipa::ToSchema;
 
 use super::Context;
 use super::body::json;
+use super::encoding::Encoding;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{Problem, ProblemKind};
-use crate::store::SessionRow;
+use crate::attribute::ByAttribute;
+use crate::store::{SessionRow, SessionWeights};
 use crate::stream::{self, Closed, Incoming, Outgoing, PROTOCOL};
 
 /// Frames that wait to be answered, and answers that wait to be read: enough to keep both ends busy.
@@ -47,7 +49,7 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
     get, path = "/v1/stream", tag = "streams",
     responses(
         (status = 101, description = "The websocket is open; the server speaks first"),
-        (status = 422, description = "`invalid`: not a websocket request", body = Problem, content_type = "application/problem+json"),
+        (status = 426, description = "`upgrade-required`: not a websocket request", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
@@ -55,14 +57,16 @@ pub(super) async fn websocket(
     State(context): State<Context>,
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
-    let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::Invalid, rejection.body_text()))?;
+    let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::UpgradeRequired, rejection.body_text()))?;
     let place = context.admit_stream()?;
     let limit = context.stream_limits.frame_bytes;
     let upgrade = upgrade
         .protocols([PROTOCOL])
         .max_message_size(limit * MAX_OVERSIZE)
         .max_frame_size(limit * MAX_OVERSIZE)
-        .max_write_buffer_size(limit * MAX_OVERSIZE)
+        // A limit would be one on the size of `done`. There is no need for it: once more waits there than is written at once,
+        // the next frame is not taken from the queue until that has gone.
+        .max_write_buffer_size(usize::MAX)
         .read_buffer_size(READ_BUFFER_BYTES);
     let span = tracing::Span::current();
     Ok(upgrade.on_upgrade(move |socket| {
@@ -143,44 +147,57 @@ async fn read_websocket(mut source: SplitStream<WebSocket>, came: mpsc::Sender<I
 }
 
 async fn write_websocket(mut sink: SplitSink<WebSocket, Message>, mut goes: mpsc::Receiver<Outgoing>) {
+    let closed = write_frames(&mut sink, &mut goes).await;
+    if let Some(closed) = closed {
+        let (code, reason) = closed.code();
+        let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
+        // A client that does not read does not hear this either.
+        let _ = tokio::time::timeout(CLOSE_TIMEOUT, sink.send(close)).await;
+    }
+}
+
+/// Writes what goes to the client, until nothing more will. Gives how to close, if there is still something to be closed.
+async fn write_frames(sink: &mut SplitSink<WebSocket, Message>, goes: &mut mpsc::Receiver<Outgoing>) -> Option<Closed> {
     while let Some(first) = goes.recv().await {
         // What waits together is written together: a write, and a wakeup of the client, cost more than a frame.
         let mut next = Some(first);
         while let Some(outgoing) = next {
-            let fed = match outgoing {
-                Outgoing::Frame(text) => sink.feed(Message::Text(text.into())).await,
-                Outgoing::Close(closed) => {
-                    let (code, reason) = closed.code();
-                    let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
-                    // A client that does not read does not hear this either.
-                    let _ = tokio::time::timeout(CLOSE_TIMEOUT, sink.send(close)).await;
-                    return;
+            match outgoing {
+                Outgoing::Frame(text) => {
+                    if let Err(error) = sink.feed(Message::Text(text.into())).await {
+                        tracing::debug!(error = &error as &dyn std::error::Error, "a frame could not be written");
+                        // Where the client is gone, it does not hear this; a frame must not vanish without a word.
+                        return Some(Closed::Failed);
+                    }
                 }
-            };
-            if fed.is_err() {
-                return;
+                Outgoing::Close(closed) => return Some(closed),
             }
             next = goes.try_recv().ok();
         }
-        if sink.flush().await.is_err() {
-            return;
-        }
+        sink.flush().await.ok()?;
     }
+    None
 }
 
 /// Stream a demonstration as NDJSON, both ways at the same time.
 ///
 /// The same frames as over the websocket, one per line. The answer begins at once and ends when the session is done or
-/// an error ends it; a session that is not done can be resumed.
+/// an error ends it; a session that is not done can be resumed. The frames are not compressed.
 #[utoipa::path(
     post, path = "/v1/stream", tag = "streams",
     request_body(content = String, content_type = "application/x-ndjson", description = "Client frames, one per line"),
     responses(
         (status = 200, description = "Server frames, one per line", body = String, content_type = "application/x-ndjson"),
+        (status = 415, description = "`unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn ndjson(State(context): State<Context>, request: Request) -> Result<Response, Problem> {
+    // A decoder gives what it has when it likes, and each would keep a window of megabytes for as long as its stream runs.
+    if Encoding::declared(request.headers()) != Ok(Encoding::Identity) {
+        let detail = "the frames of a stream are sent as they are, without `Content-Encoding`";
+        return Err(Problem::new(ProblemKind::CompressedStream, detail));
+    }
     let place = context.admit_stream()?;
     let (came, mut incoming) = mpsc::channel(MAX_WAITING);
     let (outgoing, goes) = mpsc::channel(MAX_WAITING);
@@ -268,8 +285,9 @@ struct SessionBody {
     model: String,
     /// Hash of its model's content.
     model_hash: String,
-    /// One weight per attribute, in the model's order.
-    weights: Vec<f64>,
+    /// The weights of the distance; `null` for a session that was opened before they were stored by attribute.
+    #[schema(value_type = Option<BTreeMap<String, f64>>)]
+    weights: Option<ByAttribute<f64>>,
     /// How many observations past the current one a decision may wait for; `null`: all.
     lookahead: Option<u32>,
     /// The learner whose weights are used, if any.
@@ -298,7 +316,10 @@ impl From<SessionRow> for SessionBody {
             id: row.id,
             model: row.model,
             model_hash: row.model_hash,
-            weights: row.weights,
+            weights: match row.weights {
+                SessionWeights::Named(weights) => Some(weights),
+                SessionWeights::InOrder(_) => None,
+            },
             lookahead: row.lookahead,
             learner: row.learner,
             weights_version: row.weights_version,

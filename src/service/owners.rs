@@ -14,51 +14,114 @@ pub(super) struct Owners {
 
 #[derive(Debug)]
 struct Owner {
-    /// Held while a session is driven.
+    /// Held while a session is driven; shared with all who drive it or wait for that.
     driving: Arc<tokio::sync::Mutex<()>>,
     /// Cancelled when the newest owner is to give way.
     taken_over: CancellationToken,
-    /// How many owners there were, to tell the newest.
-    generation: u64,
 }
 
 /// The right to drive a session, until it is dropped.
 #[derive(Debug)]
 pub(super) struct Ownership {
     id: String,
-    generation: u64,
     /// Cancelled when another connection takes the session over.
     pub(super) taken_over: CancellationToken,
     owners: Arc<Mutex<HashMap<String, Owner>>>,
-    _driving: OwnedMutexGuard<()>,
+    /// `None` while it is waited for.
+    driving: Option<OwnedMutexGuard<()>>,
 }
+
+/// Another connection has taken the session over meanwhile.
+#[derive(Debug)]
+pub(super) struct TakenOver;
 
 impl Owners {
     /// Waits until whoever drives the session has given way.
-    pub(super) async fn take(&self, id: &str) -> Ownership {
+    ///
+    /// # Errors
+    ///
+    /// [`TakenOver`] if a newer owner came while this one waited.
+    pub(super) async fn take(&self, id: &str) -> Result<Ownership, TakenOver> {
         let taken_over = CancellationToken::new();
-        let (driving, generation) = {
+        let driving = {
             let mut owners = self.owners.lock().unwrap_or_else(PoisonError::into_inner);
-            let owner = owners.entry(id.to_owned()).or_insert_with(|| Owner {
-                driving: Arc::default(),
-                taken_over: CancellationToken::new(),
-                generation: 0,
-            });
+            let owner = owners
+                .entry(id.to_owned())
+                .or_insert_with(|| Owner { driving: Arc::default(), taken_over: CancellationToken::new() });
             owner.taken_over.cancel();
             owner.taken_over = taken_over.clone();
-            owner.generation += 1;
-            (Arc::clone(&owner.driving), owner.generation)
+            Arc::clone(&owner.driving)
         };
-        let driving = driving.lock_owned().await;
-        Ownership { id: id.to_owned(), generation, taken_over, owners: Arc::clone(&self.owners), _driving: driving }
+        // Whoever stops waiting here leaves nothing behind either.
+        let owners = Arc::clone(&self.owners);
+        let mut ownership = Ownership { id: id.to_owned(), taken_over, owners, driving: None };
+        tokio::select! {
+            biased;
+            () = ownership.taken_over.cancelled() => Err(TakenOver),
+            driving = driving.lock_owned() => {
+                ownership.driving = Some(driving);
+                Ok(ownership)
+            }
+        }
     }
 }
 
 impl Drop for Ownership {
     fn drop(&mut self) {
         let mut owners = self.owners.lock().unwrap_or_else(PoisonError::into_inner);
-        if owners.get(&self.id).is_some_and(|owner| owner.generation == self.generation) {
+        self.driving = None;
+        // If only the map shares it, nobody else drives the session or waits for that; newcomers wait for this lock.
+        if owners.get(&self.id).is_some_and(|owner| Arc::strong_count(&owner.driving) == 1) {
             owners.remove(&self.id);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use futures_util::poll;
+
+    use super::*;
+
+    fn n_kept(owners: &Owners) -> usize {
+        owners.owners.lock().unwrap().len()
+    }
+
+    #[tokio::test]
+    async fn who_stops_waiting_leaves_nothing_behind_and_lets_nobody_in() {
+        let owners = Owners::default();
+        let first = owners.take("a").await.unwrap();
+        let mut second = Box::pin(owners.take("a"));
+        assert!(poll!(&mut second).is_pending());
+        assert!(first.taken_over.is_cancelled());
+        drop(second);
+        let mut third = Box::pin(owners.take("a"));
+        assert!(poll!(&mut third).is_pending(), "the first still drives it");
+        drop(first);
+        let third = third.await.unwrap();
+        assert!(!third.taken_over.is_cancelled());
+        assert_eq!(n_kept(&owners), 1);
+        drop(third);
+        assert_eq!(n_kept(&owners), 0);
+        // Also where the one who drives it is gone first.
+        let first = owners.take("a").await.unwrap();
+        let mut second = Box::pin(owners.take("a"));
+        assert!(poll!(&mut second).is_pending());
+        drop(first);
+        drop(second);
+        assert_eq!(n_kept(&owners), 0);
+    }
+
+    #[tokio::test]
+    async fn of_those_who_wait_the_newest_is_next() {
+        let owners = Owners::default();
+        let first = owners.take("a").await.unwrap();
+        let mut second = Box::pin(owners.take("a"));
+        let mut third = Box::pin(owners.take("a"));
+        assert!(poll!(&mut second).is_pending() && poll!(&mut third).is_pending());
+        drop(first);
+        assert!(second.await.is_err());
+        assert!(third.await.is_ok());
+        assert_eq!(n_kept(&owners), 0);
     }
 }

@@ -12,19 +12,20 @@ use serde_json::Value;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::learners::Ready;
-use super::owners::Ownership;
-use super::policies::{PolicyText, as_micros, report, write_policy};
+use super::opening::{Names, Opening};
+use super::owners::{Ownership, TakenOver};
+use super::policies::{Named, PolicyText, as_micros, report, write_policy};
 use super::{Etude, PoolError, ServiceError};
-use crate::attribute::{ByAttribute, Weights};
-use crate::document::{self, Faults, Object, Path, Place};
+use crate::attribute::{ByAttribute, Schema, Weights};
+use crate::document::{self, Faults, Place};
 use crate::interrupt::{Interrupt, Uninterrupted};
 use crate::mapping::{
-    CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, read_lookahead,
+    CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, TooManySteps,
 };
 use crate::model::Origin;
 use crate::store::{
-    NewObservations, NewRefinement, NewSession, Page, SessionEnd, SessionRow, SessionStatus, StoreError,
+    AcceptedReward, NewObservations, NewRefinement, NewSession, Page, SessionEnd, SessionRow, SessionStatus,
+    SessionWeights, StoreError, TrialRow,
 };
 
 /// Why a session could not do as told.
@@ -45,35 +46,53 @@ pub enum SessionError {
     /// The demonstration has ended already.
     #[error("the demonstration has ended")]
     Ended,
+    /// The demonstration has ended, but its policy cannot be stored. What was observed stays.
+    #[error("the demonstration cannot be ended: {0}")]
+    TooManySteps(#[from] TooManySteps),
     /// Something is wrong with the frame.
     #[error("{0}")]
     Faults(#[from] Faults),
     /// The session has expired, or was ended or taken over by another connection.
     #[error("the session is not open any more")]
     NotOpen,
+    /// Another connection has taken the session over.
+    #[error("the session was resumed on another connection")]
+    TakenOver,
     /// Whatever else can go wrong.
     #[error(transparent)]
-    Service(#[from] ServiceError),
+    Service(ServiceError),
+}
+
+impl From<ServiceError> for SessionError {
+    fn from(error: ServiceError) -> Self {
+        match error {
+            ServiceError::Faults(faults) => Self::Faults(faults),
+            error => Self::Service(error),
+        }
+    }
+}
+
+impl From<TakenOver> for SessionError {
+    fn from(TakenOver: TakenOver) -> Self {
+        Self::TakenOver
+    }
 }
 
 impl From<StoreError> for SessionError {
     fn from(error: StoreError) -> Self {
-        Self::Service(error.into())
+        ServiceError::from(error).into()
     }
 }
 
 impl From<PoolError> for SessionError {
     fn from(error: PoolError) -> Self {
-        Self::Service(error.into())
+        ServiceError::from(error).into()
     }
 }
 
-/// Work up to this many states times layers is done where it arrives, which takes less than a millisecond; more in the
-/// pool.
+/// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
+/// in the pool.
 const MAX_INLINE_WORK: usize = 1 << 14;
-
-/// Lookahead of a session that names none.
-const DEFAULT_LOOKAHEAD: u32 = 8;
 
 /// An open session, and the right to drive it.
 #[derive(Debug)]
@@ -130,25 +149,41 @@ pub struct Ended {
     pub policy: Policy,
 }
 
+/// What has become of the reward of a session.
+#[derive(Clone, Debug, PartialEq)]
+pub enum RewardState {
+    /// It is still to come.
+    Awaited,
+    /// It is on disk.
+    Accepted {
+        /// The trial that earned it.
+        trial: String,
+        /// The reward.
+        reward: AcceptedReward,
+    },
+    /// None will come: the session does not explore, its trial has failed, or its learner was deleted.
+    Never,
+}
+
 impl Etude {
-    /// Opens a session as `request` says: an object with the fields [`Session::OPEN_FIELDS`].
+    /// Opens a session as `request` says: an object with the fields [`Session::OPEN_FIELDS`]. Where as much waits to be searched
+    /// as may, it is refused; once it is open, it waits for its turn.
     ///
     /// # Errors
     ///
-    /// If the request has faults or names what is unknown.
+    /// If the request has faults or names what is unknown, or the service cannot do it now.
     pub async fn open_session(&self, request: &Value, now: Timestamp) -> Result<Session, SessionError> {
+        let place = self.pool.admit()?;
         let mut faults = Faults::default();
-        let root = Place::root(request);
-        let object = root.object(&Session::OPEN_FIELDS, &mut faults);
-        let names = object.as_ref().and_then(|object| read_names(object, &mut faults));
-        let Names { model, learner, explores } = faults.clone().check(names)?;
-        let learner = match learner {
-            Some(learner) => Some(self.ready(&learner, Some("/learner")).await?),
-            None => None,
-        };
-        let (model_hash, mapper) = self.mapper(&model, "/model", None).await?;
+        let object = Place::root(request).object(&Session::OPEN_FIELDS, &mut faults);
+        let names = object.as_ref().and_then(|object| Names::read(object, &mut faults));
+        // With the help of the model, more faults may be found; so those found without it wait.
+        let Some(Names { envelope, explores, lookahead }) = names else { return Err(faults.into()) };
+        let Named { learner, model_hash, mapper } = self.find(&envelope, faults.clone(), &place).await?;
+        drop(place);
         let opening = object.as_ref().and_then(|object| Opening::read(&mapper, learner.as_ref(), object, &mut faults));
-        let Opening { mut weights, lookahead, start } = faults.check(opening)?;
+        let Opening { mut weights, start } = faults.check(opening)?;
+        let model = envelope.model;
 
         let mut trial = None;
         if let (true, Some(ready)) = (explores, &learner) {
@@ -157,7 +192,7 @@ impl Etude {
             trial = Some(draw.trial);
         }
         let id = Uuid::now_v7().to_string();
-        let ownership = self.owners.take(&id).await;
+        let ownership = self.owners.take(&id).await?;
         let source = Source {
             learner: learner.as_ref().map(|ready| ready.name.clone()),
             weights_version: learner.as_ref().map(|ready| ready.weights.version),
@@ -169,7 +204,7 @@ impl Etude {
                 id: id.clone(),
                 model: model.clone(),
                 model_hash: model_hash.clone(),
-                weights: weights.as_slice().to_vec(),
+                weights: mapper.model().schema().by_attribute(weights.as_slice().iter().copied()),
                 lookahead: lookahead.map(NonZeroU32::get),
                 start,
                 learner: source.learner.clone(),
@@ -205,11 +240,22 @@ impl Etude {
     ///
     /// # Errors
     ///
-    /// If there is none, it has expired, or its model is gone.
-    pub async fn resume_session(&self, id: &str) -> Result<Resumed, SessionError> {
+    /// If there is none, it has expired, its model is gone, or it is taken over meanwhile.
+    pub async fn resume_session(&self, id: &str, now: Timestamp) -> Result<Resumed, SessionError> {
         // Looked up first, so that nobody is bothered for what does not exist.
         self.session(id).await?;
-        let ownership = self.owners.take(id).await;
+        let ownership = self.owners.take(id).await?;
+        let taken_over = ownership.taken_over.clone();
+        tokio::select! {
+            biased;
+            () = taken_over.cancelled() => Err(SessionError::TakenOver),
+            resumed = self.resume_owned(id, ownership, now) => resumed,
+        }
+    }
+
+    async fn resume_owned(&self, id: &str, ownership: Ownership, now: Timestamp) -> Result<Resumed, SessionError> {
+        // Behind whatever is still to be written for the owner before. It may be done already.
+        let _is_open = self.store.touch_session(id, now).await?;
         let row = self.session(id).await?;
         if row.status == SessionStatus::Expired {
             return Err(SessionError::NotOpen);
@@ -220,7 +266,7 @@ impl Etude {
             let name = format!("{} with hash {}", row.model, row.model_hash);
             return Err(ServiceError::Unknown { kind: "model", name, pointer: None }.into());
         }
-        let weights = Weights::of(row.weights);
+        let weights = read_weights(row.weights, mapper.model().schema())?;
         let lookahead = row.lookahead.and_then(NonZeroU32::new);
         let mut session = Session {
             id: row.id,
@@ -242,6 +288,8 @@ impl Etude {
         let policy = match row.policy_id {
             None => None,
             Some(policy_id) => {
+                // Whoever ended it may have been gone before there was something to refine.
+                self.refiner.wake();
                 let rest = session.online.take().and_then(OnlineMapping::end);
                 steps.extend(rest.map(|(rest, _)| rest).unwrap_or_default());
                 session.n_steps = steps.len();
@@ -337,9 +385,24 @@ impl Session {
         self.n_steps
     }
 
-    /// Completes when another connection takes the session over.
-    pub async fn taken_over(&self) {
-        self.ownership.taken_over.cancelled().await;
+    /// Cancelled when another connection takes the session over.
+    #[must_use]
+    pub fn taken_over(&self) -> &CancellationToken {
+        &self.ownership.taken_over
+    }
+
+    /// What has become of its reward.
+    ///
+    /// # Errors
+    ///
+    /// If the store failed.
+    pub async fn reward(&self, etude: &Etude) -> Result<RewardState, SessionError> {
+        let Some(trial) = &self.source.trial_id else { return Ok(RewardState::Never) };
+        Ok(match etude.store.trial(trial).await? {
+            Some(TrialRow { reward: Some(reward), id, .. }) => RewardState::Accepted { trial: id, reward },
+            Some(TrialRow { failed: None, .. }) => RewardState::Awaited,
+            Some(_) | None => RewardState::Never,
+        })
     }
 
     /// Takes the states from `seq` on, of which those received before are ignored: they are durable when this returns. What
@@ -367,6 +430,9 @@ impl Session {
         let n_known = (self.n_received - seq) as usize;
         let new = items.get(n_known..).unwrap_or_default();
         if new.is_empty() {
+            if !etude.store.touch_session(&self.id, now).await? {
+                return Err(SessionError::NotOpen);
+            }
             return Ok(Received::Mapped(Vec::new()));
         }
         if self.n_received as usize + new.len() > Demonstration::MAX_OBSERVATIONS {
@@ -410,8 +476,8 @@ impl Session {
 
     /// Whether so many observations are mapped where they arrive.
     fn is_inline(&self, n_observations: usize) -> bool {
-        let n_layers = n_observations * self.lookahead.map_or(1, |lookahead| lookahead.get() as usize);
-        n_layers.saturating_mul(self.mapper.model().graph().n_states()) <= MAX_INLINE_WORK
+        let graph = self.mapper.model().graph();
+        is_inline(graph.n_states() + graph.n_transitions(), self.lookahead, n_observations)
     }
 
     /// Maps observations that were received, and gives the steps that they commit.
@@ -447,7 +513,7 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// If observations are missing, or the service ends.
+    /// If observations are missing, or the service ends. After [`SessionError::TooManySteps`] the session is to be dropped.
     pub async fn end(&mut self, etude: &Etude, seq: u32, now: Timestamp) -> Result<Ended, SessionError> {
         if self.has_ended() {
             return Err(SessionError::Ended);
@@ -489,6 +555,12 @@ impl Session {
     }
 }
 
+/// Whether so many observations are mapped where they arrive, in a model of `size` states and transitions.
+fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) -> bool {
+    let n_layers = n_observations.saturating_mul(lookahead.map_or(1, |lookahead| lookahead.get() as usize));
+    n_layers.saturating_mul(size) <= MAX_INLINE_WORK
+}
+
 /// An observation as it was read. Shape `[n_attributes]`; `None` where an attribute was not observed.
 pub type Observation = Vec<Option<crate::attribute::Value>>;
 
@@ -505,6 +577,7 @@ fn conclude(
 ) -> Result<Concluded, SessionError> {
     let started = Instant::now();
     let (steps, mapping) = online.end().ok_or(SessionError::Empty)?;
+    Policy::check_steps(mapper.model(), &mapping)?;
     let demonstration = Demonstration::of(read_stored(mapper, texts)?).ok_or(SessionError::Empty)?;
     let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
@@ -530,6 +603,23 @@ fn conclude(
     Ok((steps, policy, row, refinement))
 }
 
+/// Reads weights that were stored.
+fn read_weights(weights: SessionWeights, schema: &Schema) -> Result<Weights, SessionError> {
+    let missing = |name: &str| StoreError::Corrupt {
+        table: "sessions",
+        column: "weights",
+        source: format!("the weight of {name:?} is missing").into(),
+    };
+    let weights: Result<Vec<f64>, _> = match weights {
+        SessionWeights::InOrder(weights) => Ok(weights),
+        SessionWeights::Named(weights) => {
+            let names = schema.attributes().iter().map(|attribute| &attribute.name);
+            names.map(|name| weights.get(name).copied().ok_or_else(|| missing(name))).collect()
+        }
+    };
+    Ok(Weights::of(weights?))
+}
+
 /// Reads observations that were stored, which were read without faults before.
 fn read_stored(mapper: &Mapper, texts: &[String]) -> Result<Vec<Observation>, SessionError> {
     let corrupt = |source: Box<dyn std::error::Error + Send + Sync>| StoreError::Corrupt {
@@ -550,77 +640,34 @@ fn read_stored(mapper: &Mapper, texts: &[String]) -> Result<Vec<Observation>, Se
     Ok(observations)
 }
 
-/// The names in a request to open a session.
-struct Names {
-    model: String,
-    learner: Option<String>,
-    explores: bool,
-}
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
 
-fn read_names(object: &Object<'_, '_>, faults: &mut Faults) -> Option<Names> {
-    let model = object.required("model", faults).and_then(|place| place.string(faults));
-    let learner = object.optional("learner").map(|place| place.string(faults));
-    let explores = match object.optional("explore") {
-        Some(place) => {
-            let explores = place.boolean(faults);
-            if explores == Some(true) && learner.is_none() {
-                faults.note(&place, "exploring needs a learner");
-            }
-            explores
-        }
-        None => Some(false),
-    };
-    if let (Some(true), Some(place)) = (explores, object.optional("weights"))
-        && place.value.as_object().is_some_and(|weights| !weights.is_empty())
-    {
-        faults.note(&place, "an exploring session draws its weights");
-    }
-    let learner = learner.map_or(Some(None), |learner| learner.map(Some));
-    Some(Names { model: model?.to_owned(), learner: learner?.map(str::to_owned), explores: explores? })
-}
+    use super::*;
+    use crate::model::{Definition, Limits, Model};
 
-/// What a session is opened with.
-struct Opening {
-    weights: Weights,
-    lookahead: Option<NonZeroU32>,
-    start: Option<u32>,
-}
-
-impl Opening {
-    fn read(mapper: &Mapper, learner: Option<&Ready>, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
-        let model = mapper.model();
-        if model.is_lazy() {
-            let detail = "this world is searched lazily, which needs the whole demonstration: ask for a policy instead";
-            faults.note_at(&Path::Member(&Path::Root, "model"), detail);
-        }
-        let base = match learner {
-            None => Some(model.schema().weights()),
-            Some(Ready { learner, weights, .. }) => {
-                let learned = learner.weights_for(model.schema(), &weights.distribution.mean);
-                learned
-                    .map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string()))
-                    .ok()
-            }
+    #[test]
+    fn what_is_mapped_where_it_arrives_is_measured_by_transitions_too() {
+        let size = |definition: &Value| {
+            let definition = Definition::read(definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+            let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+            model.graph().n_states() + model.graph().n_transitions()
         };
-        let named = match object.optional("weights") {
-            Some(place) => model.schema().read_named_weights(&place, faults),
-            None => Some(Vec::new()),
-        };
-        let weights = base.zip(named).map(|(mut weights, named)| {
-            for (position, weight) in named {
-                weights.set(position, weight);
-            }
-            weights
+        let lookahead = NonZeroU32::new(8);
+        let cave = size(&json!({"dynamics": {"kind": "wumpus", "width": 7, "height": 4, "gold": [[5, 0]]}}));
+        assert!(is_inline(cave, lookahead, 1) && !is_inline(cave, lookahead, 1000), "{cave}");
+        // Few states, between any two of which an action leads.
+        let n_states = 100;
+        let action = |n: usize| json!({"name": format!("to {n}")});
+        let transitions = (0..n_states).flat_map(|from| (0..n_states).map(move |to| json!([from, to, to])));
+        let complete = json!({
+            "attributes": [{"name": "x", "kind": "number"}], "actions": (0..n_states).map(action).collect::<Vec<_>>(),
+            "dynamics": {
+                "kind": "table", "states": (0..n_states).map(|x| json!([x])).collect::<Vec<_>>(),
+                "transitions": transitions.collect::<Vec<_>>(),
+            },
         });
-        let lookahead = match (object.optional("lookahead"), object.members.contains_key("lookahead")) {
-            (Some(place), _) => read_lookahead(&place, faults).map(Some),
-            (None, true) => Some(None),
-            (None, false) => Some(NonZeroU32::new(DEFAULT_LOOKAHEAD)),
-        };
-        let start = match object.optional("start") {
-            Some(place) => model.read_start(&place, faults).map(Origin::state),
-            None => Some(None),
-        };
-        Some(Self { weights: weights?, lookahead: lookahead?, start: start? })
+        assert!(!is_inline(size(&complete), lookahead, 1));
     }
 }

@@ -233,7 +233,7 @@ mod tests {
             id: id.to_owned(),
             model: "m".to_owned(),
             model_hash: "0".to_owned(),
-            weights: vec![1.0],
+            weights: [("x".into(), 1.0)].into_iter().collect(),
             lookahead: Some(8),
             start: None,
             learner: None,

@@ -30,7 +30,7 @@ pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
 pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
 pub use policies::{NewPolicy, PolicySummaryRow};
 pub use refinements::{NewRefinement, RefinementEnd};
-pub use sessions::{NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus};
+pub use sessions::{NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus, SessionWeights};
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection};

@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 
 use jiff::Timestamp;
+use serde::Deserialize;
 use serde_json::Value;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
@@ -12,6 +13,7 @@ use super::refinements::NewRefinement;
 use super::trials::{self, NewTrial};
 use super::writer::{Write, Written};
 use super::{Page, Store, StoreError, corrupt, policies, refinements, timestamp};
+use crate::attribute::ByAttribute;
 
 /// How far a session has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,8 +53,8 @@ pub struct SessionRow {
     pub model: String,
     /// Hash of its model's content.
     pub model_hash: String,
-    /// One weight per attribute, in the model's order.
-    pub weights: Vec<f64>,
+    /// The weights of its distance.
+    pub weights: SessionWeights,
     /// How many observations past the current one a decision may wait for; `None` for all.
     pub lookahead: Option<u32>,
     /// Index of the start state, if the request named one.
@@ -75,6 +77,16 @@ pub struct SessionRow {
     pub active_at: Timestamp,
 }
 
+/// The weights of a session's distance, as they are stored.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(untagged)]
+pub enum SessionWeights {
+    /// By attribute.
+    Named(ByAttribute<f64>),
+    /// Of a session that was opened before attributes were stored: one for each, in the model's order.
+    InOrder(Vec<f64>),
+}
+
 /// A session to be opened.
 #[derive(Clone, Debug)]
 pub struct NewSession {
@@ -84,8 +96,8 @@ pub struct NewSession {
     pub model: String,
     /// Hash of its model's content.
     pub model_hash: String,
-    /// One weight per attribute, in the model's order.
-    pub weights: Vec<f64>,
+    /// The weights of its distance.
+    pub weights: ByAttribute<f64>,
     /// How many observations past the current one a decision may wait for; `None` for all.
     pub lookahead: Option<u32>,
     /// Index of the start state, if the request named one.
@@ -143,6 +155,15 @@ impl Store {
     /// If the database failed.
     pub async fn add_observations(&self, observations: NewObservations) -> Result<bool, StoreError> {
         self.done(Write::AddObservations(observations)).await
+    }
+
+    /// Notes that something came for a session at `at`, once all that was written before is done. Says whether it is open.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn touch_session(&self, id: &str, at: Timestamp) -> Result<bool, StoreError> {
+        self.done(Write::TouchSession { id: id.to_owned(), at }).await
     }
 
     /// Ends a session: stores its policy and links them. Says whether it was open.
@@ -290,7 +311,8 @@ pub(super) async fn add(
     let rows = Value::Array(rows.collect()).to_string();
     // Only what comes next, and only once, whatever is retried or raced.
     let updated = sqlx::query_scalar::<_, String>(
-        "UPDATE sessions SET n_observations = n_observations + (new.value ->> 2), active_at_ms = new.value ->> 4
+        "UPDATE sessions
+         SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 4)
          FROM json_each($1) AS new
          WHERE sessions.id = new.value ->> 0 AND status = 'open' AND n_observations = new.value ->> 1
          RETURNING sessions.id",
@@ -318,6 +340,14 @@ pub(super) async fn add(
     .execute(connection)
     .await?;
     Ok(is_updated)
+}
+
+/// Observations that came before but are not settled yet do not undo this.
+pub(super) async fn touch(connection: &mut SqliteConnection, id: &str, at: Timestamp) -> Result<bool, StoreError> {
+    let query =
+        sqlx::query("UPDATE sessions SET active_at_ms = MAX(active_at_ms, $2) WHERE id = $1 AND status = 'open'");
+    let updated = query.bind(id).bind(at.as_millisecond()).execute(connection).await?;
+    Ok(updated.rows_affected() > 0)
 }
 
 pub(super) async fn end(connection: &mut SqliteConnection, end: &SessionEnd) -> Result<bool, StoreError> {

@@ -46,6 +46,11 @@ pub(super) enum Write {
     EndRefinement(Box<RefinementEnd>),
     OpenSession(Box<NewSession>),
     AddObservations(NewObservations),
+    /// Something came for this session at this time.
+    TouchSession {
+        id: String,
+        at: Timestamp,
+    },
     EndSession(Box<SessionEnd>),
     /// Brings observations that have arrived to their table.
     Settle,
@@ -361,6 +366,7 @@ async fn apply(
             }
             Written::Done(was_opened)
         }
+        Write::TouchSession { id, at } => Written::Done(sessions::touch(connection, id, *at).await?),
         Write::EndSession(end) => {
             arrivals.ended(&end.session_id);
             Written::Done(sessions::end(connection, end).await?)

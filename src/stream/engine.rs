@@ -5,13 +5,14 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use serde_json::Value;
-use tokio::sync::mpsc;
+use tokio::sync::{SetOnce, mpsc};
 use tokio_util::sync::CancellationToken;
 
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem};
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
-use crate::service::{Ended, Etude, PoolError, Received, Resumed, ServiceError, Session, SessionError};
+use crate::service::{Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError};
+use crate::store::{AcceptedReward, StoreError};
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
@@ -78,7 +79,7 @@ pub enum Closed {
     NotText,
     /// Not allowed now.
     NotAllowed,
-    /// A frame over the limit.
+    /// A frame over the limit, or a policy.
     TooLarge,
     /// The server failed; the session is to be resumed.
     Failed,
@@ -99,7 +100,7 @@ impl Closed {
             Self::GoingAway => (1001, "the server shuts down; resume"),
             Self::NotText => (1007, "not JSON"),
             Self::NotAllowed => (1008, "not allowed"),
-            Self::TooLarge => (1009, "frame too large"),
+            Self::TooLarge => (1009, "too large"),
             Self::Failed => (1011, "the server failed; resume"),
             Self::Overloaded => (1013, "overloaded or too slow a reader; resume"),
             Self::BadFrame => (4400, "bad frame"),
@@ -108,8 +109,11 @@ impl Closed {
     }
 }
 
-/// Speaks the protocol until the connection is over, and says why it is. Dropping the future at any time leaves a session
-/// that can be resumed.
+/// How long the last words may wait for a client that does not read.
+const GOODBYE_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// Speaks the protocol until the connection is over, and says why it is: at once if the session is taken over or the server
+/// shuts down, whatever is under way. Dropping the future at any time leaves a session that can be resumed.
 pub async fn run(
     etude: &Etude,
     limits: Limits,
@@ -117,22 +121,35 @@ pub async fn run(
     outgoing: &mpsc::Sender<Outgoing>,
     stopping: &CancellationToken,
 ) -> Closed {
-    let mut connection = Connection { etude, limits, outgoing, session: None };
-    let ended = connection.speak(incoming, stopping).await;
-    let closed = match ended {
-        Ok(closed) => closed,
-        Err(Over { closed, problem }) => {
-            if let Some(problem) = problem {
-                // Where this does not get through, the close code says it too.
-                let _ = connection.send(&ServerFrame::Error { problem }).await;
-            }
-            closed
+    let taken_over = SetOnce::new();
+    let mut connection =
+        Connection { etude, limits, outgoing, session: None, taken_over: &taken_over, is_reward_told: false };
+    let ended = tokio::select! {
+        biased;
+        () = stopping.cancelled() => {
+            let problem = StreamProblem::new("stopping", "the server shuts down; resume the session later");
+            Err(Over::because(Closed::GoingAway, problem))
         }
+        () = async { taken_over.wait().await.cancelled().await } => Err(ends(&SessionError::TakenOver)),
+        ended = connection.speak(incoming) => ended,
+    };
+    // Given back now: whoever takes it over does not wait for the goodbye.
+    let session = connection.session.take().map(|session| session.id().to_owned());
+    let (closed, problem) = match ended {
+        Ok(closed) => (closed, None),
+        Err(Over { closed, problem }) => (closed, problem),
     };
     let (code, _) = closed.code();
-    tracing::info!(code, session = connection.session.as_ref().map(Session::id), "stream closed");
-    // A client that is gone or stuck does not hear this.
-    let _ = outgoing.send_timeout(Outgoing::Close(closed), limits.slow_after).await;
+    tracing::info!(code, session, "stream closed");
+    let goodbye = async {
+        if let Some(problem) = problem {
+            // Where this does not get through, the close code says it too.
+            let _ = connection.send(&ServerFrame::Error { problem }).await;
+        }
+        // A client that is gone or stuck does not hear this.
+        let _ = outgoing.send(Outgoing::Close(closed)).await;
+    };
+    let _ = tokio::time::timeout(limits.slow_after.min(GOODBYE_TIMEOUT), goodbye).await;
     closed
 }
 
@@ -153,14 +170,14 @@ struct Connection<'c> {
     limits: Limits,
     outgoing: &'c mpsc::Sender<Outgoing>,
     session: Option<Session>,
+    /// Tells when another connection takes the session over, once there is one.
+    taken_over: &'c SetOnce<CancellationToken>,
+    /// Whether the client was told here that its reward is accepted.
+    is_reward_told: bool,
 }
 
 impl Connection<'_> {
-    async fn speak(
-        &mut self,
-        incoming: &mut mpsc::Receiver<Incoming>,
-        stopping: &CancellationToken,
-    ) -> Result<Closed, Over> {
+    async fn speak(&mut self, incoming: &mut mpsc::Receiver<Incoming>) -> Result<Closed, Over> {
         self.send(&ServerFrame::Hello {
             protocol: PROTOCOL,
             server: env!("CARGO_PKG_VERSION"),
@@ -168,19 +185,7 @@ impl Connection<'_> {
         })
         .await?;
         loop {
-            let came = tokio::select! {
-                biased;
-                () = stopping.cancelled() => {
-                    let problem = StreamProblem::new("stopping", "the server shuts down; resume the session later");
-                    return Err(Over::because(Closed::GoingAway, problem));
-                }
-                () = taken_over(self.session.as_ref()) => {
-                    let problem = StreamProblem::new("taken-over", "the session was resumed on another connection");
-                    return Err(Over::because(Closed::NotAllowed, problem));
-                }
-                came = tokio::time::timeout(self.limits.idle_after, incoming.recv()) => came,
-            };
-            let Ok(came) = came else {
+            let Ok(came) = tokio::time::timeout(self.limits.idle_after, incoming.recv()).await else {
                 return Err(Over::because(Closed::NotAllowed, StreamProblem::new("idle", "nothing came for too long")));
             };
             let Some(came) = came else { return Ok(Closed::ByClient) };
@@ -205,12 +210,12 @@ impl Connection<'_> {
             }
             (ClientFrame::Resume { session, step }, None) => {
                 let Resumed { session, steps, policy } =
-                    self.etude.resume_session(&session).await.map_err(|error| ends(&error))?;
+                    self.etude.resume_session(&session, now).await.map_err(|error| ends(&error))?;
                 self.opened(session).await?;
                 self.send_steps(steps.get(step as usize..).unwrap_or_default()).await?;
                 let Some(policy) = policy else { return Ok(None) };
                 self.send(&ServerFrame::from(&policy)).await?;
-                Ok(self.done())
+                self.done().await
             }
             (ClientFrame::Observe { .. } | ClientFrame::End { .. }, None) => {
                 Err(not_allowed("open or resume a session first"))
@@ -221,6 +226,7 @@ impl Connection<'_> {
                     Ok(trial) => {
                         let order = trial.row.reward.as_ref().map(|reward| reward.reward_order);
                         self.send(&ServerFrame::Rewarded { trial: &trial.row.id, reward, reward_order: order }).await?;
+                        self.is_reward_told = true;
                         Ok(has_ended.then_some(Closed::Done))
                     }
                     Err(error) => self.go_on_or_end(&error.into()).await,
@@ -249,22 +255,36 @@ impl Connection<'_> {
                 Ok(Ended { steps, policy }) => {
                     self.send_steps(&steps).await?;
                     self.send(&ServerFrame::from(&policy)).await?;
-                    Ok(self.done())
+                    self.done().await
                 }
                 Err(error) => self.go_on_or_end(&error).await,
             },
         }
     }
 
-    /// How the connection ends when the policy is done: an exploring session waits for its reward.
-    fn done(&self) -> Option<Closed> {
-        let explores = self.session.as_ref().is_some_and(|session| session.trial_id().is_some());
-        (!explores).then_some(Closed::Done)
+    /// How the connection ends once the policy is done, unless a reward is still to come.
+    async fn done(&mut self) -> Result<Option<Closed>, Over> {
+        let Some(session) = &self.session else { return Ok(Some(Closed::Done)) };
+        match session.reward(self.etude).await.map_err(|error| ends(&error))? {
+            RewardState::Awaited => Ok(None),
+            RewardState::Never => Ok(Some(Closed::Done)),
+            RewardState::Accepted { trial, reward } => {
+                // Whoever was cut off may not have heard it.
+                if !self.is_reward_told {
+                    let AcceptedReward { reward, reward_order } = reward;
+                    let frame = ServerFrame::Rewarded { trial: &trial, reward, reward_order: Some(reward_order) };
+                    self.send(&frame).await?;
+                }
+                Ok(Some(Closed::Done))
+            }
+        }
     }
 
     async fn opened(&mut self, session: Session) -> Result<(), Over> {
         tracing::info!(session = session.id(), received = session.n_received(), "stream opened");
         let session = self.session.insert(session);
+        // A connection has one session.
+        let _ = self.taken_over.set(session.taken_over().clone());
         let frame = ServerFrame::Opened {
             session: session.id(),
             trial: session.trial_id(),
@@ -301,7 +321,10 @@ impl Connection<'_> {
                 problem.detail = format!("none of the frame's states was taken: {}", problem.detail);
                 problem
             }
-            SessionError::NotOpen | SessionError::Service(_) => return Err(ends(error)),
+            SessionError::NotOpen
+            | SessionError::TakenOver
+            | SessionError::TooManySteps(_)
+            | SessionError::Service(_) => return Err(ends(error)),
         };
         self.send(&ServerFrame::Error { problem }).await?;
         Ok(None)
@@ -320,13 +343,6 @@ async fn send(outgoing: &mpsc::Sender<Outgoing>, limits: Limits, frame: &ServerF
         mpsc::error::SendTimeoutError::Timeout(_) => Over { closed: Closed::Overloaded, problem: None },
         mpsc::error::SendTimeoutError::Closed(_) => Over { closed: Closed::ByClient, problem: None },
     })
-}
-
-async fn taken_over(session: Option<&Session>) {
-    match session {
-        Some(session) => session.taken_over().await,
-        None => std::future::pending().await,
-    }
 }
 
 fn not_allowed(detail: &str) -> Over {
@@ -363,16 +379,20 @@ fn ends(error: &SessionError) -> Over {
     match error {
         SessionError::Faults(faults) => Over::because(Closed::BadFrame, StreamProblem::of("invalid", faults)),
         SessionError::NotOpen => Over::because(Closed::Unknown, StreamProblem::new("expired", detail)),
+        SessionError::TakenOver => Over::because(Closed::NotAllowed, StreamProblem::new("taken-over", detail)),
+        SessionError::TooManySteps(_) => {
+            Over::because(Closed::TooLarge, StreamProblem::new("policy-too-large", detail))
+        }
         SessionError::Gap { .. } | SessionError::TooMany | SessionError::Empty | SessionError::Ended => {
             not_allowed(&detail)
         }
         SessionError::Service(ServiceError::Unknown { kind, .. }) => {
             Over::because(Closed::Unknown, StreamProblem::new(&format!("unknown-{kind}"), detail))
         }
-        SessionError::Service(ServiceError::Pool(PoolError::Stopped)) => {
+        SessionError::Service(ServiceError::Pool(PoolError::Stopped) | ServiceError::Store(StoreError::Closed)) => {
             Over::because(Closed::GoingAway, StreamProblem::new("stopping", detail))
         }
-        SessionError::Service(ServiceError::Pool(PoolError::Busy)) => {
+        SessionError::Service(ServiceError::Pool(PoolError::Busy) | ServiceError::Store(StoreError::Locked)) => {
             Over::because(Closed::Overloaded, StreamProblem::new("overloaded", detail))
         }
         SessionError::Service(_) => {

@@ -1,0 +1,86 @@
+//! Requests to open a session, as they are read: first what is named, then, with the model at hand, the rest.
+
+use std::num::NonZeroU32;
+
+use super::learners::Ready;
+use super::policies::{Envelope, base_weights};
+use crate::attribute::Weights;
+use crate::document::{Faults, Object, Path};
+use crate::mapping::{Mapper, read_lookahead};
+use crate::model::Origin;
+
+/// Lookahead of a session that names none.
+const DEFAULT_LOOKAHEAD: u32 = 8;
+
+/// What can be read of a request to open a session before its model is at hand. What has a fault is left out.
+pub(super) struct Names {
+    pub(super) envelope: Envelope,
+    pub(super) explores: bool,
+    pub(super) lookahead: Option<NonZeroU32>,
+}
+
+impl Names {
+    /// Gives the names if the model's could be read. Faults may have been found either way.
+    pub(super) fn read(object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
+        let model = object.required("model", faults).and_then(|place| place.string(faults));
+        let learner = object.optional("learner").map(|place| place.string(faults));
+        let explores = object.optional("explore").and_then(|place| {
+            let explores = place.boolean(faults);
+            if explores == Some(true) && learner.is_none() {
+                faults.note(&place, "exploring needs a learner");
+            }
+            explores
+        });
+        let explores = explores == Some(true);
+        if let (true, Some(place)) = (explores, object.optional("weights"))
+            && place.value.as_object().is_some_and(|weights| !weights.is_empty())
+        {
+            faults.note(&place, "an exploring session draws its weights");
+        }
+        let lookahead = match (object.optional("lookahead"), object.members.contains_key("lookahead")) {
+            (Some(place), _) => read_lookahead(&place, faults),
+            (None, true) => None,
+            (None, false) => NonZeroU32::new(DEFAULT_LOOKAHEAD),
+        };
+        let learner = learner.flatten().map(str::to_owned);
+        let envelope = Envelope { model: model?.to_owned(), learner, deadline: None };
+        Some(Self { envelope, explores, lookahead })
+    }
+}
+
+/// What a session is opened with.
+pub(super) struct Opening {
+    pub(super) weights: Weights,
+    pub(super) start: Option<u32>,
+}
+
+impl Opening {
+    pub(super) fn read(
+        mapper: &Mapper,
+        learner: Option<&Ready>,
+        object: &Object<'_, '_>,
+        faults: &mut Faults,
+    ) -> Option<Self> {
+        let model = mapper.model();
+        if model.is_lazy() {
+            let detail = "this world is searched lazily, which needs the whole demonstration: ask for a policy instead";
+            faults.note_at(&Path::Member(&Path::Root, "model"), detail);
+        }
+        let base = base_weights(model, learner, faults);
+        let named = match object.optional("weights") {
+            Some(place) => model.schema().read_named_weights(&place, faults),
+            None => Some(Vec::new()),
+        };
+        let weights = base.zip(named).map(|(mut weights, named)| {
+            for (position, weight) in named {
+                weights.set(position, weight);
+            }
+            weights
+        });
+        let start = match object.optional("start") {
+            Some(place) => model.read_start(&place, faults).map(Origin::state),
+            None => Some(None),
+        };
+        Some(Self { weights: weights?, start: start? })
+    }
+}
