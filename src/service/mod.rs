@@ -178,6 +178,15 @@ impl Etude {
         self.store.check().await
     }
 
+    /// Removes what a killed service has left behind. Only a service may, when it starts.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn sweep_left_behind(&self) -> Result<(), StoreError> {
+        self.store.sweep_left_behind().await
+    }
+
     /// Closes the store. Whoever still asks for something gets an error.
     pub async fn close(&self) {
         self.store.close().await;

@@ -80,6 +80,9 @@ pub enum StoreError {
     /// What is read was removed while it was.
     #[error("it was removed while it was read")]
     Removed,
+    /// Another process has removed some of what was to be registered; sent once more, it may go through.
+    #[error("another service on the same database has removed what was stored so far; send it again")]
+    Lost,
     /// The store is shutting down.
     #[error("the store takes no more writes")]
     Closed,
@@ -127,9 +130,8 @@ impl Store {
             .max_connections(N_READERS)
             .connect_with(options.create_if_missing(false).pragma("query_only", "ON"))
             .await?;
-        let left = definitions::left_behind(&readers).await?;
         let writer = Writer::start(connection, tasks);
-        let sweeper = Sweeper::start(writer.clone(), left, tasks);
+        let sweeper = Sweeper::start(writer.clone(), tasks);
         Ok(Self { readers, writer, sweeper, tasks: tasks.clone() })
     }
 

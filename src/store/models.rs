@@ -5,7 +5,7 @@ use sqlx::Row;
 use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
 
-use super::definitions::NewPieces;
+use super::definitions::{self, NewPieces};
 use super::writer::{Write, Written};
 use super::{Page, Store, StoreError, corrupt, timestamp};
 use crate::attribute::AttributeDocument;
@@ -236,6 +236,12 @@ pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> 
     .execute(&mut *connection)
     .await?;
     if inserted.rows_affected() == 1 {
+        if let NewDefinition::Pieces(NewPieces { id, n_pieces, .. }) = definition
+            && !definitions::is_whole(connection, *id, *n_pieces).await?
+        {
+            // Takes the insertion back.
+            return Err(StoreError::Lost);
+        }
         return Ok(PutModel::Created(summary.clone()));
     }
     let query = sqlx::query(
