@@ -528,6 +528,30 @@ async fn a_client_that_goes_away_cancels_its_search() {
 }
 
 #[tokio::test]
+async fn a_small_request_in_a_world_searched_lazily_leaves_the_service_awake() {
+    let service = Service::start(&["--max-states", "1000"]).await;
+    let gold: Vec<_> = (0..19).map(|k| json!([(7 * k + 15) % 30, (11 * k + 24) % 30])).collect();
+    let model = json!({"dynamics": {"kind": "wumpus", "width": 30, "height": 30, "gold": gold}});
+    assert_eq!(service.put("/v1/models/lazy", &model).await.0, 201);
+    let seen: Vec<_> = (0..30).map(|k| json!({"x": 7 * k % 30, "y": 11 * k % 30, "gold": k / 2})).collect();
+    // Only for the case that nothing else ends it.
+    let request = json!({"model": "lazy", "demonstration": seen, "deadline_ms": 20_000});
+    let waiting = tokio::spawn(service.client.post(service.url("/v1/policies")).json(&request).send());
+    while service.measurement("etude_search_jobs").await < 1.0 {
+        assert!(!waiting.is_finished(), "nothing else was answered while it was searched");
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(service.get("/livez").await.0, 200);
+    assert_eq!(service.measurement("etude_search_jobs").await, 1.0, "it is still being searched");
+
+    waiting.abort();
+    while service.measurement("etude_search_jobs").await > 0.0 {
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(service.get("/v1/policies").await.1["items"], json!([]), "it was cancelled");
+}
+
+#[tokio::test]
 async fn a_deadline_gives_the_best_mapping_so_far_and_a_bound() {
     let service = Service::start(&[]).await;
     service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;

@@ -184,12 +184,14 @@ impl Envelope {
 const MAX_INLINE_WORK: usize = 16_384;
 
 /// Whether a request with a small body is answered sooner than another thread would have taken it over. Of what may be in a
-/// request, a finite lookahead and the paper's heuristic can take far longer than the size of the problem tells.
+/// request, a finite lookahead and the paper's heuristic can take far longer than the size of the problem tells; of a world that is
+/// searched lazily, nobody knows the size.
 fn is_quick(model: &Model, document: &Value) -> bool {
     let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
     let size = model.graph().n_states() + model.graph().n_transitions();
     let step_bytes = || serde_json::to_string(&model.describe(0)).map_or(usize::MAX, |text| text.len());
-    document["lookahead"].is_null()
+    !model.is_lazy()
+        && document["lookahead"].is_null()
         && document["heuristic"] != "paper"
         && n_observations.saturating_mul(size) <= MAX_INLINE_WORK
         && n_observations.saturating_mul(step_bytes()) <= MAX_INLINE_BYTES
