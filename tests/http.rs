@@ -552,6 +552,34 @@ async fn a_small_request_in_a_world_searched_lazily_leaves_the_service_awake() {
 }
 
 #[tokio::test]
+async fn a_deadline_holds_for_those_who_wait_for_a_thread() {
+    let service = Service::start(&["--search-threads", "1"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let waiting = tokio::spawn(service.client.post(service.url("/v1/policies")).json(&slow_request()).send());
+    while service.measurement("etude_search_jobs").await < 1.0 {
+        tokio::task::yield_now().await;
+    }
+    let mut small = example("figure-4/request.json");
+    small["deadline_ms"] = json!(20);
+    assert_eq!(service.post("/v1/policies", &small).await.0, 201);
+    let mut large = slow_request();
+    large["deadline_ms"] = json!(20);
+    let (status, policy) = service.post("/v1/policies", &large).await;
+    assert_eq!((status, &policy["status"]), (201, &json!("bounded")));
+    let batch = json!({
+        "model": "figure-4", "deadline_ms": 20,
+        "items": [{"demonstration": small["demonstration"]}, {"demonstration": large["demonstration"]}],
+    });
+    let (status, answer) = service.post("/v1/policies:batch", &batch).await;
+    assert_eq!((status, &answer["items"][1]["status"]), (200, &json!("bounded")));
+    assert!(!waiting.is_finished(), "the one before them is still searched");
+    waiting.abort();
+    while service.measurement("etude_search_jobs").await > 0.0 {
+        tokio::task::yield_now().await;
+    }
+}
+
+#[tokio::test]
 async fn a_deadline_gives_the_best_mapping_so_far_and_a_bound() {
     let service = Service::start(&[]).await;
     service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;

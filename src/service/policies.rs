@@ -51,6 +51,8 @@ impl Etude {
         let (envelope, faults) = Envelope::read(&document, &Request::FIELDS, "demonstration");
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
+        let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
+        let place = place.with_patience(deadline);
         let Named { learner, model_hash, mapper } = self.find(&envelope, faults, &place).await?;
 
         let id = Uuid::now_v7().to_string();
@@ -62,7 +64,6 @@ impl Etude {
             weights_version: learner.as_ref().map(|ready| ready.weights.version),
             ..Stamp::default()
         };
-        let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
         let is_quick = is_small && is_quick(mapper.model(), &document);
         let job = move |interrupt: &mut dyn Interrupt| {
             let base = |faults: &mut Faults| base_weights(mapper.model(), learner.as_ref(), faults);
@@ -134,12 +135,12 @@ impl Etude {
     }
 }
 
-/// Parses a body, by its `place` in the pool if it is large.
+/// Parses a body, by its `place` in the pool if it is large: without waiting for searches, as how long it may wait is written in it.
 pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admission) -> Result<Value, ServiceError> {
     let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
         document::parse(body.as_ref())
     } else {
-        place.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
+        place.run_reading(move || document::parse(body.as_ref())).await?
     };
     Ok(document?)
 }
@@ -148,6 +149,7 @@ pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admis
 pub(super) struct Envelope {
     pub(super) model: String,
     pub(super) learner: Option<String>,
+    /// None if there is a lookahead, which it has no effect on.
     pub(super) deadline: Option<Duration>,
 }
 
@@ -173,7 +175,7 @@ impl Envelope {
         let envelope = names.map(|(model, learner)| Self {
             model: model.to_owned(),
             learner: learner.map(str::to_owned),
-            deadline: options.and_then(|options| options.deadline),
+            deadline: options.filter(|options| options.lookahead.is_none()).and_then(|options| options.deadline),
         });
         (envelope, faults)
     }

@@ -3,6 +3,9 @@
 //! A job is admitted if fewer than `n_threads + max_waiting` are in the pool, waits for a thread, and runs there. Whoever waits for
 //! a job may go away at any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`]. A job that is
 //! over before a change of threads would have paid for itself waits its turn like the others, and then runs where it is.
+//!
+//! Searches may keep their threads for long. So bodies, which are read in a fraction of a second, wait for each other only, and a job
+//! that has to be answered by some time runs beside the pool if it has waited until then: to finish at once is all that it can do.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -42,6 +45,8 @@ pub struct SearchPool {
     settings: PoolSettings,
     admitted: Arc<Semaphore>,
     threads: Arc<Semaphore>,
+    /// For what is read: as many again.
+    readers: Arc<Semaphore>,
     tasks: TaskTracker,
     abort: CancellationToken,
 }
@@ -55,6 +60,7 @@ impl SearchPool {
             settings,
             admitted: Arc::new(Semaphore::new(n_threads + settings.max_waiting)),
             threads: Arc::new(Semaphore::new(n_threads)),
+            readers: Arc::new(Semaphore::new(n_threads)),
             tasks,
             abort,
         }
@@ -79,7 +85,7 @@ impl SearchPool {
     /// [`PoolError::Busy`] at once if the queue is full.
     pub fn admit(&self) -> Result<Admission, PoolError> {
         let admitted = Arc::clone(&self.admitted).try_acquire_owned().map_err(|_| PoolError::Busy)?;
-        Ok(Admission { pool: self.clone(), admitted: Arc::new(admitted) })
+        Ok(Admission { pool: self.clone(), admitted: Arc::new(admitted), patience: None })
     }
 
     /// Runs `job` when there is a thread for it, however many wait. For callers that are bounded in number themselves.
@@ -92,7 +98,9 @@ impl SearchPool {
         T: Send + 'static,
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
-        self.run_admitted(None, None, job).await
+        let cancel = self.abort.child_token();
+        let thread = self.turn(&self.threads).await?;
+        self.run_holding(thread, None, cancel, job).await
     }
 
     /// Runs `job` beside the threads of the pool, which it must not keep: it waits for others. For callers that are bounded in
@@ -109,28 +117,13 @@ impl SearchPool {
         self.run_holding((), None, self.abort.child_token(), job).await
     }
 
-    /// Waits for a thread.
-    async fn turn(&self) -> Result<OwnedSemaphorePermit, PoolError> {
+    /// Waits for one of `threads`.
+    async fn turn(&self, threads: &Arc<Semaphore>) -> Result<OwnedSemaphorePermit, PoolError> {
         tokio::select! {
             biased;
             () = self.abort.cancelled() => Err(PoolError::Stopped),
-            thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped),
+            thread = Arc::clone(threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped),
         }
-    }
-
-    async fn run_admitted<T, F>(
-        &self,
-        admitted: Option<Arc<OwnedSemaphorePermit>>,
-        deadline: Option<Instant>,
-        job: F,
-    ) -> Result<T, PoolError>
-    where
-        T: Send + 'static,
-        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
-    {
-        let cancel = self.abort.child_token();
-        let thread = self.turn().await?;
-        self.run_holding((admitted, thread), deadline, cancel, job).await
     }
 
     /// Runs `job`, and keeps `held` until it has really ended, even if nobody waits for it any more.
@@ -161,14 +154,46 @@ impl SearchPool {
     }
 }
 
-/// A place in the pool. Given back when this is dropped and the last job that ran by it has ended.
-#[derive(Debug)]
+/// A place in the pool. Given back when this and its clones are dropped and the last job that ran by it has ended.
+#[derive(Clone, Debug)]
 pub struct Admission {
     pool: SearchPool,
     admitted: Arc<OwnedSemaphorePermit>,
+    /// Until when jobs wait for a thread.
+    patience: Option<Instant>,
 }
 
 impl Admission {
+    /// The same place, whose jobs wait for a thread of the pool until `patience` at most, and then run beside it.
+    #[must_use]
+    pub fn with_patience(self, patience: Option<Instant>) -> Self {
+        Self { patience, ..self }
+    }
+
+    /// Waits for a thread; nothing if the patience ends first.
+    async fn turn(&self) -> Result<Option<OwnedSemaphorePermit>, PoolError> {
+        let turn = self.pool.turn(&self.pool.threads);
+        match self.patience {
+            None => turn.await.map(Some),
+            Some(patience) => tokio::time::timeout_at(patience.into(), turn).await.ok().transpose(),
+        }
+    }
+
+    /// Runs `job`, which ends by itself in a fraction of a second, off the async threads: it does not wait for searches.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the service ends before it has begun.
+    pub async fn run_reading<T, F>(&self, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce() -> T + Send + 'static,
+    {
+        let cancel = self.pool.abort.child_token();
+        let reader = self.pool.turn(&self.pool.readers).await?;
+        self.pool.run_holding((Arc::clone(&self.admitted), reader), None, cancel, |_| Ok(job())).await
+    }
+
     /// Runs `job` on a thread of the pool. It is told to finish when `deadline` has passed, and to stop when the returned
     /// future is dropped or the service ends.
     ///
@@ -180,7 +205,9 @@ impl Admission {
         T: Send + 'static,
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
-        self.pool.run_admitted(Some(Arc::clone(&self.admitted)), deadline, job).await
+        let cancel = self.pool.abort.child_token();
+        let thread = self.turn().await?;
+        self.pool.run_holding((Arc::clone(&self.admitted), thread), deadline, cancel, job).await
     }
 
     /// Runs `job`, which takes no longer than a millisecond or so, in place of a thread of the pool: on the one that polls the
@@ -194,7 +221,7 @@ impl Admission {
         deadline: Option<Instant>,
         job: impl FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled>,
     ) -> Result<T, PoolError> {
-        let _thread = self.pool.turn().await?;
+        let _thread = self.turn().await?;
         let mut interrupt = Watch { cancel: self.pool.abort.clone(), deadline };
         job(&mut interrupt).map_err(|Cancelled| PoolError::Stopped)
     }
@@ -293,6 +320,29 @@ mod tests {
         assert_eq!(place.run_here(Some(Instant::now()), until_cancelled).await, Ok(()));
         abort.cancel();
         assert_eq!(place.run_here(None, |_| Ok(7)).await, Err(PoolError::Stopped));
+    }
+
+    #[tokio::test]
+    async fn a_job_whose_patience_ends_and_one_that_reads_do_not_wait_for_searches() {
+        let (pool, _abort) = pool(1, 1);
+        let running = tokio::spawn({
+            let pool = pool.clone();
+            async move { pool.admit()?.run(None, until_cancelled).await }
+        });
+        while pool.n_jobs() == 0 {
+            tokio::task::yield_now().await;
+        }
+        let place = pool.admit().unwrap();
+        assert_eq!(place.run_reading(|| 7).await, Ok(7));
+        let now = Instant::now();
+        let impatient = place.clone().with_patience(Some(now));
+        assert_eq!(impatient.run(Some(now), until_cancelled).await, Ok(()));
+        assert_eq!(impatient.run_here(Some(now), until_cancelled).await, Ok(()));
+        assert_eq!(pool.n_jobs(), 2, "the first one still runs");
+        let mut waiting = Box::pin(place.run(Some(now), until_cancelled));
+        assert!(futures_util::poll!(&mut waiting).is_pending(), "its patience was not limited");
+        running.abort();
+        assert_eq!(waiting.await, Ok(()));
     }
 
     #[tokio::test]
