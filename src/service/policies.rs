@@ -272,7 +272,8 @@ pub(super) fn searched(policy: &Policy, document: &Value) -> Result<Searched, Se
         let mut request = document.clone();
         // The weights that were used, wherever they came from.
         request["weights"] = serde_json::json!(policy.weights);
-        for name in ["learner", "lookahead"] {
+        // The optimum does not depend on how it is searched for, and nobody waits for it.
+        for name in ["learner", "lookahead", "heuristic", "max_expansions", "deadline_ms"] {
             request[name] = Value::Null;
         }
         NewRefinement { policy_id: row.id.clone(), model_hash: policy.model_hash.clone(), request: request.to_string() }
