@@ -6,15 +6,20 @@
 //!
 //! Searches may keep their threads for long. So bodies, which are read in a fraction of a second, wait for each other only, and a job
 //! that has to be answered by some time runs beside the pool if it has waited until then: to finish at once is all that it can do.
+//! What nobody waits for runs where there is a thread to spare, and is stopped as soon as somebody needs that.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
 use crate::interrupt::{Cancelled, Interrupt, Signal};
+
+/// How long a job that nobody waits for may go on when it has taken the last thread: longer than most jobs keep theirs.
+const LAST_THREAD_KEPT: Duration = Duration::from_millis(100);
 
 /// Size of the pool.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,6 +50,8 @@ pub struct SearchPool {
     settings: PoolSettings,
     admitted: Arc<Semaphore>,
     threads: Arc<Semaphore>,
+    /// How many jobs wait for a thread.
+    n_waiting: Arc<AtomicUsize>,
     /// For what is read: as many again.
     readers: Arc<Semaphore>,
     tasks: TaskTracker,
@@ -60,6 +67,7 @@ impl SearchPool {
             settings,
             admitted: Arc::new(Semaphore::new(n_threads + settings.max_waiting)),
             threads: Arc::new(Semaphore::new(n_threads)),
+            n_waiting: Arc::default(),
             readers: Arc::new(Semaphore::new(n_threads)),
             tasks,
             abort,
@@ -99,8 +107,39 @@ impl SearchPool {
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
         let cancel = self.abort.child_token();
-        let thread = self.turn(&self.threads).await?;
+        let thread = self.thread().await?;
         self.run_holding(thread, None, cancel, job).await
+    }
+
+    /// Runs `job`, which nobody waits for, if there is a thread to spare: of several, another one stays free when it begins.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Busy`] if there is none, or the job was told to stop because somebody waits for a thread or all have been taken
+    /// for a while; [`PoolError::Stopped`] if the service ends.
+    pub async fn run_to_spare<T, F>(&self, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
+        let has_others = self.n_threads() > 1;
+        let free = Arc::clone(&self.threads).try_acquire_many_owned(if has_others { 2 } else { 1 });
+        let thread = free.ok().and_then(|mut free| free.split(1)).ok_or(PoolError::Busy)?;
+        let (threads, n_waiting) = (Arc::clone(&self.threads), Arc::clone(&self.n_waiting));
+        let yielding = move |watch: &mut dyn Interrupt| {
+            let mut last_since: Option<Instant> = None;
+            let mut is_needed = || {
+                let is_last = has_others && threads.available_permits() == 0;
+                last_since = if is_last { last_since.or_else(|| Some(Instant::now())) } else { None };
+                n_waiting.load(Ordering::Relaxed) > 0
+                    || last_since.is_some_and(|since| since.elapsed() >= LAST_THREAD_KEPT)
+            };
+            job(&mut || if is_needed() { Signal::Cancel } else { watch.poll() })
+        };
+        match self.run_holding(thread, None, self.abort.child_token(), yielding).await {
+            Err(PoolError::Stopped) if !self.abort.is_cancelled() => Err(PoolError::Busy),
+            answer => answer,
+        }
     }
 
     /// Runs `job` beside the threads of the pool, which it must not keep: it waits for others. For callers that are bounded in
@@ -115,6 +154,17 @@ impl SearchPool {
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
         self.run_holding((), None, self.abort.child_token(), job).await
+    }
+
+    /// Waits for a thread.
+    async fn thread(&self) -> Result<OwnedSemaphorePermit, PoolError> {
+        if !self.abort.is_cancelled()
+            && let Ok(thread) = Arc::clone(&self.threads).try_acquire_owned()
+        {
+            return Ok(thread);
+        }
+        let _counted = Waiting::new(&self.n_waiting);
+        self.turn(&self.threads).await
     }
 
     /// Waits for one of `threads`.
@@ -172,7 +222,7 @@ impl Admission {
 
     /// Waits for a thread; nothing if the patience ends first.
     async fn turn(&self) -> Result<Option<OwnedSemaphorePermit>, PoolError> {
-        let turn = self.pool.turn(&self.pool.threads);
+        let turn = self.pool.thread();
         match self.patience {
             None => turn.await.map(Some),
             Some(patience) => tokio::time::timeout_at(patience.into(), turn).await.ok().transpose(),
@@ -224,6 +274,22 @@ impl Admission {
         let _thread = self.turn().await?;
         let mut interrupt = Watch { cancel: self.pool.abort.clone(), deadline };
         job(&mut interrupt).map_err(|Cancelled| PoolError::Stopped)
+    }
+}
+
+/// Counts a job that waits, until it is dropped.
+struct Waiting(Arc<AtomicUsize>);
+
+impl Waiting {
+    fn new(n_waiting: &Arc<AtomicUsize>) -> Self {
+        n_waiting.fetch_add(1, Ordering::Relaxed);
+        Self(Arc::clone(n_waiting))
+    }
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -343,6 +409,38 @@ mod tests {
         assert!(futures_util::poll!(&mut waiting).is_pending(), "its patience was not limited");
         running.abort();
         assert_eq!(waiting.await, Ok(()));
+    }
+
+    #[tokio::test]
+    async fn what_nobody_waits_for_makes_way_for_whoever_does() {
+        let (pool, abort) = pool(1, 1);
+        let spare = Box::pin(pool.run_to_spare(until_cancelled));
+        let mut spare = std::pin::pin!(spare);
+        assert!(futures_util::poll!(&mut spare).is_pending());
+        assert_eq!(pool.run_to_spare(|_| Ok(())).await, Err(PoolError::Busy), "there is one thread");
+        assert_eq!(pool.admit().unwrap().run(None, |_| Ok(7)).await, Ok(7));
+        assert_eq!(spare.await, Err(PoolError::Busy));
+        assert_eq!(pool.run_to_spare(|_| Ok(7)).await, Ok(7));
+        abort.cancel();
+        assert_eq!(pool.run_to_spare(until_cancelled).await, Err(PoolError::Stopped));
+    }
+
+    #[tokio::test]
+    async fn what_nobody_waits_for_leaves_a_thread_free() {
+        let (pool, _abort) = pool(2, 0);
+        let mut running = Box::pin(pool.run_patiently(until_cancelled));
+        assert!(futures_util::poll!(&mut running).is_pending());
+        assert_eq!(pool.run_to_spare(|_| Ok(())).await, Err(PoolError::Busy));
+        drop(running);
+        // Its thread is free once it has seen that.
+        while pool.threads.available_permits() < 2 {
+            tokio::task::yield_now().await;
+        }
+        let mut spare = Box::pin(pool.run_to_spare(until_cancelled));
+        assert!(futures_util::poll!(&mut spare).is_pending());
+        let mut running = Box::pin(pool.run_patiently(until_cancelled));
+        assert!(futures_util::poll!(&mut running).is_pending());
+        assert_eq!(spare.await, Err(PoolError::Busy), "it had the last one for a while");
     }
 
     #[tokio::test]
