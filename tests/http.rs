@@ -322,6 +322,20 @@ async fn a_start_is_an_index_or_the_values_of_one_state() {
     }
 }
 
+#[tokio::test]
+async fn clients_make_up_no_labels_of_measurements() {
+    let service = Service::start(&[]).await;
+    for (method, path) in [("BREW", "/livez"), ("MADE-UP", "/made/up")] {
+        service.send(Method::from_bytes(method.as_bytes()).unwrap(), path, &Value::Null).await;
+    }
+    let (_, text) = service.get("/metrics").await;
+    let text = text.as_str().unwrap();
+    assert!(!text.contains("BREW") && !text.contains("MADE-UP") && !text.contains("made/up"), "{text}");
+    for labels in [r#"method="other",route="/livez""#, r#"method="other",route="(none)""#] {
+        assert!(text.contains(labels), "{labels}: {text}");
+    }
+}
+
 /// Sends a body as it is.
 async fn send_text(service: &Service, path: &str, content_type: &str, body: impl Into<reqwest::Body>) -> (u16, Value) {
     let request = service.client.put(service.url(path)).header(CONTENT_TYPE, content_type).body(body);
