@@ -308,6 +308,8 @@ async fn all_faults_of_a_request_are_told_at_once() {
     assert!(problem.to_string().len() < 1000, "{problem}");
     let (status, problem) = post(json!({"model": "corridor", "learner": "nobody", "demonstration": [{}]})).await;
     assert_eq!((status, &problem["type"]), (404, &json!("/problems/unknown-learner")));
+    let (status, problem) = post(json!({"model": "nothing", "learner": "nobody", "demonstration": [{}]})).await;
+    assert_eq!((status, pointers(&problem)), (422, vec!["/learner", "/model"]));
     assert_eq!(service.get("/v1/policies").await.1["items"], json!([]), "nothing was stored");
 }
 

@@ -81,29 +81,28 @@ impl Etude {
         Ok(MadePolicy { id, policy })
     }
 
-    /// Finds what the request names. `faults` are those found so far; what is unknown is one more, if there are any.
+    /// Finds what the request names. `faults` are those found so far; what is unknown is one more, if there are any others.
     pub(super) async fn find(
         &self,
         envelope: &Envelope,
         mut faults: Faults,
         place: &Admission,
     ) -> Result<Named, ServiceError> {
-        let found = async {
-            let learner = match &envelope.learner {
-                Some(learner) => Some(self.ready(learner, Some("/learner")).await?),
-                None => None,
-            };
-            let (model_hash, mapper) = self.known_mapper(&envelope.model, "/model", place).await?;
-            Ok(Named { learner, model_hash, mapper })
+        let learner = match &envelope.learner {
+            Some(learner) => self.ready(learner, Some("/learner")).await.map(Some),
+            None => Ok(None),
         };
-        match found.await {
-            Err(ref error @ ServiceError::Unknown { pointer: Some(pointer), .. }) if !faults.is_empty() => {
-                let name = pointer.trim_start_matches('/');
-                faults.note_at(&Path::Member(&Path::Root, name), error.to_string());
-                Err(faults.into())
-            }
-            found => found,
+        let mapper = self.known_mapper(&envelope.model, "/model", place).await;
+        let errors = match (learner, mapper) {
+            (Ok(learner), Ok((model_hash, mapper))) => return Ok(Named { learner, model_hash, mapper }),
+            (Err(error), Ok(_)) | (Ok(_), Err(error)) if faults.is_empty() => return Err(error),
+            (learner, mapper) => learner.err().into_iter().chain(mapper.err()),
+        };
+        for error in errors {
+            let ServiceError::Unknown { pointer: Some(pointer), .. } = error else { return Err(error) };
+            faults.note_at(&Path::Member(&Path::Root, pointer.trim_start_matches('/')), error.to_string());
         }
+        Err(faults.into())
     }
 
     /// The policy with this id: JSON.
@@ -168,7 +167,8 @@ impl Envelope {
         let root = Place::root(document);
         let Some(object) = root.object(fields, &mut faults) else { return (None, faults) };
         let model = object.required("model", &mut faults).and_then(|place| place.string(&mut faults));
-        let learner = object.optional("learner").map(|place| place.string(&mut faults));
+        let learner = object.optional("learner").filter(|_| fields.contains(&"learner"));
+        let learner = learner.map(|place| place.string(&mut faults));
         object.required(about, &mut faults);
         let options = Request::read_options(&object, &mut faults);
         let names = model.zip(learner.map_or(Some(None), |learner| learner.map(Some)));
