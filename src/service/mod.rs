@@ -25,6 +25,8 @@ mod trials;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use jiff::{Timestamp, Unit};
+
 pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, ModelText, OpenText, Registered};
@@ -201,3 +203,8 @@ impl Etude {
 
 /// How long to wait before trying again when the queue is full.
 pub const RETRY_AFTER: Duration = Duration::from_secs(1);
+
+/// A time as exact as it is stored.
+fn as_stored(time: Timestamp) -> Timestamp {
+    time.round(Unit::Millisecond).unwrap_or(time)
+}

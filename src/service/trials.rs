@@ -11,7 +11,7 @@ use uuid::Uuid;
 
 use super::learners::{Ready, unknown};
 use super::policies::{self, Envelope, Named, Searched};
-use super::{Etude, Name, ServiceError};
+use super::{Etude, Name, ServiceError, as_stored};
 use crate::attribute::{Schema, Weights};
 use crate::document::{Faults, Path, Place, Range};
 use crate::interrupt::Interrupt;
@@ -292,9 +292,4 @@ fn read_policy(policy: String) -> Result<Box<RawValue>, ServiceError> {
     let corrupt =
         |error: serde_json::Error| StoreError::Corrupt { table: "policies", column: "policy", source: error.into() };
     Ok(RawValue::from_string(policy).map_err(corrupt)?)
-}
-
-/// A time as exact as it is stored.
-pub(super) fn as_stored(time: Timestamp) -> Timestamp {
-    time.round(jiff::Unit::Millisecond).unwrap_or(time)
 }

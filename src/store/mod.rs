@@ -214,6 +214,11 @@ fn corrupt<E: Into<Box<dyn std::error::Error + Send + Sync>>>(
     move |source| StoreError::Corrupt { table, column, source: source.into() }
 }
 
+/// As SQLite holds it; the counts and times of this program stay far below its limit.
+fn as_integer(count: u64) -> i64 {
+    i64::try_from(count).unwrap_or(i64::MAX)
+}
+
 /// A column that is never negative.
 fn count(row: &sqlx::sqlite::SqliteRow, table: &'static str, column: &'static str) -> Result<u64, StoreError> {
     use sqlx::Row;
