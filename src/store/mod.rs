@@ -147,12 +147,15 @@ impl Store {
         self.writer.models_generation()
     }
 
-    /// Whether the database answers.
+    /// Whether the database answers, and writes are taken.
     ///
     /// # Errors
     ///
-    /// If it does not.
+    /// If not.
     pub async fn check(&self) -> Result<(), StoreError> {
+        if !self.writer.is_running() {
+            return Err(StoreError::Closed);
+        }
         sqlx::query("SELECT count(*) FROM (SELECT 1 FROM models LIMIT 1)").execute(&self.readers).await?;
         Ok(())
     }
@@ -227,4 +230,21 @@ fn count(row: &sqlx::sqlite::SqliteRow, table: &'static str, column: &'static st
 
 fn timestamp(table: &'static str, column: &'static str, ms: i64) -> Result<jiff::Timestamp, StoreError> {
     jiff::Timestamp::from_millisecond(ms).map_err(corrupt(table, column))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_store_whose_writer_has_ended_is_not_ready() {
+        let directory = tempfile::tempdir().unwrap();
+        let tasks = TaskTracker::new();
+        let store = Store::open(&directory.path().join("etude.db"), &tasks).await.unwrap();
+        store.check().await.unwrap();
+        store.writer.close();
+        tasks.close();
+        tasks.wait().await;
+        assert!(matches!(store.check().await, Err(StoreError::Closed)), "though it could be read");
+    }
 }
