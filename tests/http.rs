@@ -469,7 +469,7 @@ async fn a_body_cut_off_in_the_middle_is_refused_and_changes_nothing() {
 #[tokio::test]
 async fn unknown_paths_and_methods_are_problems_too() {
     let service = Service::start(&[]).await;
-    for path in ["/", "/v1", "/v2/models", "/v1/models/a/b", "/v1/models/"] {
+    for path in ["/", "/v1", "/v2/models", "/v1/models/a/b", "/v1/models/", "/docs/nope"] {
         let (status, problem) = service.get(path).await;
         assert_eq!((status, &problem["type"]), (404, &json!("/problems/not-found")), "{path}");
     }

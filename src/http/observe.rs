@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use axum::extract::{MatchedPath, Request};
-use axum::http::{HeaderMap, HeaderName, HeaderValue, Method};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::FutureExt;
@@ -39,7 +39,12 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
         span.in_scope(|| tracing::error!(panic = panic_message(panic.as_ref()), "a handler panicked"));
         Problem::new(ProblemKind::Internal, "an internal error was logged under this request id").into_response()
     });
-    if let Some(problem) = response.extensions_mut().remove::<Problem>() {
+    let problem = response.extensions_mut().remove::<Problem>().or_else(|| {
+        // Of the page that describes the service, whose files are another's to serve.
+        let is_bare = response.status() == StatusCode::NOT_FOUND;
+        is_bare.then(|| Problem::new(ProblemKind::NotFound, "there is nothing at this path"))
+    });
+    if let Some(problem) = problem {
         let headers = std::mem::take(response.headers_mut());
         response = problem.render(&id);
         // What the router added, such as `Allow`; the body's own headers are the document's.
