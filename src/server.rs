@@ -101,6 +101,7 @@ impl Server {
             stream_limits: config.stream_limits(),
             stream_places: Arc::new(Semaphore::new(config.max_streams)),
             streams: streams.clone(),
+            tasks: tasks.clone(),
         });
         Ok(Self {
             listener,

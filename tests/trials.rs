@@ -156,6 +156,17 @@ async fn all_faults_of_a_request_for_a_trial_are_told_at_once() {
 }
 
 #[tokio::test]
+async fn a_reward_that_is_too_large_is_refused_for_what_it_is() {
+    let service = start(&ONLY_WHEN_TOLD).await;
+    let trial = make_trial(&service).await;
+    let reward = json!({"reward": 1, "why": "x".repeat(20_000)});
+    let (status, problem) = service.put(&format!("{}/reward", path_of(&trial)), &reward).await;
+    assert_eq!((status, &problem["type"]), (413, &json!("/problems/too-large")));
+    let detail = problem["detail"].as_str().unwrap();
+    assert!(detail.contains("16384") && !detail.contains("ETUDE_MAX_BODY_BYTES"), "{detail}");
+}
+
+#[tokio::test]
 async fn a_learner_that_cannot_be_read_keeps_no_other_from_learning() {
     use sqlx::{ConnectOptions, Connection};
     // First in the table, it comes first.

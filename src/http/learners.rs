@@ -117,7 +117,7 @@ pub(super) async fn put_learner(
     PathName(name): PathName,
     request: Request,
 ) -> Result<Response, Problem> {
-    let body = read_json(request, context.max_body_bytes).await?;
+    let body = read_json(request, &context).await?;
     let (registered, answer) = context.etude.put_learner(&name, &body, Timestamp::now()).await?;
     let status = match registered {
         Registered::New => StatusCode::CREATED,

@@ -58,6 +58,8 @@ pub struct Context {
     pub stream_places: Arc<Semaphore>,
     /// The streams that run.
     pub streams: TaskTracker,
+    /// Whatever else runs.
+    pub tasks: TaskTracker,
 }
 
 impl Context {

@@ -38,7 +38,7 @@ use crate::service::{BatchRequest, ServiceError};
 )]
 pub(super) async fn make_policy(State(context): State<Context>, request: Request) -> Result<Response, Problem> {
     let arrived = Instant::now();
-    let body = read_json(request, context.max_body_bytes).await?;
+    let body = read_json(request, &context).await?;
     let made = context.etude.make_policy(body, arrived, Timestamp::now()).await?;
     let mut response = json_text(StatusCode::CREATED, made.policy);
     if let Ok(location) = HeaderValue::from_str(&format!("/v1/policies/{}", made.id)) {
@@ -73,7 +73,7 @@ pub(super) async fn make_policies(
     request: Request,
 ) -> Result<Response, Problem> {
     let arrived = Instant::now();
-    let body = read_json(request, context.max_body_bytes).await?;
+    let body = read_json(request, &context).await?;
     let made = context.etude.make_policies(body, arrived, Timestamp::now()).await?;
     let mut text = String::with_capacity(made.iter().flatten().map(|made| made.policy.len() + 1).sum());
     let mut separator = r#"{"items":["#;
