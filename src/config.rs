@@ -21,10 +21,10 @@ pub struct ServeConfig {
     #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_name = "FILE")]
     pub database: PathBuf,
     /// Searches that run at the same time [default: one per core].
-    #[arg(long, env = "ETUDE_SEARCH_THREADS", value_name = "N")]
+    #[arg(long, env = "ETUDE_SEARCH_THREADS", value_parser = parse_threads, value_name = "N")]
     pub search_threads: Option<NonZeroUsize>,
     /// Searches that wait for a thread; further ones are answered 503.
-    #[arg(long, env = "ETUDE_SEARCH_QUEUE", default_value_t = 64, value_name = "N")]
+    #[arg(long, env = "ETUDE_SEARCH_QUEUE", default_value_t = 64, value_parser = parse_places, value_name = "N")]
     pub search_queue: usize,
     /// Largest request body; once it is decompressed, too.
     #[arg(long, env = "ETUDE_MAX_BODY_BYTES", default_value_t = 8 * 1024 * 1024, value_name = "BYTES")]
@@ -47,7 +47,7 @@ pub struct ServeConfig {
     #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", default_value_t = 1024 * 1024 * 1024, value_name = "BYTES")]
     pub model_cache_bytes: u64,
     /// Streams that may run at the same time; further ones are answered 503.
-    #[arg(long, env = "ETUDE_MAX_STREAMS", default_value_t = 4096, value_name = "N")]
+    #[arg(long, env = "ETUDE_MAX_STREAMS", default_value_t = 4096, value_parser = parse_places, value_name = "N")]
     pub max_streams: usize,
     /// How long a session may be idle before it expires.
     #[arg(
@@ -101,6 +101,25 @@ impl ServeConfig {
 /// Largest frame of a stream: a thousand observations of a dozen attributes.
 const STREAM_FRAME_BYTES: usize = 262_144;
 
+/// Most threads: half of those that the runtime has for what blocks.
+const MAX_THREADS: usize = 256;
+
+/// Most searches that wait, and most streams: beyond what memory and files allow.
+const MAX_PLACES: usize = 1_000_000;
+
+fn parse_at_most(text: &str, most: usize) -> Result<usize, String> {
+    let count: usize = text.parse().map_err(|error: std::num::ParseIntError| error.to_string())?;
+    if count <= most { Ok(count) } else { Err(format!("expected at most {most}")) }
+}
+
+fn parse_places(text: &str) -> Result<usize, String> {
+    parse_at_most(text, MAX_PLACES)
+}
+
+fn parse_threads(text: &str) -> Result<NonZeroUsize, String> {
+    NonZeroUsize::new(parse_at_most(text, MAX_THREADS)?).ok_or_else(|| "expected at least 1".to_owned())
+}
+
 fn parse_duration(text: &str) -> Result<Duration, String> {
     let duration: jiff::SignedDuration = text.parse().map_err(|error: jiff::Error| error.to_string())?;
     Duration::try_from(duration).map_err(|_| "expected a time of at least 0".to_owned())
@@ -120,5 +139,12 @@ mod tests {
         assert_eq!(parse_duration("1s"), Ok(Duration::from_secs(1)));
         assert_eq!(parse_duration("500ms"), Ok(Duration::from_millis(500)));
         assert!(parse_duration("-1s").is_err() && parse_duration("7").is_err());
+    }
+
+    #[test]
+    fn more_places_than_there_can_be_are_refused() {
+        assert_eq!((parse_places("0"), parse_places("1000000")), (Ok(0), Ok(MAX_PLACES)));
+        assert!(parse_places("1000001").is_err() && parse_places("18446744073709551615").is_err());
+        assert!(parse_threads("256").is_ok() && parse_threads("257").is_err() && parse_threads("0").is_err());
     }
 }

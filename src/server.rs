@@ -79,11 +79,9 @@ impl Server {
     pub async fn start(config: &ServeConfig) -> Result<Self, ServerError> {
         let (tasks, stopping, abort) = (TaskTracker::new(), CancellationToken::new(), CancellationToken::new());
         let metrics = telemetry::measurements()?;
-        let etude = Etude::open(&config.settings(), &tasks, abort.clone()).await;
-        let etude = etude.map_err(|source| {
-            let database = config.database.display().to_string();
-            ServerError::Store { database, source }
-        })?;
+        let not_usable = |source| ServerError::Store { database: config.database.display().to_string(), source };
+        let etude = Etude::open(&config.settings(), &tasks, abort.clone()).await.map_err(not_usable)?;
+        etude.sweep_left_behind().await.map_err(not_usable)?;
         let listen = |source| ServerError::Listen { listen: config.listen, source };
         let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
@@ -103,6 +101,7 @@ impl Server {
             stream_limits: config.stream_limits(),
             stream_places: Arc::new(Semaphore::new(config.max_streams)),
             streams: streams.clone(),
+            tasks: tasks.clone(),
         });
         Ok(Self {
             listener,

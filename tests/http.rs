@@ -314,6 +314,8 @@ async fn all_faults_of_a_request_are_told_at_once() {
     assert!(problem.to_string().len() < 1000, "{problem}");
     let (status, problem) = post(json!({"model": "corridor", "learner": "nobody", "demonstration": [{}]})).await;
     assert_eq!((status, &problem["type"]), (404, &json!("/problems/unknown-learner")));
+    let (status, problem) = post(json!({"model": "nothing", "learner": "nobody", "demonstration": [{}]})).await;
+    assert_eq!((status, pointers(&problem)), (422, vec!["/learner", "/model"]));
     assert_eq!(service.get("/v1/policies").await.1["items"], json!([]), "nothing was stored");
 }
 
@@ -325,6 +327,20 @@ async fn a_start_is_an_index_or_the_values_of_one_state() {
         let request = json!({"model": "corridor", "demonstration": [{"x": 0}], "start": start});
         let (status, policy) = service.post("/v1/policies", &request).await;
         assert_eq!((status, &policy["steps"][0]["state_index"]), (201, &json!(1)), "{policy}");
+    }
+}
+
+#[tokio::test]
+async fn clients_make_up_no_labels_of_measurements() {
+    let service = Service::start(&[]).await;
+    for (method, path) in [("BREW", "/livez"), ("MADE-UP", "/made/up")] {
+        service.send(Method::from_bytes(method.as_bytes()).unwrap(), path, &Value::Null).await;
+    }
+    let (_, text) = service.get("/metrics").await;
+    let text = text.as_str().unwrap();
+    assert!(!text.contains("BREW") && !text.contains("MADE-UP") && !text.contains("made/up"), "{text}");
+    for labels in [r#"method="other",route="/livez""#, r#"method="other",route="(none)""#] {
+        assert!(text.contains(labels), "{labels}: {text}");
     }
 }
 
@@ -459,7 +475,7 @@ async fn a_body_cut_off_in_the_middle_is_refused_and_changes_nothing() {
 #[tokio::test]
 async fn unknown_paths_and_methods_are_problems_too() {
     let service = Service::start(&[]).await;
-    for path in ["/", "/v1", "/v2/models", "/v1/models/a/b", "/v1/models/"] {
+    for path in ["/", "/v1", "/v2/models", "/v1/models/a/b", "/v1/models/", "/docs/nope"] {
         let (status, problem) = service.get(path).await;
         assert_eq!((status, &problem["type"]), (404, &json!("/problems/not-found")), "{path}");
     }
@@ -531,6 +547,58 @@ async fn a_client_that_goes_away_cancels_its_search() {
         tokio::task::yield_now().await;
     }
     assert_eq!(service.post("/v1/policies", &example("figure-4/request.json")).await.0, 201);
+}
+
+#[tokio::test]
+async fn a_small_request_in_a_world_searched_lazily_leaves_the_service_awake() {
+    let service = Service::start(&["--max-states", "1000"]).await;
+    let gold: Vec<_> = (0..19).map(|k| json!([(7 * k + 15) % 30, (11 * k + 24) % 30])).collect();
+    let model = json!({"dynamics": {"kind": "wumpus", "width": 30, "height": 30, "gold": gold}});
+    assert_eq!(service.put("/v1/models/lazy", &model).await.0, 201);
+    let seen: Vec<_> = (0..30).map(|k| json!({"x": 7 * k % 30, "y": 11 * k % 30, "gold": k / 2})).collect();
+    // Only for the case that nothing else ends it.
+    let request = json!({"model": "lazy", "demonstration": seen, "deadline_ms": 20_000});
+    let waiting = tokio::spawn(service.client.post(service.url("/v1/policies")).json(&request).send());
+    while service.measurement("etude_search_jobs").await < 1.0 {
+        assert!(!waiting.is_finished(), "nothing else was answered while it was searched");
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(service.get("/livez").await.0, 200);
+    assert_eq!(service.measurement("etude_search_jobs").await, 1.0, "it is still being searched");
+
+    waiting.abort();
+    while service.measurement("etude_search_jobs").await > 0.0 {
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(service.get("/v1/policies").await.1["items"], json!([]), "it was cancelled");
+}
+
+#[tokio::test]
+async fn a_deadline_holds_for_those_who_wait_for_a_thread() {
+    let service = Service::start(&["--search-threads", "1"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let waiting = tokio::spawn(service.client.post(service.url("/v1/policies")).json(&slow_request()).send());
+    while service.measurement("etude_search_jobs").await < 1.0 {
+        tokio::task::yield_now().await;
+    }
+    let mut small = example("figure-4/request.json");
+    small["deadline_ms"] = json!(20);
+    assert_eq!(service.post("/v1/policies", &small).await.0, 201);
+    let mut large = slow_request();
+    large["deadline_ms"] = json!(20);
+    let (status, policy) = service.post("/v1/policies", &large).await;
+    assert_eq!((status, &policy["status"]), (201, &json!("bounded")));
+    let batch = json!({
+        "model": "figure-4", "deadline_ms": 20,
+        "items": [{"demonstration": small["demonstration"]}, {"demonstration": large["demonstration"]}],
+    });
+    let (status, answer) = service.post("/v1/policies:batch", &batch).await;
+    assert_eq!((status, &answer["items"][1]["status"]), (200, &json!("bounded")));
+    assert!(!waiting.is_finished(), "the one before them is still searched");
+    waiting.abort();
+    while service.measurement("etude_search_jobs").await > 0.0 {
+        tokio::task::yield_now().await;
+    }
 }
 
 #[tokio::test]

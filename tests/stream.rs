@@ -761,6 +761,9 @@ async fn a_service_with_too_much_to_do_opens_no_session_and_goes_on_with_those_t
 
     searching.abort();
     before.receive_until("done").await;
+    while service.measurement("etude_search_jobs").await > 0.0 {
+        tokio::task::yield_now().await;
+    }
     Client::connect(&service).await.open(open).await;
 }
 

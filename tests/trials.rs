@@ -136,6 +136,62 @@ async fn a_trial_goes_from_drawn_to_learned() {
 }
 
 #[tokio::test]
+async fn all_faults_of_a_request_for_a_trial_are_told_at_once() {
+    let service = start(&ONLY_WHEN_TOLD).await;
+    let demonstration = json!([{"x": 0}]);
+    for (request, expected) in [
+        (json!({"demonstration": [], "lookahead": 0, "q": 2}), vec!["/lookahead", "/model", "/q"]),
+        (json!({"model": "zz", "demonstration": demonstration, "q": 2}), vec!["/model", "/q"]),
+        (json!({"model": "zz", "demonstration": demonstration, "learner": 1}), vec!["/learner", "/model"]),
+        (json!({"model": "figure-6", "demonstration": [{"mood": 1}], "q": 2}), vec!["/demonstration/0/mood", "/q"]),
+    ] {
+        let (status, problem) = service.post("/v1/learners/gold/trials", &request).await;
+        let mut found = pointers(&problem);
+        found.sort_unstable();
+        assert_eq!((status, found), (422, expected), "{request}");
+    }
+    let unknown = json!({"model": "zz", "demonstration": demonstration});
+    let answer = service.post("/v1/learners/gold/trials", &unknown).await;
+    assert_eq!(kind(&answer), (404, "/problems/unknown-model"));
+}
+
+#[tokio::test]
+async fn a_reward_that_is_too_large_is_refused_for_what_it_is() {
+    let service = start(&ONLY_WHEN_TOLD).await;
+    let trial = make_trial(&service).await;
+    let reward = json!({"reward": 1, "why": "x".repeat(20_000)});
+    let (status, problem) = service.put(&format!("{}/reward", path_of(&trial)), &reward).await;
+    assert_eq!((status, &problem["type"]), (413, &json!("/problems/too-large")));
+    let detail = problem["detail"].as_str().unwrap();
+    assert!(detail.contains("16384") && !detail.contains("ETUDE_MAX_BODY_BYTES"), "{detail}");
+}
+
+#[tokio::test]
+async fn a_learner_that_cannot_be_read_keeps_no_other_from_learning() {
+    use sqlx::{ConnectOptions, Connection};
+    // First in the table, it comes first.
+    let service = Service::start(&["--learn-every", "10ms"]).await;
+    assert_eq!(service.put("/v1/learners/broken", &gold()).await.0, 201);
+    assert_eq!(service.put("/v1/learners/gold", &gold()).await.0, 201);
+    assert_eq!(service.put("/v1/models/figure-6", &example("figure-6/model.json")).await.0, 201);
+    let (status, broken) = service.post("/v1/learners/broken/trials", &trial_request()).await;
+    assert_eq!(status, 201, "{broken}");
+    let path = service.directory.path().join("etude.db");
+    let mut database = sqlx::sqlite::SqliteConnectOptions::new().filename(path).connect().await.unwrap();
+    let garble = "UPDATE learners SET definition = '{' WHERE name = 'broken'";
+    sqlx::query(garble).execute(&mut database).await.unwrap();
+    database.close().await.unwrap();
+
+    assert_eq!(reward(&service, &broken, 1.0).await.0, 200);
+    let trial = make_trial(&service).await;
+    assert_eq!(reward(&service, &trial, 1.0).await.0, 200);
+    while service.get(&path_of(&trial)).await.1["status"] != "learned" {
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(service.get(&path_of(&broken)).await.1["status"], "rewarded");
+}
+
+#[tokio::test]
 async fn weights_have_versions_tags_and_a_history() {
     let service = start(&ONLY_WHEN_TOLD).await;
     for n in 0..4 {

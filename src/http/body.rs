@@ -11,6 +11,7 @@ use axum::response::{IntoResponse, Response};
 use futures_util::{Stream, StreamExt, TryStreamExt};
 use serde::Serialize;
 
+use super::Context;
 use super::encoding::{BodyError, DecodedLimit, Encoding};
 use super::problem::{Problem, ProblemKind};
 use crate::document::Quoted;
@@ -30,11 +31,27 @@ const MIN_BYTES_PER_S: u64 = 64 * 1024;
 /// Of the body of a model, how much is waited for before reading begins: one that is not larger is at hand then.
 const AT_HAND_BYTES: usize = 1 << 20;
 
-/// Reads the JSON body of a request: at most `limit` bytes, as it is sent and once it is decompressed.
-pub(super) async fn read_json(request: Request, limit: usize) -> Result<Bytes, Problem> {
+/// Largest body of a reward or of a reason.
+const MAX_SMALL_BODY_BYTES: usize = 16 * 1024;
+
+/// Reads the JSON body of a request, which has its limit as it is sent and once it is decompressed.
+pub(super) async fn read_json(request: Request, context: &Context) -> Result<Bytes, Problem> {
+    let limit = SentLimit { n_bytes: context.max_body_bytes, setting: "ETUDE_MAX_BODY_BYTES" };
+    read_json_within(limit, request, context).await
+}
+
+/// Reads the JSON body of a request that has only little to say.
+pub(super) async fn read_small_json(request: Request, context: &Context) -> Result<Bytes, Problem> {
+    if context.max_body_bytes < MAX_SMALL_BODY_BYTES {
+        return read_json(request, context).await;
+    }
+    let limit = SentLimit { n_bytes: MAX_SMALL_BODY_BYTES, setting: "for this path, whatever the settings" };
+    read_json_within(limit, request, context).await
+}
+
+async fn read_json_within(limit: SentLimit, request: Request, context: &Context) -> Result<Bytes, Problem> {
     let is_json = format_of(request.headers()) == Some(Format::Json);
     let encoding = Encoding::declared(request.headers());
-    let limit = SentLimit { n_bytes: limit, setting: "ETUDE_MAX_BODY_BYTES" };
     let read = async {
         let body = open(request, limit).await?;
         let (bytes, _) = collect(body, limit, usize::MAX).await?;
@@ -56,7 +73,7 @@ pub(super) async fn read_json(request: Request, limit: usize) -> Result<Bytes, P
         encoding.decode(io::Cursor::new(bytes), limit)?.read_to_end(&mut decoded)?;
         Ok(decoded)
     };
-    let decoded = tokio::task::spawn_blocking(decode).await.map_err(io::Error::other).flatten();
+    let decoded = context.tasks.spawn_blocking(decode).await.map_err(io::Error::other).flatten();
     decoded.map(Bytes::from).map_err(|error| unreadable(&error))
 }
 

@@ -110,6 +110,7 @@ impl From<WeightsAnswer> for WeightsBody {
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn put_learner(
@@ -117,7 +118,7 @@ pub(super) async fn put_learner(
     PathName(name): PathName,
     request: Request,
 ) -> Result<Response, Problem> {
-    let body = read_json(request, context.max_body_bytes).await?;
+    let body = read_json(request, &context).await?;
     let (registered, answer) = context.etude.put_learner(&name, &body, Timestamp::now()).await?;
     let status = match registered {
         Registered::New => StatusCode::CREATED,
@@ -133,6 +134,7 @@ pub(super) async fn put_learner(
     responses(
         (status = 200, description = "The learner", body = LearnerBody),
         (status = 404, description = "`unknown-learner`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn get_learner(State(context): State<Context>, PathName(name): PathName) -> Result<Response, Problem> {
@@ -160,6 +162,8 @@ pub(super) async fn list_learners(State(context): State<Context>, paging: Paging
     responses(
         (status = 204, description = "It is deleted"),
         (status = 404, description = "`unknown-learner`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn delete_learner(
@@ -197,7 +201,8 @@ impl<S: Send + Sync> FromRequestParts<S> for WhichWeights {
     }
 }
 
-/// The weights of a learner. Their `ETag` is the version in quotes.
+/// The weights of a learner. Their `ETag` is the version in quotes: of a learner that was deleted and registered anew, it begins with 0
+/// again, so that tags from before the deletion are to be forgotten.
 #[utoipa::path(
     get, path = "/v1/learners/{learner}/weights", tag = "learners",
     params(
@@ -268,6 +273,8 @@ pub(super) async fn list_weights(
         (status = 200, description = "The weights, with every reward that was accepted before", body = WeightsBody,
             headers(("etag" = String, description = "The version in quotes"))),
         (status = 404, description = "`unknown-learner`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn learn(State(context): State<Context>, PathName(name): PathName) -> Result<Response, Problem> {

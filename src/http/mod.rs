@@ -30,6 +30,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use utoipa::OpenApi;
+use utoipa::openapi::{Content, Ref, ResponseBuilder};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
@@ -58,6 +59,8 @@ pub struct Context {
     pub stream_places: Arc<Semaphore>,
     /// The streams that run.
     pub streams: TaskTracker,
+    /// Whatever else runs.
+    pub tasks: TaskTracker,
 }
 
 impl Context {
@@ -130,7 +133,19 @@ fn routes() -> OpenApiRouter<Context> {
 /// Never: every description can be written as YAML.
 #[must_use]
 pub fn openapi() -> String {
-    routes().into_openapi().to_yaml().expect("every description can be written as YAML")
+    let mut description = routes().into_openapi();
+    // Not the handlers' to name, as any of them may meet a defect or a failing disk.
+    let internal = ResponseBuilder::new()
+        .description("`internal`: what went wrong was logged under the request's id")
+        .content("application/problem+json", Content::new(Some(Ref::from_schema_name("Problem"))))
+        .build();
+    let paths = description.paths.paths.iter_mut().filter(|(path, _)| path.starts_with("/v1/"));
+    for (_, path) in paths {
+        for operation in [&mut path.get, &mut path.put, &mut path.post, &mut path.delete].into_iter().flatten() {
+            operation.responses.responses.insert("500".to_owned(), internal.clone().into());
+        }
+    }
+    description.to_yaml().expect("every description can be written as YAML")
 }
 
 /// The whole service as a router.

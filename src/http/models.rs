@@ -117,7 +117,7 @@ struct WholeModelBody {
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "`unsupported-media-type`; `unsupported-encoding`: see `Accept-Encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn put_model(
@@ -199,6 +199,7 @@ pub(super) async fn list_models(State(context): State<Context>, paging: Paging) 
         (status = 204, description = "It is deleted"),
         (status = 404, description = "`unknown-model`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn delete_model(

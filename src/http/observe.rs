@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use axum::extract::{MatchedPath, Request};
-use axum::http::{HeaderMap, HeaderName, HeaderValue};
+use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::FutureExt;
@@ -39,7 +39,12 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
         span.in_scope(|| tracing::error!(panic = panic_message(panic.as_ref()), "a handler panicked"));
         Problem::new(ProblemKind::Internal, "an internal error was logged under this request id").into_response()
     });
-    if let Some(problem) = response.extensions_mut().remove::<Problem>() {
+    let problem = response.extensions_mut().remove::<Problem>().or_else(|| {
+        // Of the page that describes the service, whose files are another's to serve.
+        let is_bare = response.status() == StatusCode::NOT_FOUND;
+        is_bare.then(|| Problem::new(ProblemKind::NotFound, "there is nothing at this path"))
+    });
+    if let Some(problem) = problem {
         let headers = std::mem::take(response.headers_mut());
         response = problem.render(&id);
         // What the router added, such as `Allow`; the body's own headers are the document's.
@@ -54,7 +59,7 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
     unanswered.is_answered = true;
     let elapsed = unanswered.started.elapsed();
     let status = response.status().as_u16();
-    let labels = [("method", method.to_string()), ("route", route), ("status", status.to_string())];
+    let labels = [("method", method_label(&method).to_owned()), ("route", route), ("status", status.to_string())];
     metrics::counter!("etude_http_requests_total", &labels).increment(1);
     metrics::histogram!("etude_http_request_duration_seconds", &labels).record(elapsed.as_secs_f64());
     let elapsed_us = u64::try_from(elapsed.as_micros()).unwrap_or(u64::MAX);
@@ -67,6 +72,14 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
         }
     });
     response
+}
+
+/// The method, if it is a standard one: labels are kept for as long as the service runs, so that clients must not make them up.
+fn method_label(method: &Method) -> &str {
+    match method.as_str() {
+        known @ ("GET" | "HEAD" | "POST" | "PUT" | "DELETE" | "CONNECT" | "OPTIONS" | "TRACE" | "PATCH") => known,
+        _ => "other",
+    }
 }
 
 /// Takes the client's id if it is short and plain, else makes one.

@@ -20,12 +20,12 @@ pub(super) async fn livez() -> &'static str {
     "alive\n"
 }
 
-/// Whether requests should be sent here: the database answers, and no shutdown has begun.
+/// Whether requests should be sent here: the database answers, writes are taken, and no shutdown has begun.
 #[utoipa::path(
     get, path = "/readyz", tag = "operation",
     responses(
         (status = 200, description = "They should", body = String, content_type = "text/plain"),
-        (status = 503, description = "`not-ready`: the database does not answer; `stopping`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`not-ready`: the database does not answer, or nothing can be written to it; `stopping`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn readyz(State(context): State<Context>) -> Result<&'static str, Problem> {
@@ -34,7 +34,7 @@ pub(super) async fn readyz(State(context): State<Context>) -> Result<&'static st
     }
     context.etude.check().await.map_err(|error| {
         tracing::warn!(error = &error as &dyn std::error::Error, "not ready");
-        Problem::new(ProblemKind::NotReady, "the database does not answer")
+        Problem::new(ProblemKind::NotReady, "the database does not answer, or nothing can be written to it")
     })?;
     Ok("ready\n")
 }

@@ -33,12 +33,12 @@ use crate::service::{BatchRequest, ServiceError};
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn make_policy(State(context): State<Context>, request: Request) -> Result<Response, Problem> {
     let arrived = Instant::now();
-    let body = read_json(request, context.max_body_bytes).await?;
+    let body = read_json(request, &context).await?;
     let made = context.etude.make_policy(body, arrived, Timestamp::now()).await?;
     let mut response = json_text(StatusCode::CREATED, made.policy);
     if let Ok(location) = HeaderValue::from_str(&format!("/v1/policies/{}", made.id)) {
@@ -58,13 +58,13 @@ pub(super) async fn make_policy(State(context): State<Context>, request: Request
     request_body = BatchRequest,
     responses(
         (status = 200, description = "For each item its policy, or what is wrong with it", body = BatchAnswer),
-        (status = 400, description = "`malformed-json`, `incomplete-body`", body = Problem, content_type = "application/problem+json"),
+        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "`unknown-model`, `unknown-learner`", body = Problem, content_type = "application/problem+json"),
         (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn make_policies(
@@ -73,7 +73,7 @@ pub(super) async fn make_policies(
     request: Request,
 ) -> Result<Response, Problem> {
     let arrived = Instant::now();
-    let body = read_json(request, context.max_body_bytes).await?;
+    let body = read_json(request, &context).await?;
     let made = context.etude.make_policies(body, arrived, Timestamp::now()).await?;
     let mut text = String::with_capacity(made.iter().flatten().map(|made| made.policy.len() + 1).sum());
     let mut separator = r#"{"items":["#;

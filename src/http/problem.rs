@@ -210,7 +210,7 @@ impl From<ServiceError> for Problem {
             ServiceError::AlreadyRewarded { .. } => Self::new(ProblemKind::AlreadyRewarded, detail),
             ServiceError::TrialFailed { .. } => Self::new(ProblemKind::TrialFailed, detail),
             ServiceError::Pool(PoolError::Busy) => Self::new(ProblemKind::Busy, detail),
-            ServiceError::Store(StoreError::Locked) => Self::new(ProblemKind::NotReady, detail),
+            ServiceError::Store(StoreError::Locked | StoreError::Lost) => Self::new(ProblemKind::NotReady, detail),
             ServiceError::Store(StoreError::Closed) | ServiceError::Pool(PoolError::Stopped) => {
                 Self::new(ProblemKind::Stopping, detail)
             }

@@ -11,16 +11,13 @@ use serde_json::value::RawValue;
 use utoipa::{IntoParams, ToSchema};
 
 use super::Context;
-use super::body::{json, read_json};
+use super::body::{json, read_json, read_small_json};
 use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
 use super::problem::Problem;
 use crate::mapping::{ObservationDocument, Policy, StartReference};
 use crate::service::{ServiceError, TrialAnswer};
 use crate::store::{StoreError, TrialStatus};
-
-/// Largest body of a reward or of a reason.
-const MAX_SMALL_BODY_BYTES: usize = 16 * 1024;
 
 /// A request for a trial.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]
@@ -136,7 +133,7 @@ pub(super) struct FailureBody {
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`; also if the model lacks an attribute of the learner", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn make_trial(
@@ -144,7 +141,7 @@ pub(super) async fn make_trial(
     PathName(name): PathName,
     request: Request,
 ) -> Result<Response, Problem> {
-    let body = read_json(request, context.max_body_bytes).await?;
+    let body = read_json(request, &context).await?;
     let made = TrialBody::of(context.etude.make_trial(&name, body, Timestamp::now()).await?)?;
     let location = HeaderValue::from_str(&format!("/v1/trials/{}", made.id));
     let mut response = json(StatusCode::CREATED, &made);
@@ -232,6 +229,7 @@ pub(super) async fn get_trial(State(context): State<Context>, PathId(id): PathId
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`: among others, not finite", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn put_reward(
@@ -239,7 +237,7 @@ pub(super) async fn put_reward(
     PathId(id): PathId,
     request: Request,
 ) -> Result<Response, Problem> {
-    let body = read_json(request, context.max_body_bytes.min(MAX_SMALL_BODY_BYTES)).await?;
+    let body = read_small_json(request, &context).await?;
     let trial = context.etude.reward_trial(&id, &body, Timestamp::now()).await?;
     Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
 }
@@ -258,6 +256,7 @@ pub(super) async fn put_reward(
         (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn fail_trial(
@@ -265,7 +264,7 @@ pub(super) async fn fail_trial(
     PathId(id): PathId,
     request: Request,
 ) -> Result<Response, Problem> {
-    let body = read_json(request, context.max_body_bytes.min(MAX_SMALL_BODY_BYTES)).await?;
+    let body = read_small_json(request, &context).await?;
     let trial = context.etude.fail_trial(&id, &body, Timestamp::now()).await?;
     Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
 }

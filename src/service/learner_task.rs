@@ -29,7 +29,6 @@ impl Etude {
                 () = stopping.cancelled() => return,
             }
             if let Err(error) = self.learn_all(Timestamp::now()).await {
-                // What is pending stays pending, and is tried again.
                 tracing::error!(error = &error as &dyn std::error::Error, "learning failed");
             }
         }
@@ -41,7 +40,14 @@ impl Etude {
             match self.learn(&name, now).await {
                 // Deleted since.
                 Ok(_) | Err(ServiceError::Unknown { .. }) => {}
-                Err(error) => return Err(error),
+                // What is wrong with one learner is no concern of the others. What is pending stays pending, and is tried again.
+                Err(error) => {
+                    tracing::error!(
+                        error = &error as &dyn std::error::Error,
+                        learner = name.as_str(),
+                        "learning failed"
+                    );
+                }
             }
         }
         Ok(())

@@ -1,8 +1,8 @@
 //! The registry of learners, their weights, and how they learn.
 
-use jiff::{Timestamp, Unit};
+use jiff::Timestamp;
 
-use super::{Etude, Name, Registered, ServiceError};
+use super::{Etude, Name, Registered, ServiceError, as_stored};
 use crate::document;
 use crate::learning::{Distribution, Learner, LearnerDocument};
 use crate::model::hash_of;
@@ -99,8 +99,7 @@ impl Etude {
             hash: hash_of(&definition),
             definition,
             initial: learner.initial().clone(),
-            // As exact as it is stored.
-            created_at: now.round(Unit::Millisecond).unwrap_or(now),
+            created_at: as_stored(now),
         };
         let (registered, row) = match self.store.put_learner(new).await? {
             PutLearner::Created(row) => (Registered::New, row),
@@ -199,12 +198,8 @@ impl Etude {
         if reward_order == weights.reward_order {
             return Ok(weights_answer(name, &learner, weights));
         }
-        let folded = WeightsRow {
-            version: weights.version + 1,
-            reward_order,
-            distribution,
-            updated_at: now.round(Unit::Millisecond).unwrap_or(now),
-        };
+        let folded =
+            WeightsRow { version: weights.version + 1, reward_order, distribution, updated_at: as_stored(now) };
         if !self.store.add_weights(sequence, folded.clone()).await? {
             // Deleted meanwhile, or another process has learned; what that made is as good.
             let Ready { learner, weights, .. } = self.ready(name, None).await?;

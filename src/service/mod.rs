@@ -26,6 +26,8 @@ mod trials;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use jiff::{Timestamp, Unit};
+
 pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, ModelText, OpenText, Registered};
@@ -183,6 +185,15 @@ impl Etude {
         self.store.check().await
     }
 
+    /// Removes what a killed service has left behind. Only a service may, when it starts.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn sweep_left_behind(&self) -> Result<(), StoreError> {
+        self.store.sweep_left_behind().await
+    }
+
     /// Closes the store. Whoever still asks for something gets an error.
     pub async fn close(&self) {
         self.store.close().await;
@@ -197,3 +208,8 @@ impl Etude {
 
 /// How long to wait before trying again when the queue is full.
 pub const RETRY_AFTER: Duration = Duration::from_secs(1);
+
+/// A time as exact as it is stored.
+fn as_stored(time: Timestamp) -> Timestamp {
+    time.round(Unit::Millisecond).unwrap_or(time)
+}

@@ -4,13 +4,13 @@ use std::io::{self, BufRead};
 use std::sync::Arc;
 
 use futures_util::future::OptionFuture;
-use jiff::{Timestamp, Unit};
+use jiff::Timestamp;
 use serde_json::value::RawValue;
 use sha2::{Digest, Sha256};
 use tokio::sync::{Semaphore, SemaphorePermit, mpsc};
 
 use super::pool::Admission;
-use super::{Etude, Name, PipeWriter, PoolError, ServiceError, pipe};
+use super::{Etude, Name, PipeWriter, PoolError, ServiceError, as_stored, pipe};
 use crate::attribute::AttributeDocument;
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::Mapper;
@@ -142,8 +142,7 @@ impl Etude {
                 n_transitions: model.n_transitions() as u64,
             }),
             n_unsafe: model.n_unsafe() as u64,
-            // As exact as it is stored.
-            created_at: now.round(Unit::Millisecond).unwrap_or(now),
+            created_at: as_stored(now),
         };
         let key = ModelKey { hash: summary.hash.clone(), is_lazy: model.is_lazy() };
         let put = match (text, stored) {

@@ -83,13 +83,15 @@ impl Etude {
         let (Some(envelope), faults) = Envelope::read(&document, &Request::FIELDS, "demonstration") else {
             return Ok(None);
         };
-        let Ok(named) = self.find(&envelope, faults, place).await else { return Ok(None) };
+        let deadline = envelope.deadline(arrived);
+        let place = place.clone().with_patience(deadline);
+        let Ok(named) = self.find(&envelope, faults, &place).await else { return Ok(None) };
         let model = named.mapper.model();
         let demonstration = Demonstration::read_well_formed(model.schema(), demonstration.get());
         let Some(demonstration) = demonstration.filter(|read| is_quick(model, &document, read.len())) else {
             return Ok(None);
         };
-        let (deadline, stamp) = (envelope.deadline(arrived), envelope.stamp(id, &named));
+        let stamp = envelope.stamp(id, &named);
         let Named { learner, mapper, .. } = &named;
         let job = |interrupt: &mut dyn Interrupt| {
             let mut faults = Faults::default();
@@ -118,8 +120,10 @@ impl Etude {
         let (envelope, faults) = Envelope::read(&document, &Request::FIELDS, "demonstration");
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
-        let named = self.find(&envelope, faults, place).await?;
-        let (deadline, stamp) = (envelope.deadline(arrived), envelope.stamp(id, &named));
+        let deadline = envelope.deadline(arrived);
+        let place = place.clone().with_patience(deadline);
+        let named = self.find(&envelope, faults, &place).await?;
+        let stamp = envelope.stamp(id, &named);
         let Named { learner, mapper, .. } = named;
         let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
         let is_quick = is_small && is_quick(mapper.model(), &document, n_observations);
@@ -130,29 +134,28 @@ impl Etude {
         if is_quick { place.run_here(deadline, job).await? } else { place.run(deadline, job).await? }
     }
 
-    /// Finds what the request names. `faults` are those found so far; what is unknown is one more, if there are any.
+    /// Finds what the request names. `faults` are those found so far; what is unknown is one more, if there are any others.
     pub(super) async fn find(
         &self,
         envelope: &Envelope,
         mut faults: Faults,
         place: &Admission,
     ) -> Result<Named, ServiceError> {
-        let found = async {
-            let learner = match &envelope.learner {
-                Some(learner) => Some(self.ready(learner, Some("/learner")).await?),
-                None => None,
-            };
-            let (model_hash, mapper) = self.known_mapper(&envelope.model, "/model", place).await?;
-            Ok(Named { learner, model_hash, mapper })
+        let learner = match &envelope.learner {
+            Some(learner) => self.ready(learner, Some("/learner")).await.map(Some),
+            None => Ok(None),
         };
-        match found.await {
-            Err(ref error @ ServiceError::Unknown { pointer: Some(pointer), .. }) if !faults.is_empty() => {
-                let name = pointer.trim_start_matches('/');
-                faults.note_at(&Path::Member(&Path::Root, name), error.to_string());
-                Err(faults.into())
-            }
-            found => found,
+        let mapper = self.known_mapper(&envelope.model, "/model", place).await;
+        let errors = match (learner, mapper) {
+            (Ok(learner), Ok((model_hash, mapper))) => return Ok(Named { learner, model_hash, mapper }),
+            (Err(error), Ok(_)) | (Ok(_), Err(error)) if faults.is_empty() => return Err(error),
+            (learner, mapper) => learner.err().into_iter().chain(mapper.err()),
+        };
+        for error in errors {
+            let ServiceError::Unknown { pointer: Some(pointer), .. } = error else { return Err(error) };
+            faults.note_at(&Path::Member(&Path::Root, pointer.trim_start_matches('/')), error.to_string());
         }
+        Err(faults.into())
     }
 
     /// The policy with this id: JSON.
@@ -184,12 +187,12 @@ impl Etude {
     }
 }
 
-/// Parses a body, by its `place` in the pool if it is large.
+/// Parses a body, by its `place` in the pool if it is large: without waiting for searches, as how long it may wait is written in it.
 pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admission) -> Result<Value, ServiceError> {
     let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
         document::parse(body.as_ref())
     } else {
-        place.run(None, move |_| Ok(document::parse(body.as_ref()))).await?
+        place.run_reading(move || document::parse(body.as_ref())).await?
     };
     Ok(document?)
 }
@@ -198,6 +201,7 @@ pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admis
 pub(super) struct Envelope {
     pub(super) model: String,
     pub(super) learner: Option<String>,
+    /// None if there is a lookahead, which it has no effect on.
     pub(super) deadline: Option<Duration>,
 }
 
@@ -252,14 +256,15 @@ impl Envelope {
         let root = Place::root(document);
         let Some(object) = root.object(fields, &mut faults) else { return (None, faults) };
         let model = object.required("model", &mut faults).and_then(|place| place.string(&mut faults));
-        let learner = object.optional("learner").map(|place| place.string(&mut faults));
+        let learner = object.optional("learner").filter(|_| fields.contains(&"learner"));
+        let learner = learner.map(|place| place.string(&mut faults));
         object.required(about, &mut faults);
         let options = Request::read_options(&object, &mut faults);
         let names = model.zip(learner.map_or(Some(None), |learner| learner.map(Some)));
         let envelope = names.map(|(model, learner)| Self {
             model: model.to_owned(),
             learner: learner.map(str::to_owned),
-            deadline: options.and_then(|options| options.deadline),
+            deadline: options.filter(|options| options.lookahead.is_none()).and_then(|options| options.deadline),
         });
         (envelope, faults)
     }
@@ -287,11 +292,13 @@ impl Envelope {
 const MAX_INLINE_WORK: usize = 16_384;
 
 /// Whether a request with a small body is answered sooner than another thread would have taken it over. Of what may be in a
-/// request, a finite lookahead and the paper's heuristic can take far longer than the size of the problem tells.
+/// request, a finite lookahead and the paper's heuristic can take far longer than the size of the problem tells; of a world that is
+/// searched lazily, nobody knows the size.
 fn is_quick(model: &Model, document: &Value, n_observations: usize) -> bool {
     let size = model.graph().n_states() + model.graph().n_transitions();
     let step_bytes = || serde_json::to_string(&model.describe(0)).map_or(usize::MAX, |text| text.len());
-    document["lookahead"].is_null()
+    !model.is_lazy()
+        && document["lookahead"].is_null()
         && document["heuristic"] != "paper"
         && n_observations.saturating_mul(size) <= MAX_INLINE_WORK
         && n_observations.saturating_mul(step_bytes()) <= MAX_INLINE_BYTES
@@ -371,7 +378,8 @@ pub(super) fn follow(
         let mut request_for_refined = document.clone();
         // The weights that are used, wherever they came from.
         request_for_refined["weights"] = serde_json::json!(request.problem.named_weights());
-        for name in ["learner", "lookahead"] {
+        // The optimum does not depend on how it is searched for, and nobody waits for it.
+        for name in ["learner", "lookahead", "heuristic", "max_expansions", "deadline_ms"] {
             request_for_refined[name] = Value::Null;
         }
         NewRefinement {

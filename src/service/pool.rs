@@ -3,15 +3,23 @@
 //! A job is admitted if fewer than `n_threads + max_waiting` are in the pool, waits for a thread, and runs there. Whoever waits for
 //! a job may go away at any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`]. A job that is
 //! over before a change of threads would have paid for itself waits its turn like the others, and then runs where it is.
+//!
+//! Searches may keep their threads for long. So bodies, which are read in a fraction of a second, wait for each other only, and a job
+//! that has to be answered by some time runs beside the pool if it has waited until then: to finish at once is all that it can do.
+//! What nobody waits for runs where there is a thread to spare, and is stopped as soon as somebody needs that.
 
 use std::sync::Arc;
-use std::time::Instant;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
 use crate::interrupt::{Cancelled, Interrupt, Signal};
+
+/// How long a job that nobody waits for may go on when it has taken the last thread: longer than most jobs keep theirs.
+const LAST_THREAD_KEPT: Duration = Duration::from_millis(100);
 
 /// Size of the pool.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,6 +50,10 @@ pub struct SearchPool {
     settings: PoolSettings,
     admitted: Arc<Semaphore>,
     threads: Arc<Semaphore>,
+    /// How many jobs wait for a thread.
+    n_waiting: Arc<AtomicUsize>,
+    /// For what is read: as many again.
+    readers: Arc<Semaphore>,
     tasks: TaskTracker,
     abort: CancellationToken,
 }
@@ -55,6 +67,8 @@ impl SearchPool {
             settings,
             admitted: Arc::new(Semaphore::new(n_threads + settings.max_waiting)),
             threads: Arc::new(Semaphore::new(n_threads)),
+            n_waiting: Arc::default(),
+            readers: Arc::new(Semaphore::new(n_threads)),
             tasks,
             abort,
         }
@@ -79,7 +93,7 @@ impl SearchPool {
     /// [`PoolError::Busy`] at once if the queue is full.
     pub fn admit(&self) -> Result<Admission, PoolError> {
         let admitted = Arc::clone(&self.admitted).try_acquire_owned().map_err(|_| PoolError::Busy)?;
-        Ok(Admission { pool: self.clone(), admitted: Arc::new(admitted) })
+        Ok(Admission { pool: self.clone(), admitted: Arc::new(admitted), patience: None })
     }
 
     /// Runs `job` when there is a thread for it, however many wait. For callers that are bounded in number themselves.
@@ -92,7 +106,40 @@ impl SearchPool {
         T: Send + 'static,
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
-        self.run_admitted(None, None, job).await
+        let cancel = self.abort.child_token();
+        let thread = self.thread().await?;
+        self.run_holding(thread, None, cancel, job).await
+    }
+
+    /// Runs `job`, which nobody waits for, if there is a thread to spare: of several, another one stays free when it begins.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Busy`] if there is none, or the job was told to stop because somebody waits for a thread or all have been taken
+    /// for a while; [`PoolError::Stopped`] if the service ends.
+    pub async fn run_to_spare<T, F>(&self, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
+    {
+        let has_others = self.n_threads() > 1;
+        let free = Arc::clone(&self.threads).try_acquire_many_owned(if has_others { 2 } else { 1 });
+        let thread = free.ok().and_then(|mut free| free.split(1)).ok_or(PoolError::Busy)?;
+        let (threads, n_waiting) = (Arc::clone(&self.threads), Arc::clone(&self.n_waiting));
+        let yielding = move |watch: &mut dyn Interrupt| {
+            let mut last_since: Option<Instant> = None;
+            let mut is_needed = || {
+                let is_last = has_others && threads.available_permits() == 0;
+                last_since = if is_last { last_since.or_else(|| Some(Instant::now())) } else { None };
+                n_waiting.load(Ordering::Relaxed) > 0
+                    || last_since.is_some_and(|since| since.elapsed() >= LAST_THREAD_KEPT)
+            };
+            job(&mut || if is_needed() { Signal::Cancel } else { watch.poll() })
+        };
+        match self.run_holding(thread, None, self.abort.child_token(), yielding).await {
+            Err(PoolError::Stopped) if !self.abort.is_cancelled() => Err(PoolError::Busy),
+            answer => answer,
+        }
     }
 
     /// Runs `job` beside the threads of the pool, which it must not keep: it waits for others. For callers that are bounded in
@@ -110,27 +157,23 @@ impl SearchPool {
     }
 
     /// Waits for a thread.
-    async fn turn(&self) -> Result<OwnedSemaphorePermit, PoolError> {
+    async fn thread(&self) -> Result<OwnedSemaphorePermit, PoolError> {
+        if !self.abort.is_cancelled()
+            && let Ok(thread) = Arc::clone(&self.threads).try_acquire_owned()
+        {
+            return Ok(thread);
+        }
+        let _counted = Waiting::new(&self.n_waiting);
+        self.turn(&self.threads).await
+    }
+
+    /// Waits for one of `threads`.
+    async fn turn(&self, threads: &Arc<Semaphore>) -> Result<OwnedSemaphorePermit, PoolError> {
         tokio::select! {
             biased;
             () = self.abort.cancelled() => Err(PoolError::Stopped),
-            thread = Arc::clone(&self.threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped),
+            thread = Arc::clone(threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped),
         }
-    }
-
-    async fn run_admitted<T, F>(
-        &self,
-        admitted: Option<Arc<OwnedSemaphorePermit>>,
-        deadline: Option<Instant>,
-        job: F,
-    ) -> Result<T, PoolError>
-    where
-        T: Send + 'static,
-        F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
-    {
-        let cancel = self.abort.child_token();
-        let thread = self.turn().await?;
-        self.run_holding((admitted, thread), deadline, cancel, job).await
     }
 
     /// Runs `job`, and keeps `held` until it has really ended, even if nobody waits for it any more.
@@ -161,14 +204,46 @@ impl SearchPool {
     }
 }
 
-/// A place in the pool. Given back when this is dropped and the last job that ran by it has ended.
-#[derive(Debug)]
+/// A place in the pool. Given back when this and its clones are dropped and the last job that ran by it has ended.
+#[derive(Clone, Debug)]
 pub struct Admission {
     pool: SearchPool,
     admitted: Arc<OwnedSemaphorePermit>,
+    /// Until when jobs wait for a thread.
+    patience: Option<Instant>,
 }
 
 impl Admission {
+    /// The same place, whose jobs wait for a thread of the pool until `patience` at most, and then run beside it.
+    #[must_use]
+    pub fn with_patience(self, patience: Option<Instant>) -> Self {
+        Self { patience, ..self }
+    }
+
+    /// Waits for a thread; nothing if the patience ends first.
+    async fn turn(&self) -> Result<Option<OwnedSemaphorePermit>, PoolError> {
+        let turn = self.pool.thread();
+        match self.patience {
+            None => turn.await.map(Some),
+            Some(patience) => tokio::time::timeout_at(patience.into(), turn).await.ok().transpose(),
+        }
+    }
+
+    /// Runs `job`, which ends by itself in a fraction of a second, off the async threads: it does not wait for searches.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the service ends before it has begun.
+    pub async fn run_reading<T, F>(&self, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce() -> T + Send + 'static,
+    {
+        let cancel = self.pool.abort.child_token();
+        let reader = self.pool.turn(&self.pool.readers).await?;
+        self.pool.run_holding((Arc::clone(&self.admitted), reader), None, cancel, |_| Ok(job())).await
+    }
+
     /// Runs `job` on a thread of the pool. It is told to finish when `deadline` has passed, and to stop when the returned
     /// future is dropped or the service ends.
     ///
@@ -180,7 +255,9 @@ impl Admission {
         T: Send + 'static,
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
-        self.pool.run_admitted(Some(Arc::clone(&self.admitted)), deadline, job).await
+        let cancel = self.pool.abort.child_token();
+        let thread = self.turn().await?;
+        self.pool.run_holding((Arc::clone(&self.admitted), thread), deadline, cancel, job).await
     }
 
     /// Runs `job`, which takes no longer than a millisecond or so, in place of a thread of the pool: on the one that polls the
@@ -194,9 +271,25 @@ impl Admission {
         deadline: Option<Instant>,
         job: impl FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled>,
     ) -> Result<T, PoolError> {
-        let _thread = self.pool.turn().await?;
+        let _thread = self.turn().await?;
         let mut interrupt = Watch { cancel: self.pool.abort.clone(), deadline };
         job(&mut interrupt).map_err(|Cancelled| PoolError::Stopped)
+    }
+}
+
+/// Counts a job that waits, until it is dropped.
+struct Waiting(Arc<AtomicUsize>);
+
+impl Waiting {
+    fn new(n_waiting: &Arc<AtomicUsize>) -> Self {
+        n_waiting.fetch_add(1, Ordering::Relaxed);
+        Self(Arc::clone(n_waiting))
+    }
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        self.0.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
@@ -293,6 +386,61 @@ mod tests {
         assert_eq!(place.run_here(Some(Instant::now()), until_cancelled).await, Ok(()));
         abort.cancel();
         assert_eq!(place.run_here(None, |_| Ok(7)).await, Err(PoolError::Stopped));
+    }
+
+    #[tokio::test]
+    async fn a_job_whose_patience_ends_and_one_that_reads_do_not_wait_for_searches() {
+        let (pool, _abort) = pool(1, 1);
+        let running = tokio::spawn({
+            let pool = pool.clone();
+            async move { pool.admit()?.run(None, until_cancelled).await }
+        });
+        while pool.n_jobs() == 0 {
+            tokio::task::yield_now().await;
+        }
+        let place = pool.admit().unwrap();
+        assert_eq!(place.run_reading(|| 7).await, Ok(7));
+        let now = Instant::now();
+        let impatient = place.clone().with_patience(Some(now));
+        assert_eq!(impatient.run(Some(now), until_cancelled).await, Ok(()));
+        assert_eq!(impatient.run_here(Some(now), until_cancelled).await, Ok(()));
+        assert_eq!(pool.n_jobs(), 2, "the first one still runs");
+        let mut waiting = Box::pin(place.run(Some(now), until_cancelled));
+        assert!(futures_util::poll!(&mut waiting).is_pending(), "its patience was not limited");
+        running.abort();
+        assert_eq!(waiting.await, Ok(()));
+    }
+
+    #[tokio::test]
+    async fn what_nobody_waits_for_makes_way_for_whoever_does() {
+        let (pool, abort) = pool(1, 1);
+        let spare = Box::pin(pool.run_to_spare(until_cancelled));
+        let mut spare = std::pin::pin!(spare);
+        assert!(futures_util::poll!(&mut spare).is_pending());
+        assert_eq!(pool.run_to_spare(|_| Ok(())).await, Err(PoolError::Busy), "there is one thread");
+        assert_eq!(pool.admit().unwrap().run(None, |_| Ok(7)).await, Ok(7));
+        assert_eq!(spare.await, Err(PoolError::Busy));
+        assert_eq!(pool.run_to_spare(|_| Ok(7)).await, Ok(7));
+        abort.cancel();
+        assert_eq!(pool.run_to_spare(until_cancelled).await, Err(PoolError::Stopped));
+    }
+
+    #[tokio::test]
+    async fn what_nobody_waits_for_leaves_a_thread_free() {
+        let (pool, _abort) = pool(2, 0);
+        let mut running = Box::pin(pool.run_patiently(until_cancelled));
+        assert!(futures_util::poll!(&mut running).is_pending());
+        assert_eq!(pool.run_to_spare(|_| Ok(())).await, Err(PoolError::Busy));
+        drop(running);
+        // Its thread is free once it has seen that.
+        while pool.threads.available_permits() < 2 {
+            tokio::task::yield_now().await;
+        }
+        let mut spare = Box::pin(pool.run_to_spare(until_cancelled));
+        assert!(futures_util::poll!(&mut spare).is_pending());
+        let mut running = Box::pin(pool.run_patiently(until_cancelled));
+        assert!(futures_util::poll!(&mut running).is_pending());
+        assert_eq!(spare.await, Err(PoolError::Busy), "it had the last one for a while");
     }
 
     #[tokio::test]

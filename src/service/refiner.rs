@@ -1,6 +1,14 @@
 //! Refinement: policies that a finite lookahead decided are followed, in the background, by the global optimum.
 //!
-//! What waits is in the store, so that a restart forgets nothing. One policy is refined at a time.
+//! What waits is in the store, so that a restart forgets nothing. One policy is refined at a time, where there is a thread to spare:
+//!
+//! ```text
+//! next --search--> optimal: stored, linked
+//!  ^         |---> budget spent, model gone, cannot be read: given up, logged
+//!  +--pause--+---> somebody needs the thread, database locked: later, after the others; every pause is longer than the last
+//! ```
+//!
+//! A search that made way begins anew. So while all threads are needed all the time, policies stay what they are.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -11,14 +19,17 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::policies::{PolicyText, as_micros, read_weighted_request, report, write_policy};
-use super::{Etude, ServiceError};
+use super::{Etude, PoolError, ServiceError};
 use crate::document;
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::{Mapper, Policy, Settings, Stamp, Status};
-use crate::store::{NewRefinement, RefinementEnd};
+use crate::store::{NewRefinement, RefinementEnd, StoreError};
 
-/// How long after a failure it is tried again.
-const RETRY_EVERY: Duration = Duration::from_secs(10);
+/// The first pause after a refinement that did not come to its end.
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+
+/// The longest one.
+const LONGEST_PAUSE: Duration = Duration::from_secs(10);
 
 /// The way to wake the refiner.
 #[derive(Debug, Default)]
@@ -33,68 +44,118 @@ impl Refiner {
     }
 }
 
+/// What became of a refinement.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Outcome {
+    /// It is over, one way or the other.
+    Ended,
+    /// It is to be taken up again.
+    Later,
+}
+
 impl Etude {
     /// Refines whatever waits to be refined, until `stopping` is cancelled.
     pub async fn refine_until(self: Arc<Self>, stopping: CancellationToken) {
+        let mut after = 0;
+        let mut pause = FIRST_PAUSE;
         loop {
-            let waiting = tokio::select! {
-                waiting = self.refine_next() => waiting,
+            let outcome = tokio::select! {
+                outcome = self.refine_next(&mut after) => outcome,
                 () = stopping.cancelled() => return,
             };
-            let pause = match waiting {
-                Ok(true) => continue,
-                Ok(false) => Duration::MAX,
-                Err(error) => {
-                    tracing::warn!(error = &error as &dyn std::error::Error, "a policy could not be refined yet");
-                    RETRY_EVERY
+            match outcome {
+                Ok(Some(Outcome::Ended)) => {
+                    pause = FIRST_PAUSE;
+                    continue;
                 }
-            };
+                Ok(None) => {
+                    tokio::select! {
+                        () = self.refiner.work.notified() => continue,
+                        () = stopping.cancelled() => return,
+                    }
+                }
+                Ok(Some(Outcome::Later)) => {}
+                Err(error) => {
+                    tracing::warn!(error = &error as &dyn std::error::Error, "no policy could be refined");
+                }
+            }
             tokio::select! {
-                () = self.refiner.work.notified() => {}
-                () = tokio::time::sleep(pause) => {}
+                () = tokio::time::sleep(pause) => pause = (2 * pause).min(LONGEST_PAUSE),
                 () = stopping.cancelled() => return,
             }
         }
     }
 
-    /// Refines the policy that has waited longest. Says whether there was one.
-    async fn refine_next(&self) -> Result<bool, ServiceError> {
-        let Some(NewRefinement { policy_id, model_hash, request }) = self.store.next_refinement().await? else {
-            return Ok(false);
+    /// Refines the policy that has waited longest of those after the sequence number `after`, which becomes its; of all, if there is
+    /// none. Nothing if none waits.
+    async fn refine_next(&self, after: &mut i64) -> Result<Option<Outcome>, StoreError> {
+        let next = match self.store.next_refinement(*after).await? {
+            None => self.store.next_refinement(0).await?,
+            next => next,
         };
-        let document = document::parse(request.as_bytes())?;
-        let model = document["model"].as_str().unwrap_or_default().to_owned();
-        let refined = match self.mapper(&model, "/model", None).await {
-            Ok((hash, mapper)) if hash == model_hash => {
-                let local = self.policy(&policy_id).await?;
-                let local: Policy = serde_json::from_str(&local).map_err(ServiceError::Write)?;
-                let id = Uuid::now_v7().to_string();
-                let stamp =
-                    Stamp { id: Some(id), model, model_hash, refines: Some(policy_id.clone()), ..Stamp::default() };
-                let local_cost = local.cost.total;
-                let job = move |interrupt: &mut dyn Interrupt| refine(&mapper, &document, local_cost, stamp, interrupt);
-                match self.pool.run_patiently(job).await? {
-                    // What cannot be read will not be read later either.
-                    Err(error @ (ServiceError::Parse(_) | ServiceError::Faults(_))) => {
-                        tracing::error!(error = &error as &dyn std::error::Error, policy_id, "cannot be refined");
-                        None
-                    }
-                    refined => refined?,
-                }
+        let Some((sequence, refinement)) = next else { return Ok(None) };
+        *after = sequence;
+        let policy_id = refinement.policy_id.clone();
+        let refined = match self.refine(refinement).await {
+            Ok(Some(refined)) => Some(refined),
+            Ok(None) => {
+                tracing::info!(policy_id, "not refined: the search has spent its budget");
+                None
+            }
+            Err(ServiceError::Pool(PoolError::Busy)) => {
+                tracing::debug!(policy_id, "not refined yet: no thread to spare");
+                return Ok(Some(Outcome::Later));
+            }
+            Err(error) if is_passing(&error) => {
+                tracing::warn!(error = &error as &dyn std::error::Error, policy_id, "not refined yet");
+                return Ok(Some(Outcome::Later));
             }
             // Without its model, the policy stays what it is.
-            Ok(_) | Err(ServiceError::Unknown { .. }) => None,
-            Err(error) => return Err(error),
+            Err(error @ ServiceError::Unknown { .. }) => {
+                tracing::info!(error = &error as &dyn std::error::Error, policy_id, "not refined");
+                None
+            }
+            Err(error) => {
+                tracing::error!(error = &error as &dyn std::error::Error, policy_id, "cannot be refined");
+                None
+            }
         };
         let refined = refined.map(|refined| refined.at(Timestamp::now()));
         self.store.end_refinement(RefinementEnd { policy_id, refined }).await?;
-        Ok(true)
+        Ok(Some(Outcome::Ended))
+    }
+
+    /// The refined policy; `None` if the budget does not suffice to find it.
+    async fn refine(&self, refinement: NewRefinement) -> Result<Option<PolicyText>, ServiceError> {
+        let NewRefinement { policy_id, model_hash, request } = refinement;
+        let document = document::parse(request.as_bytes())?;
+        let model = document["model"].as_str().unwrap_or_default().to_owned();
+        let (hash, mapper) = self.mapper(&model, "/model", None).await?;
+        if hash != model_hash {
+            // Another one is there under its name.
+            return Err(ServiceError::Unknown { kind: "model", name: model, pointer: None });
+        }
+        let local: Policy = serde_json::from_str(&self.policy(&policy_id).await?).map_err(ServiceError::Write)?;
+        let id = Uuid::now_v7().to_string();
+        let stamp = Stamp { id: Some(id), model, model_hash, refines: Some(policy_id), ..Stamp::default() };
+        let local_cost = local.cost.total;
+        let job = move |interrupt: &mut dyn Interrupt| optimum(&mapper, &document, local_cost, stamp, interrupt);
+        self.pool.run_to_spare(job).await?
     }
 }
 
-/// Searches for the global optimum, knowing a mapping of cost `local_cost`. Nothing if the budget ran out before anything
-/// better was found, or if what was found is too large.
-fn refine(
+/// Whether what has failed may go through later: nothing is wrong with the refinement itself.
+fn is_passing(error: &ServiceError) -> bool {
+    match error {
+        ServiceError::Pool(error) => *error != PoolError::Panicked,
+        ServiceError::Store(error) => !matches!(error, StoreError::Corrupt { .. }),
+        _ => false,
+    }
+}
+
+/// Searches for the global optimum, knowing a mapping of cost `local_cost`. Nothing if the budget ran out before that was proven,
+/// or if its policy is too large.
+fn optimum(
     mapper: &Mapper,
     document: &serde_json::Value,
     local_cost: f64,
@@ -108,11 +169,116 @@ fn refine(
     let started = Instant::now();
     let settings = Settings { upper_bound: Some(local_cost), ..request.settings };
     let mapping = mapper.map(&request.problem, settings, interrupt)?;
-    let is_no_better = mapping.status != Status::Optimal && mapping.cost.total >= local_cost;
-    if is_no_better || Policy::check_steps(mapper.model(), &mapping).is_err() {
-        return Ok(Ok(None));
-    }
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
+    if mapping.status != Status::Optimal || Policy::check_steps(mapper.model(), &mapping).is_err() {
+        return Ok(Ok(None));
+    }
     Ok(write_policy(stamp, &request.problem, &mapping).map(|(_, row)| Some(row)))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::interrupt::{Signal, Uninterrupted};
+    use crate::model::{Format, Limits};
+    use crate::service::{ModelText, Name, PoolSettings};
+    use crate::store::NewPolicy;
+
+    const NOW: Timestamp = Timestamp::UNIX_EPOCH;
+
+    async fn etude(directory: &std::path::Path) -> Etude {
+        let settings = super::super::Settings {
+            database: directory.join("etude.db"),
+            limits: Limits::DEFAULT,
+            model_cache_bytes: 1 << 20,
+            session_idle_timeout: Duration::MAX,
+            pool: PoolSettings { n_threads: 1, max_waiting: 1 },
+        };
+        let etude = Etude::open(&settings, &TaskTracker::new(), CancellationToken::new()).await.unwrap();
+        let world = ModelText::Whole(br#"{"dynamics": {"kind": "wumpus", "width": 4, "height": 4}}"#.to_vec());
+        etude.put_model(&Name::new("world").unwrap(), world, Format::Json, NOW).await.unwrap();
+        etude
+    }
+
+    /// A request that a search with a lookahead follows badly.
+    fn request() -> Value {
+        json!({"model": "world", "demonstration": [{"x": 0}, {"x": 3}, {"x": 0, "y": 3}], "lookahead": 1})
+    }
+
+    async fn made(etude: &Etude, request: &Value) -> String {
+        etude.make_policy(request.to_string().into_bytes(), Instant::now(), NOW).await.unwrap().id
+    }
+
+    async fn read(etude: &Etude, id: &str) -> Value {
+        serde_json::from_str(&etude.policy(id).await.unwrap()).unwrap()
+    }
+
+    #[tokio::test]
+    async fn what_can_never_be_refined_is_dropped_and_does_not_hold_up_the_others() {
+        let directory = tempfile::tempdir().unwrap();
+        let etude = etude(directory.path()).await;
+        let (hash, _) = etude.mapper("world", "/model", None).await.unwrap();
+        for (id, policy, request) in [
+            ("unreadable", "{}", request().to_string()),
+            ("garbled", "{}", "{".to_owned()),
+            ("gone", "{}", "{}".to_owned()),
+        ] {
+            let policy =
+                NewPolicy { id: id.to_owned(), summary: policy.to_owned(), steps: Vec::new(), created_at: NOW };
+            let refinement = NewRefinement { policy_id: id.to_owned(), model_hash: hash.clone(), request };
+            etude.store.add_policies(vec![policy], vec![refinement]).await.unwrap();
+        }
+        let good = made(&etude, &request()).await;
+        let mut after = 0;
+        while let Some(outcome) = etude.refine_next(&mut after).await.unwrap() {
+            assert_eq!(outcome, Outcome::Ended);
+        }
+        assert!(etude.policy("unreadable").await.is_err(), "it stays what it is");
+        let refined_by = read(&etude, &good).await["refined_by"].as_str().unwrap().to_owned();
+        assert_eq!(read(&etude, &refined_by).await["status"], "optimal");
+    }
+
+    #[tokio::test]
+    async fn who_waits_for_a_thread_comes_before_a_refinement_which_is_taken_up_again() {
+        let directory = tempfile::tempdir().unwrap();
+        let etude = etude(directory.path()).await;
+        let id = made(&etude, &request()).await;
+        let mut after = 0;
+        let mut running = Box::pin(etude.pool.run_patiently(|interrupt| {
+            while interrupt.poll() != Signal::Cancel {
+                std::thread::yield_now();
+            }
+            Ok(())
+        }));
+        assert!(futures_util::poll!(&mut running).is_pending());
+        assert_eq!(etude.refine_next(&mut after).await.unwrap(), Some(Outcome::Later));
+        drop(running);
+        while etude.refine_next(&mut after).await.unwrap() == Some(Outcome::Later) {
+            tokio::task::yield_now().await;
+        }
+        assert!(read(&etude, &id).await["refined_by"].is_string());
+    }
+
+    #[tokio::test]
+    async fn the_refined_policy_is_the_optimum_however_the_first_one_was_to_be_searched_for() {
+        let directory = tempfile::tempdir().unwrap();
+        let etude = etude(directory.path()).await;
+        let mut request = request();
+        (request["heuristic"], request["max_expansions"]) = ("paper".into(), 0.into());
+        let id = made(&etude, &request).await;
+        let mut after = 0;
+        assert_eq!(etude.refine_next(&mut after).await.unwrap(), Some(Outcome::Ended));
+        let refined_by = read(&etude, &id).await["refined_by"].as_str().unwrap().to_owned();
+        assert_eq!(read(&etude, &refined_by).await["status"], "optimal");
+
+        // What is better, but not proven to be the best, is not it.
+        let (_, mapper) = etude.mapper("world", "/model", None).await.unwrap();
+        (request["heuristic"], request["lookahead"]) = (Value::Null, Value::Null);
+        let refined = optimum(&mapper, &request, 1e9, Stamp::default(), &mut Uninterrupted);
+        assert!(refined.unwrap().unwrap().is_none());
+    }
 }

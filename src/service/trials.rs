@@ -10,8 +10,8 @@ use serde_json::value::RawValue;
 use uuid::Uuid;
 
 use super::learners::{Ready, unknown};
-use super::policies::{self, Searched};
-use super::{Etude, Name, ServiceError};
+use super::policies::{self, Envelope, Named, Searched};
+use super::{Etude, Name, ServiceError, as_stored};
 use crate::attribute::{Schema, Weights};
 use crate::document::{Faults, Path, Place, Range};
 use crate::interrupt::Interrupt;
@@ -49,24 +49,16 @@ impl Etude {
         let Ready { sequence, name, learner, weights } = self.ready(name.as_str(), None).await?;
         let place = self.pool.admit()?;
         let document = policies::parse(body, &place).await?;
-        let mut faults = Faults::default();
-        let root = Place::root(&document);
-        let model = root.object(&TRIAL_FIELDS, &mut faults).and_then(|object| {
-            object.required("demonstration", &mut faults);
-            object.required("model", &mut faults)?.string(&mut faults).map(str::to_owned)
-        });
-        let Some(model) = model else { return Err(faults.into()) };
-        let (model_hash, mapper) = match self.known_mapper(&model, "/model", &place).await {
-            Err(ServiceError::Unknown { .. }) if !faults.is_empty() => return Err(faults.into()),
-            found => found?,
-        };
+        let (envelope, faults) = Envelope::read(&document, &TRIAL_FIELDS, "demonstration");
+        let Some(envelope) = envelope else { return Err(faults.into()) };
+        let Named { model_hash, mapper, .. } = self.find(&envelope, faults, &place).await?;
 
         let numbers = self.trial_numbers.of(sequence, &self.store).await?;
         let id = Uuid::now_v7().to_string();
         let (policy_id, weights_version) = (Uuid::now_v7().to_string(), weights.version);
         let stamp = Stamp {
             id: Some(policy_id.clone()),
-            model,
+            model: envelope.model,
             model_hash,
             learner: Some(name.clone()),
             weights_version: Some(weights_version),
@@ -300,9 +292,4 @@ fn read_policy(policy: String) -> Result<Box<RawValue>, ServiceError> {
     let corrupt =
         |error: serde_json::Error| StoreError::Corrupt { table: "policies", column: "policy", source: error.into() };
     Ok(RawValue::from_string(policy).map_err(corrupt)?)
-}
-
-/// A time as exact as it is stored.
-pub(super) fn as_stored(time: Timestamp) -> Timestamp {
-    time.round(jiff::Unit::Millisecond).unwrap_or(time)
 }

@@ -3,12 +3,16 @@
 //! ```text
 //! begin -> piece, piece, ..            each in a transaction of its own: nobody waits for long
 //!       -> put_model                   makes them a model's, all at once
-//!       -> dropped, or the model deleted, or the program killed: the sweeper removes the pieces, some at a time
+//!       -> dropped, or the model deleted: the sweeper removes the pieces, some at a time
+//!       -> the program killed: a service that starts removes them
 //! ```
+//!
+//! What a killed program left behind looks like what another one is still storing. So only services remove it, and a definition
+//! becomes a model's only if all its pieces are still there.
 
 use sqlx::query::QueryScalar;
 use sqlx::sqlite::SqliteArguments;
-use sqlx::{Sqlite, SqliteConnection, SqlitePool};
+use sqlx::{Sqlite, SqliteConnection};
 use tokio::sync::mpsc;
 use tokio_util::task::TaskTracker;
 
@@ -28,7 +32,7 @@ const COMPRESSION_LEVEL: i32 = 1;
 #[derive(Debug)]
 pub struct NewPieces {
     pub(super) id: i64,
-    n_pieces: i64,
+    pub(super) n_pieces: i64,
     sweeper: Sweeper,
 }
 
@@ -44,15 +48,10 @@ impl Drop for NewPieces {
 pub(super) struct Sweeper(mpsc::UnboundedSender<i64>);
 
 impl Sweeper {
-    /// Starts the task in `tasks`, with `left`, which an earlier run has left behind. It ends when the writer takes no more.
-    pub(super) fn start(writer: Writer, left: Vec<i64>, tasks: &TaskTracker) -> Self {
+    /// Starts the task in `tasks`. It ends when the writer takes no more.
+    pub(super) fn start(writer: Writer, tasks: &TaskTracker) -> Self {
         let (queue, mut ids) = mpsc::unbounded_channel();
         tasks.spawn(async move {
-            for id in left {
-                if sweep(&writer, id).await.is_err() {
-                    return;
-                }
-            }
             loop {
                 tokio::select! {
                     id = ids.recv() => match id {
@@ -68,7 +67,7 @@ impl Sweeper {
 
     /// Removes the definition `id` some time soon, unless it is a model's.
     pub(super) fn sweep(&self, id: i64) {
-        // If the task has ended, the next run finds what is left.
+        // If the task has ended, the next service finds what is left.
         let _ = self.0.send(id);
     }
 }
@@ -89,6 +88,24 @@ async fn sweep(writer: &Writer, id: i64) -> Result<(), StoreError> {
 }
 
 impl Store {
+    /// Removes, some time soon, the definitions that are no model's. To be called by a service that starts, before it stores any:
+    /// those that another process is storing cannot be told from those that a killed one has left behind, and are
+    /// [`StoreError::Lost`] to it.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn sweep_left_behind(&self) -> Result<(), StoreError> {
+        let left = sqlx::query_scalar(
+            "SELECT id FROM (SELECT id FROM definitions UNION SELECT definition_id FROM definition_pieces)
+             WHERE NOT EXISTS (SELECT 1 FROM models WHERE definition_id = id)",
+        );
+        for id in left.fetch_all(&self.readers).await? {
+            self.sweeper.sweep(id);
+        }
+        Ok(())
+    }
+
     /// Begins to store a definition in pieces.
     ///
     /// # Errors
@@ -119,14 +136,18 @@ impl Store {
     ///
     /// # Errors
     ///
-    /// [`StoreError::Removed`] if the definition is no model's any more, or if the database failed.
+    /// [`StoreError::Removed`] if the definition is no model's any more, [`StoreError::Corrupt`] if it has no first piece, or if
+    /// the database failed.
     pub async fn piece(&self, definition_id: i64, seq: i64) -> Result<Option<Vec<u8>>, StoreError> {
         let query = sqlx::query_scalar("SELECT piece FROM definition_pieces WHERE definition_id = $1 AND seq = $2");
         let query = query.bind(definition_id).bind(seq);
         let Some(piece): Option<Vec<u8>> = query.fetch_optional(&self.readers).await? else {
             // Pieces are only ever removed once the model is.
-            let is_there = is_a_models(definition_id).fetch_one(&self.readers).await?;
-            return if is_there { Ok(None) } else { Err(StoreError::Removed) };
+            return match is_a_models(definition_id).fetch_one(&self.readers).await? {
+                false => Err(StoreError::Removed),
+                true if seq == 0 => Err(corrupt("definition_pieces", "seq")("the first piece is missing")),
+                true => Ok(None),
+            };
         };
         let decompress = move || zstd::bulk::decompress(&piece, PIECE_BYTES);
         let text = self.tasks.spawn_blocking(decompress).await.map_err(std::io::Error::other).flatten();
@@ -158,6 +179,19 @@ fn is_a_models<'q>(definition_id: i64) -> QueryScalar<'q, Sqlite, bool, SqliteAr
     sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM models WHERE definition_id = $1)").bind(definition_id)
 }
 
+/// Whether a definition has been begun, and has `n_pieces`.
+pub(super) async fn is_whole(
+    connection: &mut SqliteConnection,
+    definition_id: i64,
+    n_pieces: i64,
+) -> Result<bool, StoreError> {
+    let query = sqlx::query_scalar(
+        "SELECT EXISTS (SELECT 1 FROM definitions WHERE id = $1)
+             AND $2 = (SELECT count(*) FROM definition_pieces WHERE definition_id = $1)",
+    );
+    Ok(query.bind(definition_id).bind(n_pieces).fetch_one(connection).await?)
+}
+
 /// Removes some pieces of a definition, unless it is a model's. Says whether nothing is left to be done.
 pub(super) async fn sweep_some(connection: &mut SqliteConnection, definition_id: i64) -> Result<bool, StoreError> {
     if is_a_models(definition_id).fetch_one(&mut *connection).await? {
@@ -178,19 +212,12 @@ pub(super) async fn sweep_some(connection: &mut SqliteConnection, definition_id:
     Ok(true)
 }
 
-/// The definitions that are no model's.
-pub(super) async fn left_behind(readers: &SqlitePool) -> Result<Vec<i64>, StoreError> {
-    let query = sqlx::query_scalar(
-        "SELECT id FROM definitions WHERE NOT EXISTS (SELECT 1 FROM models WHERE definition_id = definitions.id)",
-    );
-    Ok(query.fetch_all(readers).await?)
-}
-
 #[cfg(test)]
 mod tests {
     use std::path::Path;
 
     use jiff::Timestamp;
+    use sqlx::sqlite::{SqliteConnectOptions, SqlitePool};
     use tokio_util::task::TaskTracker;
 
     use super::*;
@@ -205,6 +232,11 @@ mod tests {
         store.close().await;
         tasks.close();
         tasks.wait().await;
+    }
+
+    /// Another way to the same database.
+    async fn writing(directory: &Path) -> SqlitePool {
+        SqlitePool::connect_with(SqliteConnectOptions::new().filename(directory.join("etude.db"))).await.unwrap()
     }
 
     /// How many definitions and pieces there are, whoever they belong to.
@@ -271,7 +303,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn what_a_crash_leaves_behind_is_no_model_and_is_removed_at_the_next_start() {
+    async fn what_a_crash_leaves_behind_is_no_model_and_is_removed_by_the_next_service() {
         let directory = tempfile::tempdir().unwrap();
         let (store, tasks) = open(directory.path()).await;
         let kept = stored(&store, &["kept"]).await;
@@ -285,8 +317,62 @@ mod tests {
         let (store, tasks) = open(directory.path()).await;
         let names: Vec<_> = store.models(None, 10).await.unwrap().items.into_iter().map(|model| model.name).collect();
         assert_eq!(names, ["kept"]);
+        // Pieces alone would be no other's.
+        sqlx::query("DELETE FROM definitions WHERE id != 1").execute(&writing(directory.path()).await).await.unwrap();
+        store.sweep_left_behind().await.unwrap();
         until_counts_are(&store, (1, 1)).await;
         assert_eq!(text(&store, "kept").await.unwrap(), "kept");
+        close(store, tasks).await;
+    }
+
+    #[tokio::test]
+    async fn whoever_else_opens_the_database_leaves_alone_what_is_being_stored() {
+        let directory = tempfile::tempdir().unwrap();
+        let (store, tasks) = open(directory.path()).await;
+        let pieces = stored(&store, &["one, ", "two"]).await;
+        let (other, other_tasks) = open(directory.path()).await;
+        // It tidies up after itself, last of all that it would.
+        drop(stored(&other, &["unfinished"]).await);
+        while counts(&store).await.0 > 1 {
+            tokio::task::yield_now().await;
+        }
+        assert_eq!(counts(&store).await, (1, 2));
+        close(other, other_tasks).await;
+        assert!(matches!(store.put_model(model("m", pieces)).await.unwrap(), PutModel::Created(_)));
+        assert_eq!(text(&store, "m").await.unwrap(), "one, two");
+        close(store, tasks).await;
+    }
+
+    #[tokio::test]
+    async fn what_another_service_has_removed_becomes_no_model() {
+        let directory = tempfile::tempdir().unwrap();
+        let (store, tasks) = open(directory.path()).await;
+        let (other, other_tasks) = open(directory.path()).await;
+        let mut continued = stored(&store, &["one, "]).await;
+        let all_lost = stored(&store, &["two"]).await;
+        other.sweep_left_behind().await.unwrap();
+        until_counts_are(&store, (0, 0)).await;
+        store.add_piece(&mut continued, b"three".to_vec()).await.unwrap();
+        for pieces in [continued, all_lost] {
+            let put = store.put_model(model("m", pieces)).await;
+            assert!(matches!(put, Err(StoreError::Lost)), "{put:?}");
+        }
+        assert!(store.model("m").await.unwrap().is_none());
+        // Sent once more, it goes through.
+        let again = stored(&store, &["one, ", "three"]).await;
+        assert!(matches!(store.put_model(model("m", again)).await.unwrap(), PutModel::Created(_)));
+        close(other, other_tasks).await;
+        close(store, tasks).await;
+    }
+
+    #[tokio::test]
+    async fn a_definition_without_its_first_piece_is_corrupt() {
+        let directory = tempfile::tempdir().unwrap();
+        let (store, tasks) = open(directory.path()).await;
+        let pieces = stored(&store, &["all"]).await;
+        store.put_model(model("m", pieces)).await.unwrap();
+        sqlx::query("DELETE FROM definition_pieces").execute(&writing(directory.path()).await).await.unwrap();
+        assert!(matches!(text(&store, "m").await, Err(StoreError::Corrupt { .. })));
         close(store, tasks).await;
     }
 

@@ -6,7 +6,7 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
 use super::writer::{Write, Written};
-use super::{Page, Store, StoreError, corrupt, count, timestamp};
+use super::{Page, Store, StoreError, as_integer, corrupt, count, timestamp};
 use crate::attribute::ByAttribute;
 use crate::learning::Distribution;
 
@@ -250,11 +250,6 @@ fn read_weights(row: &SqliteRow) -> Result<WeightsRow, StoreError> {
         },
         updated_at: timestamp(TABLE, "updated_at_ms", row.try_get("updated_at_ms")?)?,
     })
-}
-
-/// As SQLite holds it; the counts and times of this program stay far below its limit.
-pub(super) fn as_integer(count: u64) -> i64 {
-    i64::try_from(count).unwrap_or(i64::MAX)
 }
 
 pub(super) async fn put(connection: &mut SqliteConnection, learner: &NewLearner) -> Result<PutLearner, StoreError> {

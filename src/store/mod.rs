@@ -84,6 +84,9 @@ pub enum StoreError {
     /// What is read was removed while it was.
     #[error("it was removed while it was read")]
     Removed,
+    /// Another process has removed some of what was to be registered; sent once more, it may go through.
+    #[error("another service on the same database has removed what was stored so far; send it again")]
+    Lost,
     /// The store is shutting down.
     #[error("the store takes no more writes")]
     Closed,
@@ -132,9 +135,8 @@ impl Store {
             .max_connections(N_READERS)
             .connect_with(options.create_if_missing(false).pragma("query_only", "ON"))
             .await?;
-        let left = definitions::left_behind(&readers).await?;
         let writer = Writer::start(connection, tasks);
-        let sweeper = Sweeper::start(writer.clone(), left, tasks);
+        let sweeper = Sweeper::start(writer.clone(), tasks);
         Ok(Self { readers, writer, sweeper, tasks: tasks.clone() })
     }
 
@@ -150,12 +152,15 @@ impl Store {
         self.writer.models_generation()
     }
 
-    /// Whether the database answers.
+    /// Whether the database answers, and writes are taken.
     ///
     /// # Errors
     ///
-    /// If it does not.
+    /// If not.
     pub async fn check(&self) -> Result<(), StoreError> {
+        if !self.writer.is_running() {
+            return Err(StoreError::Closed);
+        }
         sqlx::query("SELECT count(*) FROM (SELECT 1 FROM models LIMIT 1)").execute(&self.readers).await?;
         Ok(())
     }
@@ -218,6 +223,11 @@ fn corrupt<E: Into<Box<dyn std::error::Error + Send + Sync>>>(
     move |source| StoreError::Corrupt { table, column, source: source.into() }
 }
 
+/// As SQLite holds it; the counts and times of this program stay far below its limit.
+fn as_integer(count: u64) -> i64 {
+    i64::try_from(count).unwrap_or(i64::MAX)
+}
+
 /// A column that is never negative.
 fn count(row: &sqlx::sqlite::SqliteRow, table: &'static str, column: &'static str) -> Result<u64, StoreError> {
     use sqlx::Row;
@@ -226,4 +236,21 @@ fn count(row: &sqlx::sqlite::SqliteRow, table: &'static str, column: &'static st
 
 fn timestamp(table: &'static str, column: &'static str, ms: i64) -> Result<jiff::Timestamp, StoreError> {
     jiff::Timestamp::from_millisecond(ms).map_err(corrupt(table, column))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_store_whose_writer_has_ended_is_not_ready() {
+        let directory = tempfile::tempdir().unwrap();
+        let tasks = TaskTracker::new();
+        let store = Store::open(&directory.path().join("etude.db"), &tasks).await.unwrap();
+        store.check().await.unwrap();
+        store.writer.close();
+        tasks.close();
+        tasks.wait().await;
+        assert!(matches!(store.check().await, Err(StoreError::Closed)), "though it could be read");
+    }
 }

@@ -5,9 +5,9 @@ use sqlx::Row;
 use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
 
-use super::definitions::NewPieces;
+use super::definitions::{self, NewPieces};
 use super::writer::{Write, Written};
-use super::{Page, Store, StoreError, corrupt, timestamp};
+use super::{Page, Store, StoreError, as_integer, corrupt, count, timestamp};
 use crate::attribute::AttributeDocument;
 use crate::model::ActionDocument;
 
@@ -192,9 +192,7 @@ const UNKNOWN: i64 = 0;
 
 fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
     const TABLE: &str = "models";
-    let count = |column: &'static str| -> Result<u64, StoreError> {
-        u64::try_from(row.try_get::<i64, _>(column)?).map_err(corrupt(TABLE, column))
-    };
+    let count = |column| count(row, TABLE, column);
     Ok(ModelSummary {
         name: row.try_get("name")?,
         hash: row.try_get("hash")?,
@@ -216,7 +214,6 @@ pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> 
         NewDefinition::Pieces(pieces) => ("", Some(pieces.id)),
     };
     let json = |source: serde_json::Error| corrupt("models", "attributes")(source);
-    let count = |count: u64| i64::try_from(count).unwrap_or(i64::MAX);
     let inserted = sqlx::query(
         "INSERT INTO models
              (name, hash, definition, definition_id, attributes, actions, n_states, n_transitions, n_unsafe,
@@ -229,13 +226,19 @@ pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> 
     .bind(definition_id)
     .bind(serde_json::to_string(&summary.attributes).map_err(json)?)
     .bind(serde_json::to_string(&summary.actions).map_err(json)?)
-    .bind(summary.size.map_or(UNKNOWN, |size| count(size.n_states)))
-    .bind(summary.size.map_or(UNKNOWN, |size| count(size.n_transitions)))
-    .bind(count(summary.n_unsafe))
+    .bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_states)))
+    .bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_transitions)))
+    .bind(as_integer(summary.n_unsafe))
     .bind(summary.created_at.as_millisecond())
     .execute(&mut *connection)
     .await?;
     if inserted.rows_affected() == 1 {
+        if let NewDefinition::Pieces(NewPieces { id, n_pieces, .. }) = definition
+            && !definitions::is_whole(connection, *id, *n_pieces).await?
+        {
+            // Takes the insertion back.
+            return Err(StoreError::Lost);
+        }
         return Ok(PutModel::Created(summary.clone()));
     }
     let query = sqlx::query(

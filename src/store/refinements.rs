@@ -27,19 +27,23 @@ pub struct RefinementEnd {
 }
 
 impl Store {
-    /// The refinement that has waited longest.
+    /// The refinement that has waited longest of those after the sequence number `after`, with its own.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn next_refinement(&self) -> Result<Option<NewRefinement>, StoreError> {
-        let query = sqlx::query("SELECT policy_id, model_hash, request FROM refinements ORDER BY rowid LIMIT 1");
-        let Some(row) = query.fetch_optional(&self.readers).await? else { return Ok(None) };
-        Ok(Some(NewRefinement {
+    pub async fn next_refinement(&self, after: i64) -> Result<Option<(i64, NewRefinement)>, StoreError> {
+        let query = sqlx::query(
+            "SELECT rowid AS sequence, policy_id, model_hash, request FROM refinements WHERE rowid > $1
+             ORDER BY rowid LIMIT 1",
+        );
+        let Some(row) = query.bind(after).fetch_optional(&self.readers).await? else { return Ok(None) };
+        let refinement = NewRefinement {
             policy_id: row.try_get("policy_id")?,
             model_hash: row.try_get("model_hash")?,
             request: row.try_get("request")?,
-        }))
+        };
+        Ok(Some((row.try_get("sequence")?, refinement)))
     }
 
     /// Stores a refined policy and links the two.

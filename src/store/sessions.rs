@@ -12,7 +12,7 @@ use super::policies::NewPolicy;
 use super::refinements::NewRefinement;
 use super::trials::{self, NewTrial};
 use super::writer::{Write, Written};
-use super::{Page, Store, StoreError, corrupt, policies, refinements, timestamp};
+use super::{Page, Store, StoreError, as_integer, corrupt, policies, refinements, timestamp};
 use crate::attribute::ByAttribute;
 
 /// How far a session has come.
@@ -283,7 +283,7 @@ pub(super) async fn open(connection: &mut SqliteConnection, session: &NewSession
     .bind(session.lookahead)
     .bind(session.start)
     .bind(&session.learner)
-    .bind(session.weights_version.and_then(|version| i64::try_from(version).ok()))
+    .bind(session.weights_version.map(as_integer))
     .bind(session.trial.as_ref().map(|trial| &trial.id))
     .bind(created_at_ms)
     .execute(connection)

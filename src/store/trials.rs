@@ -7,9 +7,8 @@ use rustc_hash::FxHashMap;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{AssertSqlSafe, QueryBuilder, Row, SqliteConnection};
 
-use super::learners::as_integer;
 use super::writer::{Write, Written};
-use super::{NewPolicy, NewRefinement, Page, Store, StoreError, count, policies, refinements, timestamp};
+use super::{NewPolicy, NewRefinement, Page, Store, StoreError, as_integer, count, policies, refinements, timestamp};
 
 /// A trial to be stored.
 #[derive(Clone, Debug)]

@@ -137,6 +137,11 @@ impl Writer {
         self.closing.cancel();
     }
 
+    /// Whether writes are taken: not once it has ended, for whatever reason.
+    pub(super) fn is_running(&self) -> bool {
+        !self.queue.is_closed()
+    }
+
     /// Completes when no more writes are taken.
     pub(super) async fn closed(&self) {
         self.closing.cancelled().await;
