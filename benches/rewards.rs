@@ -110,7 +110,7 @@ impl Service {
         let address = server.address();
         let (stop, stopped) = tokio::sync::oneshot::channel::<()>();
         let running = tokio::spawn(async move {
-            server.run(async { drop(stopped.await) }).await.expect("a service that runs");
+            server.run(async { drop(stopped.await) }).await;
         });
         let mut client = Client::connect(address).await;
         let model: Value = serde_json::from_str(include_str!("../examples/figure-6/model.json")).expect("JSON");

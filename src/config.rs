@@ -62,6 +62,9 @@ pub struct ServeConfig {
     /// How often rewards are folded into the weights of their learners, such as 100ms or 1s; above 0.
     #[arg(long, env = "ETUDE_LEARN_EVERY", default_value = "1s", value_parser = parse_period, value_name = "TIME")]
     pub learn_every: Duration,
+    /// How long a client may take to send a request up to its body, or keep a connection without one.
+    #[arg(long, env = "ETUDE_HEAD_TIMEOUT", default_value = "2m", value_parser = parse_period, value_name = "TIME")]
+    pub head_timeout: Duration,
     /// How long requests may go on after SIGTERM or SIGINT, such as 500ms, 10s or 1m.
     #[arg(long, env = "ETUDE_DRAIN_TIMEOUT", default_value = "10s", value_parser = parse_duration, value_name = "TIME")]
     pub drain_timeout: Duration,

@@ -9,7 +9,6 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use axum::serve::ListenerExt;
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
@@ -51,9 +50,6 @@ pub enum ServerError {
     /// Measurements cannot be set up.
     #[error("cannot set up measurements")]
     Measurements(#[from] metrics_exporter_prometheus::BuildError),
-    /// Connections could no longer be accepted.
-    #[error("serving failed")]
-    Serve(#[source] std::io::Error),
 }
 
 /// A service that listens.
@@ -67,6 +63,7 @@ pub struct Server {
     streams: TaskTracker,
     stopping: CancellationToken,
     abort: CancellationToken,
+    head_timeout: Duration,
     drain_timeout: Duration,
 }
 
@@ -112,6 +109,7 @@ impl Server {
             streams,
             stopping,
             abort,
+            head_timeout: config.head_timeout,
             drain_timeout: config.drain_timeout,
         })
     }
@@ -124,33 +122,20 @@ impl Server {
 
     /// Serves until `stop` completes, then lets requests end within the drain time, aborts what is left, and closes the
     /// database.
-    ///
-    /// # Errors
-    ///
-    /// If connections can no longer be accepted.
-    pub async fn run(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), ServerError> {
-        let Self { listener, address, etude, router, tasks, streams, stopping, abort, drain_timeout } = self;
+    pub async fn run(self, stop: impl Future<Output = ()> + Send + 'static) {
+        let Self { listener, address, etude, router, tasks, streams, stopping, abort, head_timeout, drain_timeout } =
+            self;
         tracing::info!(%address, "listening on http://{address}");
-        let listener = listener.tap_io(|stream| {
-            // Small answers should not wait for more.
-            if let Err(error) = stream.set_nodelay(true) {
-                tracing::debug!(error = &error as &dyn std::error::Error, "could not set TCP_NODELAY");
-            }
-        });
-        let announce = {
-            let stopping = stopping.clone();
-            async move {
-                stop.await;
-                tracing::info!("stopping");
-                stopping.cancel();
-            }
+        let announce = async {
+            stop.await;
+            tracing::info!("stopping");
+            stopping.cancel();
         };
         let serving = async {
-            axum::serve(listener, router).with_graceful_shutdown(announce).await?;
+            tokio::join!(announce, http::serve(listener, router, head_timeout, &stopping));
             // Websockets are no longer the listener's.
             streams.close();
             streams.wait().await;
-            Ok(())
         };
         let overtime = async {
             stopping.cancelled().await;
@@ -160,7 +145,7 @@ impl Server {
             tokio::time::sleep(ABORT_GRACE).await;
         };
         tokio::select! {
-            served = serving => { let served: std::io::Result<()> = served; served.map_err(ServerError::Serve)?; }
+            () = serving => {}
             () = overtime => tracing::warn!("closing connections that are still open"),
         }
         abort.cancel();
@@ -170,7 +155,6 @@ impl Server {
         // A search that does not look up would keep the process; it ends without it.
         let ended = tokio::time::timeout(ABORT_GRACE, tasks.wait()).await;
         tracing::info!(is_clean = ended.is_ok(), "stopped");
-        Ok(())
     }
 }
 

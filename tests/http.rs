@@ -664,6 +664,23 @@ async fn a_shutdown_answers_what_still_runs_and_closes_the_database() {
 }
 
 #[tokio::test]
+async fn a_client_that_does_not_finish_its_request_finds_its_connection_closed() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let service = Service::start(&["--head-timeout", "1s"]).await;
+    for begun in ["", "GET /livez HTTP/1.1\r\nhost: ", "GET /livez HTTP/1.1\r\nhost: here\r\n\r\n"] {
+        let mut stream = tokio::net::TcpStream::connect(service.address).await.unwrap();
+        stream.write_all(begun.as_bytes()).await.unwrap();
+        let mut answer = String::new();
+        // Ends with the connection, which this side leaves open.
+        tokio::time::timeout(std::time::Duration::from_secs(30), stream.read_to_string(&mut answer))
+            .await
+            .unwrap()
+            .unwrap();
+        assert_eq!(answer.starts_with("HTTP/1.1 200"), begun.ends_with("\r\n\r\n"), "{answer}");
+    }
+}
+
+#[tokio::test]
 async fn a_database_that_another_process_holds_is_no_internal_error() {
     use sqlx::{ConnectOptions, Connection};
     let service = Service::start(&[]).await;

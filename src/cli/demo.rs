@@ -32,7 +32,7 @@ pub(super) fn run(out: &mut impl Write) -> Result<(), CliError> {
         }));
         let shown = show(address, out).await;
         drop(stop);
-        running.await.map_err(std::io::Error::other)??;
+        running.await.map_err(std::io::Error::other)?;
         shown
     })
 }

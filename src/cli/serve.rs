@@ -19,7 +19,8 @@ impl Serve {
             // Listened for before anything is started, so that no signal is missed.
             let stop = stop_signal()?;
             let server = Server::start(&self.config).await?;
-            Ok(server.run(stop).await?)
+            server.run(stop).await;
+            Ok(())
         });
         // A job that does not look up must not keep the process: the store is closed, and nobody waits any more.
         runtime.shutdown_background();

@@ -9,6 +9,7 @@
 //! The OpenAPI description is generated from the handlers of this module; [`openapi`] gives it without a running service.
 
 mod body;
+mod connections;
 mod encoding;
 mod learners;
 mod models;
@@ -36,6 +37,7 @@ use utoipa_axum::routes;
 
 use crate::service::Etude;
 use crate::stream::Limits;
+pub use connections::serve;
 use problem::{Problem, ProblemKind};
 
 /// What handlers work with.

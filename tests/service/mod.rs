@@ -49,7 +49,7 @@ impl Service {
         let address = server.address();
         let (stop, stopped) = oneshot::channel::<()>();
         let running = tokio::spawn(async move {
-            server.run(async { drop(stopped.await) }).await.unwrap();
+            server.run(async { drop(stopped.await) }).await;
         });
         let client = Client::builder().no_proxy().build().unwrap();
         Self { address, client, directory, stop, running }

@@ -1,0 +1,57 @@
+//! Connections: accepted, served, and ended in good order.
+
+use std::pin::pin;
+use std::time::Duration;
+
+use axum::Router;
+use axum::serve::{Listener, ListenerExt};
+use hyper::body::Incoming;
+use hyper::server::conn::http1;
+use hyper_util::rt::{TokioIo, TokioTimer};
+use hyper_util::service::TowerToHyperService;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::task::JoinSet;
+use tokio_util::sync::CancellationToken;
+
+/// Serves `router` on whatever connects, until `stopping` is cancelled and the requests that run then are answered. A client
+/// whose next request is not there, up to its body, after `head_timeout` finds its connection closed. So does everybody if the
+/// returned future is dropped.
+pub async fn serve(listener: TcpListener, router: Router, head_timeout: Duration, stopping: &CancellationToken) {
+    let mut builder = http1::Builder::new();
+    // Without a timer there is no timeout.
+    builder.timer(TokioTimer::new()).header_read_timeout(head_timeout);
+    let mut listener = listener.tap_io(|stream| {
+        // Small answers should not wait for more.
+        if let Err(error) = stream.set_nodelay(true) {
+            tracing::debug!(error = &error as &dyn std::error::Error, "could not set TCP_NODELAY");
+        }
+    });
+    let mut connections = JoinSet::new();
+    loop {
+        tokio::select! {
+            // Waits a moment where there are no more file descriptors.
+            (stream, _) = listener.accept() => {
+                connections.spawn(serve_connection(builder.clone(), stream, router.clone(), stopping.clone()));
+            }
+            Some(_) = connections.join_next() => {}
+            () = stopping.cancelled() => break,
+        }
+    }
+    drop(listener);
+    while connections.join_next().await.is_some() {}
+}
+
+async fn serve_connection(builder: http1::Builder, stream: TcpStream, router: Router, stopping: CancellationToken) {
+    let service = TowerToHyperService::new(router.into_service::<Incoming>());
+    let mut connection = pin!(builder.serve_connection(TokioIo::new(stream), service).with_upgrades());
+    let served = tokio::select! {
+        served = connection.as_mut() => served,
+        () = stopping.cancelled() => {
+            connection.as_mut().graceful_shutdown();
+            connection.await
+        }
+    };
+    if let Err(error) = served {
+        tracing::debug!(error = &error as &dyn std::error::Error, "a connection broke");
+    }
+}
