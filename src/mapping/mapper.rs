@@ -152,7 +152,8 @@ impl Mapper {
     }
 
     /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the
-    /// search by default. Consistent; 0 at the last observation. For other searches, and to look at.
+    /// search by default. Consistent, for nodes that the start leads to; 0 at the last observation. For other searches, and to
+    /// look at.
     ///
     /// # Panics
     ///
