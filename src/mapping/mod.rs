@@ -52,6 +52,7 @@ pub(crate) use online::longest_lookahead;
 pub use online::{CommittedStep, OnlineMapping};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
 pub use problem::Problem;
+pub(crate) use request::Conditions;
 pub use request::{
     ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,
 };
