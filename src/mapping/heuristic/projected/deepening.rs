@@ -234,7 +234,7 @@ impl<'p> Projected<'p> {
                         }
                     }
                 }
-                match meter.spend((n_classes + ways.ways.len()) as u64) {
+                match meter.spend((n_classes + ways.len()) as u64) {
                     Signal::Continue => {}
                     signal => return Err(signal),
                 }
