@@ -19,10 +19,6 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use utoipa::ToSchema;
 
-/// Largest cost of an action, and largest term of a distance; dimensionless. Keeps every sum along a path finite: even a
-/// hundred million of them stay below the largest float.
-pub const MAX_COST: f64 = 1e150;
-
 /// One thing wrong with a document, and where.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub struct Fault {
@@ -323,10 +319,10 @@ impl<'v, 'p> Place<'v, 'p> {
     /// Reads a finite number within `range`.
     pub fn number(&self, range: Range, faults: &mut Faults) -> Option<f64> {
         let Some(number) = self.value.as_f64().filter(|number| number.is_finite()) else {
-            return self.mismatch(range.describe(), faults);
+            return self.mismatch(&range.describe(), faults);
         };
         // Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bits.
-        if range.contains(number) { Some(number + 0.0) } else { self.mismatch(range.describe(), faults) }
+        if range.contains(number) { Some(number + 0.0) } else { self.mismatch(&range.describe(), faults) }
     }
 
     /// Reads a whole number from `least` to `most`.
@@ -399,7 +395,7 @@ impl<'v, 'p> Object<'v, 'p> {
 }
 
 /// Which finite numbers are allowed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Range {
     /// All of them.
     Finite,
@@ -407,10 +403,8 @@ pub enum Range {
     NonNegative,
     /// Above 0.
     Positive,
-    /// 0 to [`MAX_COST`].
-    Cost,
-    /// 0 to 1.
-    Fraction,
+    /// 0 to this.
+    UpTo(f64),
 }
 
 impl Range {
@@ -419,18 +413,17 @@ impl Range {
             Self::Finite => true,
             Self::NonNegative => number >= 0.0,
             Self::Positive => number > 0.0,
-            Self::Cost => (0.0..=MAX_COST).contains(&number),
-            Self::Fraction => (0.0..=1.0).contains(&number),
+            Self::UpTo(most) => (0.0..=most).contains(&number),
         }
     }
 
-    pub(crate) fn describe(self) -> &'static str {
+    pub(crate) fn describe(self) -> String {
         match self {
-            Self::Finite => "a number",
-            Self::NonNegative => "a number of at least 0",
-            Self::Positive => "a number above 0",
-            Self::Cost => "a cost: a number from 0 to 1e150",
-            Self::Fraction => "a number from 0 to 1",
+            Self::Finite => "a number".to_owned(),
+            Self::NonNegative => "a number of at least 0".to_owned(),
+            Self::Positive => "a number above 0".to_owned(),
+            Self::UpTo(most) if most < 1e6 => format!("a number from 0 to {most}"),
+            Self::UpTo(most) => format!("a number from 0 to {most:e}"),
         }
     }
 }

@@ -24,8 +24,11 @@ pub use schema::{AttributeDocument, KindName, Schema};
 pub use value::{Scalar, Value};
 pub use weights::Weights;
 
-pub use crate::document::MAX_COST;
 use crate::document::{Faults, Place, Range, list_known};
+
+/// Largest cost of an action, and largest term of a distance; dimensionless. Keeps every sum along a path finite: even a
+/// hundred million of them stay below the largest float.
+pub const MAX_COST: f64 = 1e150;
 
 /// A named feature of a state.
 #[derive(Clone, Debug, PartialEq)]
@@ -126,7 +129,7 @@ impl Attribute {
     /// What its values are, as a fault says it.
     pub(crate) fn expected(&self) -> String {
         match &self.kind {
-            Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. } => Range::Finite.describe().to_owned(),
+            Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. } => Range::Finite.describe(),
             Kind::Cyclic { cycle: Cycle::Labels(labels), .. } => {
                 format!("one of the labels {}", list_known(labels.names()))
             }

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::{Algorithm, Distribution, Learner};
-use crate::attribute::Attribute;
+use crate::attribute::{Attribute, MAX_COST};
 use crate::document::{Faults, Object, Path, Place, Quoted, Range, list_known};
 
 const DEFAULT_ALPHA: f64 = 0.5;
@@ -141,9 +141,9 @@ fn read_algorithm(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Algorith
         _ => place.mismatch("\"srv\"", faults),
     });
     let alpha = number(&object, "alpha", DEFAULT_ALPHA, Range::NonNegative, faults);
-    let beta = number(&object, "beta", DEFAULT_BETA, Range::Fraction, faults);
-    let gamma = number(&object, "gamma", DEFAULT_GAMMA, Range::Fraction, faults);
-    let sd_min = number(&object, "sd_min", DEFAULT_SD_MIN, Range::Cost, faults);
+    let beta = number(&object, "beta", DEFAULT_BETA, Range::UpTo(1.0), faults);
+    let gamma = number(&object, "gamma", DEFAULT_GAMMA, Range::UpTo(1.0), faults);
+    let sd_min = number(&object, "sd_min", DEFAULT_SD_MIN, Range::UpTo(MAX_COST), faults);
     kind?;
     Some(Algorithm::Srv { alpha: alpha?, beta: beta?, gamma: gamma?, sd_min: sd_min? })
 }
@@ -163,11 +163,11 @@ fn read_per_attribute(
         if !place.value.is_number() {
             return place.mismatch("a number of at least 0, or an object of them by attribute", faults);
         }
-        numbers.fill(place.number(Range::Cost, faults)?);
+        numbers.fill(place.number(Range::UpTo(MAX_COST), faults)?);
         return Some(numbers);
     }
     for (name, member) in place.open_object(faults)?.iter() {
-        let number = member.number(Range::Cost, faults);
+        let number = member.number(Range::UpTo(MAX_COST), faults);
         let Some(names) = names else { continue };
         if let Some(position) = names.iter().position(|other| **other == *name) {
             numbers[position] = number.unwrap_or(default);

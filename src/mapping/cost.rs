@@ -6,6 +6,10 @@ use utoipa::ToSchema;
 use super::{Move, Problem};
 use crate::model::Space;
 
+/// How much more than a limit a mapping may cost before it is dropped, relatively: more than sums of 100,000 terms differ by
+/// rounding.
+pub(super) const SLACK: f64 = 1e-9;
+
 /// What a mapping costs: `C = C_a + C_s`. Dimensionless; finite, at least 0.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Cost {

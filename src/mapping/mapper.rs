@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::completion::{Allowance, Extras, complete};
-use super::cost::{Cost, ROUNDING, cost_of};
+use super::cost::{Cost, ROUNDING, SLACK, cost_of};
 use super::heuristic::paper::Paper;
 use super::heuristic::projected::{MAX_ENTRIES, Projected};
 use super::heuristic::projection::Projections;
@@ -29,7 +29,8 @@ pub struct Budget {
 }
 
 impl Budget {
-    /// Any number of expansions, within 16 million nodes: about 1 GB.
+    /// Any number of expansions, within 16 million nodes: about 1 GB. The tables of the default heuristic come on top: up to
+    /// 256 MB, and as much again where attributes are projected together.
     pub const DEFAULT: Self = Self { max_expansions: u64::MAX, max_nodes: 16_000_000 };
 }
 
@@ -151,8 +152,8 @@ impl Mapper {
     }
 
     /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the
-    /// search by default. Consistent; 0 at the last observation. It holds for nodes that the start leads to. For other searches, and
-    /// to look at.
+    /// search by default. Consistent, for nodes that the start leads to; 0 at the last observation. For other searches, and to
+    /// look at.
     ///
     /// # Panics
     ///
@@ -445,9 +446,6 @@ fn renumber(moves: &mut [Move]) -> Vec<StateIdx> {
     }
     former
 }
-
-/// How much more than an upper bound a mapping may cost, relatively: more than sums of 100,000 terms differ by rounding.
-const SLACK: f64 = 1e-9;
 
 /// What was found by a search among the mappings that cost at most `most_f`. If it came to its end without one, there is none, so
 /// that is a lower bound.

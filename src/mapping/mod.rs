@@ -27,7 +27,9 @@
 //! **Ties.** Among mappings of equal cost the search returns the one that it comes to first, which is determined: what was
 //! found is given up only for what costs less. Nodes are expanded in the order of `f` to a thousandth, the most recently found of
 //! equals first; the first way found to a node at its least cost is kept; successors are found in the order `skip`, then
-//! by action `match` before `extra`. Costs are compared as the sums of floats along the path.
+//! by action `match` before `extra`. Costs are compared as the sums of floats along the path. A search that takes long may be
+//! replaced by a sweep over all nodes, which tells them apart as [`online`] does; when it is depends on the problem and the budget
+//! alone.
 
 mod completion;
 mod cost;
@@ -51,6 +53,7 @@ pub(crate) use online::longest_lookahead;
 pub use online::{CommittedStep, OnlineMapping};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
 pub use problem::Problem;
+pub(crate) use request::Conditions;
 pub use request::{
     ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,
 };

@@ -15,7 +15,7 @@ use super::{
 use crate::attribute::{Scalar, Weights};
 use crate::document::{Faults, Object, Place};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
-use crate::model::{Model, StateIdx};
+use crate::model::{Model, Origin, StateIdx};
 
 /// A request for a policy, checked against its model.
 #[derive(Debug)]
@@ -80,15 +80,7 @@ impl<'m> Request<'m> {
         base: impl FnOnce(&mut Faults) -> Option<Weights>,
         faults: &mut Faults,
     ) -> Option<Self> {
-        let schema = model.schema();
-        let named = match object.optional("weights") {
-            Some(place) => schema.read_named_weights(&place, faults),
-            None => Some(Vec::new()),
-        };
-        let start = match object.optional("start") {
-            Some(place) => model.read_start(&place, faults).map(Some),
-            None => Some(None),
-        };
+        let conditions = Conditions::read(model, object, faults);
         let options = Self::read_options(object, faults);
         Self::check_lookahead(model, object, faults);
         if let (Some(Options { lookahead: Some(lookahead), .. }), Some(place)) = (options, object.optional("lookahead"))
@@ -96,12 +88,10 @@ impl<'m> Request<'m> {
             let n_observations = demonstration.as_ref().map_or(0, Demonstration::len);
             Self::check_window(model, lookahead, n_observations, &place, faults);
         }
-        let mut weights = base(faults)?;
-        for (position, weight) in named? {
-            weights.set(position, weight);
-        }
+        let base = base(faults)?;
+        let conditions = conditions?;
         let Options { settings, lookahead, deadline } = options?;
-        let problem = Problem::new(model, demonstration?, weights, start?);
+        let problem = Problem::new(model, demonstration?, conditions.weights_over(base), conditions.start);
         Some(Self { problem, settings, lookahead, deadline })
     }
 
@@ -220,6 +210,38 @@ impl<'m> Request<'m> {
         let budget = Budget { max_expansions: max_expansions?, ..Budget::DEFAULT };
         let settings = Settings { heuristic: heuristic?, budget, upper_bound: None, grouping: Grouping::default() };
         Some(Options { settings, lookahead: lookahead?, deadline: deadline? })
+    }
+}
+
+/// Under which weights a demonstration is to be followed, and from where: what requests of all kinds may say.
+#[derive(Debug)]
+pub(crate) struct Conditions {
+    /// Weights by the attributes' positions.
+    named: Vec<(usize, f64)>,
+    /// The start, if one is named.
+    pub(crate) start: Option<Origin>,
+}
+
+impl Conditions {
+    /// Reads the members `weights` and `start`.
+    pub(crate) fn read(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
+        let named = match object.optional("weights") {
+            Some(place) => model.schema().read_named_weights(&place, faults),
+            None => Some(Vec::new()),
+        };
+        let start = match object.optional("start") {
+            Some(place) => model.read_start(&place, faults).map(Some),
+            None => Some(None),
+        };
+        Some(Self { named: named?, start: start? })
+    }
+
+    /// The weights that are named, and those of `base` for the others.
+    pub(crate) fn weights_over(&self, mut base: Weights) -> Weights {
+        for (position, weight) in &self.named {
+            base.set(*position, *weight);
+        }
+        base
     }
 }
 

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use crate::attribute::MAX_COST;
 use crate::document::{Faults, Path, Place, Quoted, Range, list_known};
 
 /// Index of an action in its model.
@@ -108,7 +109,7 @@ impl<'v> ReadActions<'v> {
 fn read_action(place: &Place<'_, '_>, default_cost: f64, faults: &mut Faults) -> Option<Action> {
     let object = place.object(&["name", "cost"], faults)?;
     let cost = match object.optional("cost") {
-        Some(place) => place.number(Range::Cost, faults),
+        Some(place) => place.number(Range::UpTo(MAX_COST), faults),
         None => Some(default_cost),
     };
     let place = object.required("name", faults)?;

@@ -26,7 +26,7 @@ use super::{Etude, MadePolicy, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{Faults, Object, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{HeuristicName, Mapper, ObservationDocument, Policy, Request, Stamp, StartReference};
+use crate::mapping::{Conditions, HeuristicName, Mapper, ObservationDocument, Policy, Request, Stamp, StartReference};
 use crate::model::{Model, Origin};
 
 /// Most items of a batch: as large a data set as most, while an answer full of short policies stays at some ten megabytes.
@@ -260,31 +260,21 @@ fn read_shared(
     base: impl FnOnce(&mut Faults) -> Option<Weights>,
     faults: &mut Faults,
 ) -> Option<(Weights, Map<String, Value>)> {
-    let named = match object.optional("weights") {
-        Some(place) => model.schema().read_named_weights(&place, faults),
-        None => Some(Vec::new()),
-    };
-    let start = match object.optional("start") {
-        Some(place) => model.read_start(&place, faults).map(Some),
-        None => Some(None),
-    };
+    let conditions = Conditions::read(model, object, faults);
     let options = Request::read_options(object, faults);
     Request::check_lookahead(model, object, faults);
-    let mut weights = base(faults)?;
-    for (position, weight) in named? {
-        weights.set(position, weight);
-    }
-    let (start, _) = (start?, options?);
+    let base = base(faults)?;
+    let (conditions, _) = (conditions?, options?);
     let mut shared = Map::new();
     for name in SHARED_OPTIONS {
-        let value = match start {
+        let value = match conditions.start {
             // Values would be looked up among all states, for every item.
             Some(Origin::State(start)) if name == "start" => Some(start.into()),
             _ => object.optional(name).map(|place| place.value.clone()),
         };
         shared.extend(value.map(|value| (name.to_owned(), value)));
     }
-    Some((weights, shared))
+    Some((conditions.weights_over(base), shared))
 }
 
 /// A request for policies, as it is written in JSON.

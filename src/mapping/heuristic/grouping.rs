@@ -23,9 +23,6 @@ const MOST_CLASSES: [usize; 3] = [1 << 12, 1 << 16, 1 << 20];
 const MAX_STATES: usize = 1 << 17;
 const MAX_LOOKS: usize = 1 << 21;
 
-/// Of a model with more attributes than this, no groups are made: all pairs are compared.
-const MAX_ATTRIBUTES: usize = 256;
-
 /// The partitions of the attributes of `model` that vary, from the finest to the coarsest, without that into single attributes.
 /// Deterministic.
 ///
@@ -34,9 +31,6 @@ const MAX_ATTRIBUTES: usize = 256;
 /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
 pub(super) fn choose(model: &Model, interrupt: &mut dyn Interrupt) -> Result<Vec<Partition>, Cancelled> {
     let varying: Vec<usize> = (0..model.schema().len()).filter(|at| model.states().domain(*at).len() > 1).collect();
-    if varying.len() > MAX_ATTRIBUTES {
-        return Ok(Vec::new());
-    }
     let restrictions = Restrictions::new(model, interrupt)?;
     let sizes: Vec<usize> = (0..model.schema().len()).map(|at| model.states().domain(at).len()).collect();
     let alone: Partition = varying.iter().map(|at| vec![*at]).collect();

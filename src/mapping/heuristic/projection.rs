@@ -32,7 +32,7 @@ use super::grouping::{self, Partition};
 use super::projected::Estimate;
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
-use crate::model::{ActionIdx, Model, Operator};
+use crate::model::{ActionIdx, Model, Operator, Rows};
 
 /// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
 #[derive(Debug)]
@@ -61,10 +61,8 @@ pub(super) struct Group {
     /// The attributes, ascending.
     digits: Vec<Digit>,
     n_classes: usize,
-    /// `offsets[v]..offsets[v + 1]` are the edges into `v`. Shape `[n_classes + 1]`.
-    offsets: Vec<u32>,
-    /// Distinct ways to change the class, by where they lead.
-    edges: Vec<ProjectedEdge>,
+    /// Distinct ways to change the class, by where they lead; no rows if they do not fit.
+    edges: Rows<ProjectedEdge>,
     /// Whether its edges fit.
     is_kept: bool,
 }
@@ -279,41 +277,18 @@ impl Group {
             n_classes *= n_values;
             digit
         });
-        Self { digits: digits.collect(), n_classes, offsets: Vec::new(), edges: Vec::new(), is_kept: true }
+        Self { digits: digits.collect(), n_classes, edges: Rows::default(), is_kept: true }
     }
 
     /// Takes the edges, each with the class that it leads to, and sorts them.
     fn set_edges(&mut self, edges: &[(ClassIdx, ProjectedEdge)], meter: &mut Meter<'_>) -> Result<(), Cancelled> {
-        let mut starts = vec![0u32; self.n_classes + 1];
-        for (to, _) in edges {
-            starts[*to as usize + 1] += 1;
-        }
+        self.edges = Rows::of_entries(self.n_classes, edges.iter().copied());
         for class in 0..self.n_classes {
-            starts[class + 1] += starts[class];
-        }
-        let mut free = starts.clone();
-        let mut sorted = vec![ProjectedEdge { from: 0, kind: 0, action: 0 }; edges.len()];
-        for (to, edge) in edges {
-            let place = &mut free[*to as usize];
-            sorted[*place as usize] = *edge;
-            *place += 1;
-        }
-        self.offsets = Vec::with_capacity(self.n_classes + 1);
-        self.offsets.push(0);
-        self.edges = Vec::with_capacity(edges.len());
-        for bounds in starts.windows(2) {
-            let into = &mut sorted[bounds[0] as usize..bounds[1] as usize];
+            let into = self.edges.of_mut(class);
             meter.spend_or_cancel(1 + into.len() as u64)?;
             into.sort_unstable();
-            let first = self.edges.len();
-            for edge in into {
-                if self.edges[first..].last() != Some(edge) {
-                    self.edges.push(*edge);
-                }
-            }
-            #[expect(clippy::cast_possible_truncation, reason = "at most `MAX_EDGES`")]
-            self.offsets.push(self.edges.len() as u32);
         }
+        self.edges.dedup(|edge, other| edge == other);
         self.edges.shrink_to_fit();
         Ok(())
     }
@@ -350,14 +325,16 @@ impl Group {
     /// The edges into a class, by where they come from.
     #[inline]
     pub(super) fn edges_into(&self, class: usize) -> &[ProjectedEdge] {
-        match (self.offsets.get(class), self.offsets.get(class + 1)) {
-            (Some(first), Some(end)) => &self.edges[*first as usize..*end as usize],
-            _ => &[],
-        }
+        if self.is_kept { self.edges.of(class) } else { &[] }
+    }
+
+    /// The edges by where they lead, and in each row by where they come from. No rows if they do not fit.
+    pub(super) fn edges(&self) -> &Rows<ProjectedEdge> {
+        &self.edges
     }
 
     pub(super) fn n_edges(&self) -> usize {
-        self.edges.len()
+        self.edges.n_items()
     }
 
     /// The positions of its attributes, and how many values they have: the digits of a class, the lowest first.
@@ -397,7 +374,7 @@ impl Group {
     }
 
     fn size_bytes(&self) -> usize {
-        size_of_val(self.edges.as_slice()) + size_of_val(self.offsets.as_slice())
+        self.edges.size_bytes()
     }
 }
 
@@ -423,7 +400,7 @@ mod tests {
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let kept = |max_edges| {
             let projections = Projections::bounded(&model, max_edges, &mut Uninterrupted).unwrap();
-            projections.groups.iter().map(|group| (group.is_kept, group.edges.len())).collect::<Vec<_>>()
+            projections.groups.iter().map(|group| (group.is_kept, group.edges.n_items())).collect::<Vec<_>>()
         };
         assert_eq!(kept(MAX_EDGES), [(true, 99), (true, 2)]);
         assert_eq!(kept(50), [(false, 0), (true, 2)]);

@@ -256,9 +256,6 @@ impl Sweep {
             self.distances[*state as usize] = observed.distance(model, *state);
         }
         let Spare { mut costs, mut nodes, .. } = spare.cleared(model.graph().n_states(), usize::MAX);
-        for state in reached.iter().map(|state| *state as usize) {
-            (costs[state], nodes[state]) = (f64::INFINITY, Node::ABSENT);
-        }
         costs[root as usize] = cost;
         self.open.push(cost, root);
         while let Some((cost, state)) = self.open.pop() {

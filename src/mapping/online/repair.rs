@@ -14,39 +14,20 @@ use super::layer::{Source, Sweep};
 use super::open_list::OpenList;
 use super::window::{Place, Window, action};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
-use crate::model::{ActionIdx, Graph, Model, StateIdx};
+use crate::model::{ActionIdx, Graph, Model, Rows, StateIdx};
 
-/// The ways into states.
+/// The ways into states, by the state that is led to.
 #[derive(Debug)]
-pub(super) struct Predecessors {
-    /// Shape `[n_states + 1]`.
-    offsets: Vec<u32>,
-    /// By state that is led to.
-    transitions: Vec<(StateIdx, ActionIdx)>,
-}
+pub(super) struct Predecessors(Rows<(StateIdx, ActionIdx)>);
 
 impl Predecessors {
     pub(super) fn new(graph: &Graph) -> Self {
-        let mut offsets = vec![0_u32; graph.n_states() + 1];
-        for (_, transition) in graph.iter() {
-            offsets[transition.to as usize + 1] += 1;
-        }
-        for state in 0..graph.n_states() {
-            offsets[state + 1] += offsets[state];
-        }
-        let mut free = offsets.clone();
-        let mut transitions = vec![(0, 0); graph.n_transitions()];
-        for (from, transition) in graph.iter() {
-            let place = &mut free[transition.to as usize];
-            transitions[*place as usize] = (from, transition.action);
-            *place += 1;
-        }
-        Self { offsets, transitions }
+        let ways = graph.iter().map(|(from, transition)| (transition.to, (from, transition.action)));
+        Self(Rows::of_entries(graph.n_states(), ways))
     }
 
     fn of(&self, state: StateIdx) -> &[(StateIdx, ActionIdx)] {
-        let state = state as usize;
-        &self.transitions[self.offsets[state] as usize..self.offsets[state + 1] as usize]
+        self.0.of(state as usize)
     }
 }
 

@@ -180,7 +180,7 @@ impl Window {
         self.reached = reached;
     }
 
-    /// The only child of the root, if it has just one and is not in the newest layer.
+    /// The only child of the root, if the root has just one, and is not in the newest layer itself.
     pub(super) fn only_child(&self, model: &Model) -> Option<Place> {
         let root = self.root;
         if self.layers.len() == 1 || self.layers[0].node(root).n_children != 1 {

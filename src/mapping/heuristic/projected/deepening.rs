@@ -6,6 +6,7 @@ use super::shares::{Parts, Way, Ways};
 use super::{Column, Projected};
 use crate::interrupt::{Cancelled, Meter, Signal};
 use crate::mapping::Problem;
+use crate::mapping::cost::SLACK;
 use crate::mapping::heuristic::bounded::{Basis, Bounded, Unsolved};
 use crate::mapping::heuristic::projection::Projections;
 use crate::mapping::heuristic::{Grouping, GroupingPatience};
@@ -76,9 +77,6 @@ pub(in crate::mapping) enum Deepened {
 
 /// Most entries of the tables of a level: 256 MB with the room in hash tables.
 const MAX_JOINT_ENTRIES: usize = 1 << 22;
-
-/// How much more than the limit a mapping may cost before its classes are dropped, relatively: more than sums differ by rounding.
-const SLACK: f64 = 1e-9;
 
 impl<'p> Projected<'p> {
     /// Sets when attributes are projected together, before any were.
@@ -236,7 +234,7 @@ impl<'p> Projected<'p> {
                         }
                     }
                 }
-                match meter.spend((n_classes + ways.ways.len()) as u64) {
+                match meter.spend((n_classes + ways.len()) as u64) {
                     Signal::Continue => {}
                     signal => return Err(signal),
                 }

@@ -2,6 +2,7 @@
 
 use crate::mapping::Problem;
 use crate::mapping::heuristic::projection::{ClassIdx, Group, ProjectedEdge, Projections};
+use crate::model::Rows;
 
 /// How the costs of actions are divided, as one group sees it.
 pub(super) struct Parts<'p> {
@@ -40,11 +41,7 @@ impl<'p> Parts<'p> {
 }
 
 /// The ways between classes, by where they lead or where they come from, the cheapest of each pair.
-pub(super) struct Ways {
-    /// `offsets[v]..offsets[v + 1]` are the ways of `v`. Shape `[n_classes + 1]`.
-    offsets: Vec<u32>,
-    pub(super) ways: Vec<Way>,
-}
+pub(super) struct Ways(Rows<Way>);
 
 /// The way to or from a class: the least share of those that there are, and the least part, which may be of different ones.
 #[derive(Clone, Copy, Debug, Default)]
@@ -67,53 +64,38 @@ impl Way {
 impl Ways {
     /// The ways into each class, with where they come from.
     pub(super) fn into_classes(group: &Group, parts: &Parts<'_>) -> Self {
-        let mut offsets = Vec::with_capacity(group.n_classes() + 1);
-        offsets.push(0);
-        let mut ways: Vec<Way> = Vec::with_capacity(group.n_edges());
-        for class in 0..group.n_classes() {
-            let first = ways.len();
-            for edge in group.edges_into(class) {
-                let (share, part) = (parts.of(edge, 0.0), 1.0 / parts.divisors[edge.kind as usize]);
-                match ways[first..].last_mut() {
-                    Some(way) if way.class == edge.from => {
-                        way.share = way.share.min(share);
-                        way.part = way.part.min(part);
-                    }
-                    _ => ways.push(Way { class: edge.from, share, part }),
-                }
+        let mut ways = group.edges().map(|edge| {
+            let (share, part) = (parts.of(edge, 0.0), 1.0 / parts.divisors[edge.kind as usize]);
+            Way { class: edge.from, share, part }
+        });
+        ways.dedup(|way, other| {
+            let is_same = way.class == other.class;
+            if is_same {
+                way.share = way.share.min(other.share);
+                way.part = way.part.min(other.part);
             }
-            #[expect(clippy::cast_possible_truncation, reason = "at most `MAX_EDGES`")]
-            offsets.push(ways.len() as u32);
-        }
-        Self { offsets, ways }
+            is_same
+        });
+        Self(ways)
     }
 
     /// The same ways, by where they come from.
     pub(super) fn reversed(&self) -> Self {
-        let n_classes = self.offsets.len() - 1;
-        let mut offsets = vec![0; n_classes + 1];
-        for way in &self.ways {
-            offsets[way.class as usize + 1] += 1;
-        }
-        for class in 0..n_classes {
-            offsets[class + 1] += offsets[class];
-        }
-        let mut free: Vec<u32> = offsets.clone();
-        let mut ways = vec![Way::default(); self.ways.len()];
-        for to in 0..n_classes {
-            for way in self.of(to) {
-                let place = &mut free[way.class as usize];
-                #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
-                let class = to as ClassIdx;
-                ways[*place as usize] = Way { class, ..*way };
-                *place += 1;
-            }
-        }
-        Self { offsets, ways }
+        let ways = self
+            .0
+            .iter()
+            .zip(0..)
+            .flat_map(|(ways, to)| ways.iter().map(move |way| (way.class, Way { class: to, ..*way })));
+        Self(Rows::of_entries(self.0.n_rows(), ways))
     }
 
     #[inline]
     pub(super) fn of(&self, class: usize) -> &[Way] {
-        &self.ways[self.offsets[class] as usize..self.offsets[class + 1] as usize]
+        self.0.of(class)
+    }
+
+    /// How many there are.
+    pub(super) fn len(&self) -> usize {
+        self.0.n_items()
     }
 }

@@ -116,6 +116,9 @@ proptest! {
 
         let solved = Projected::solve(&projections, &problem, Grouping::Widest, MAX_ENTRIES, &mut Uninterrupted).unwrap();
         let mut projected = solved.unwrap();
+        // What no action changes is taken to be as it is at the start, so nothing is said of states that it does not lead to.
+        let is_reached = |(i, state): &(usize, StateIdx)| from_start[*i][*state as usize].is_finite();
+        let reached: Vec<_> = nodes(&problem).into_iter().filter(is_reached).collect();
         let mut alone: Vec<f64> = Vec::new();
         for is_deep in [false, true] {
             if is_deep {
@@ -123,9 +126,7 @@ proptest! {
                 let mut meter = Meter::new(&mut interrupt, 1);
                 prop_assert_eq!(projected.deepen(limit, 0, &mut meter), Ok(Deepened::Yes));
             }
-            // What no action changes is taken to be as it is at the start, so nothing is said of nodes that cannot be come to.
-            let reached = nodes(&problem).into_iter().filter(|(i, state)| from_start[*i][*state as usize].is_finite());
-            for (number, (i, state)) in reached.enumerate() {
+            for (number, (i, state)) in reached.iter().copied().enumerate() {
                 let estimate = projected.at(i).of(problem.model.states().row(state));
                 prop_assert!((estimate.distance - distance(&problem, i, state)).abs() <= close);
                 let h = estimate.cost_to_go;

@@ -1,146 +1,21 @@
-//! Dynamics that list every state and transition.
+//! Reading what a table lists.
 
+use std::hash::BuildHasher;
 use std::sync::Arc;
 
 use hashbrown::{DefaultHashBuilder, HashTable};
-use serde::ser::SerializeSeq;
-use serde::{Deserialize, Serialize, Serializer};
-use std::hash::BuildHasher;
-use utoipa::ToSchema;
 
-use super::action::ReadActions;
-use super::reading::{Distinct, NoTransition, Raw, RawIndex, RawStates, RawTransitions};
-use super::{Action, ActionIdx, Graph, Limits, Model, Start, StateIdx, States, Transition};
-use crate::attribute::{Attribute, Scalar, Schema, Value};
+use super::{Edges, Table};
+use crate::attribute::{Attribute, Schema, Value};
 use crate::document::{Faults, Object, Path, Place, index_of};
 use crate::interrupt::{Cancelled, Meter};
-
-/// Cost of an action that names none.
-pub(super) const DEFAULT_ACTION_COST: f64 = 1.0;
-
-/// A model whose states and transitions are listed. At most one transition leaves a state by an action.
-#[derive(Clone, Debug)]
-pub struct Table {
-    schema: Schema,
-    actions: Vec<Action>,
-    /// Shared with the models that are compiled from this.
-    states: Arc<States>,
-    edges: Edges,
-    start: Start,
-    /// Ascending, all different.
-    unsafe_states: Vec<StateIdx>,
-}
-
-/// Transitions in the order of the document, by column: 10 bytes each.
-#[derive(Clone, Debug)]
-struct Edges {
-    from: Vec<StateIdx>,
-    action: Vec<ActionIdx>,
-    to: Vec<StateIdx>,
-}
-
-impl Edges {
-    fn len(&self) -> usize {
-        self.from.len()
-    }
-
-    fn iter(&self) -> impl Iterator<Item = (StateIdx, Transition)> + Clone {
-        let transitions = self.action.iter().zip(&self.to).map(|(action, to)| Transition { action: *action, to: *to });
-        self.from.iter().copied().zip(transitions)
-    }
-}
-
-impl Table {
-    /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, which
-    /// a `skip` does for nothing.
-    pub(super) fn compile(&self) -> Model {
-        let n_states = self.states.len() as usize;
-        // Where none is, none is noted.
-        let n_noted = if self.unsafe_states.is_empty() { 0 } else { n_states };
-        let mut is_unsafe = vec![false; n_noted];
-        for state in &self.unsafe_states {
-            is_unsafe[*state as usize] = true;
-        }
-        let is_useful = |(from, transition): &(StateIdx, Transition)| {
-            *from != transition.to && is_unsafe.get(transition.to as usize) != Some(&true)
-        };
-        let graph = Graph::new(n_states, self.edges.iter().filter(is_useful));
-        Model {
-            schema: self.schema.clone(),
-            actions: self.actions.clone(),
-            graph,
-            states: Arc::clone(&self.states),
-            start: self.start.clone(),
-            n_transitions: self.edges.len(),
-            n_unsafe: self.unsafe_states.len(),
-            is_unsafe,
-            unexplored: None,
-        }
-    }
-
-    pub(super) fn schema(&self) -> &Schema {
-        &self.schema
-    }
-
-    pub(super) fn actions(&self) -> &[Action] {
-        &self.actions
-    }
-}
-
-/// Written as the [`TableDocument`] that it was read from, in canonical form, without a copy of it.
-impl Serialize for Table {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        use serde::ser::SerializeStruct;
-        let start = match &self.start {
-            Start::State(state) => Some(StartDocument::State(*state)),
-            Start::Candidates(states) => Some(StartDocument::Candidates(states.clone())),
-            Start::Any => None,
-        };
-        let mut fields = serializer.serialize_struct("Table", 4 + usize::from(start.is_some()))?;
-        fields.serialize_field("kind", "table")?;
-        fields.serialize_field("states", &WrittenStates(self))?;
-        fields.serialize_field("transitions", &WrittenTransitions(self))?;
-        if let Some(start) = start {
-            fields.serialize_field("start", &start)?;
-        }
-        fields.serialize_field("unsafe", &self.unsafe_states)?;
-        fields.end()
-    }
-}
-
-struct WrittenStates<'t>(&'t Table);
-
-impl Serialize for WrittenStates<'_> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_seq((0..self.0.states.len()).map(|state| WrittenState(self.0, state)))
-    }
-}
-
-struct WrittenState<'t>(&'t Table, StateIdx);
-
-impl Serialize for WrittenState<'_> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let Self(table, state) = self;
-        let mut cells = serializer.serialize_seq(Some(table.schema.len()))?;
-        for (attribute, value) in table.schema.attributes().iter().zip(table.states.values(*state)) {
-            cells.serialize_element(&attribute.written(value))?;
-        }
-        cells.end()
-    }
-}
-
-struct WrittenTransitions<'t>(&'t Table);
-
-impl Serialize for WrittenTransitions<'_> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let name = |action: ActionIdx| &*self.0.actions[usize::from(action)].name;
-        serializer.collect_seq(self.0.edges.iter().map(|(from, Transition { action, to })| (from, name(action), to)))
-    }
-}
+use crate::model::action::ReadActions;
+use crate::model::reading::{Distinct, NoTransition, Raw, RawIndex, RawStates, RawTransitions};
+use crate::model::{ActionIdx, Limits, Start, StateIdx, States};
 
 /// Reads the dynamics. `attributes` and `actions` are `None` where they had faults of their own; what does not
 /// depend on them is checked all the same. `lists` are the states and transitions that were taken out of the dynamics.
-pub(super) fn read(
+pub(in crate::model) fn read(
     place: &Place<'_, '_>,
     lists: (Option<RawStates>, Option<RawTransitions>),
     attributes: Option<Vec<Option<Attribute>>>,
@@ -479,49 +354,4 @@ fn read_start(
             Some(Start::Any)
         }
     }
-}
-
-/// Listed states and transitions.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct TableDocument {
-    /// Each state's attribute values, in attribute order.
-    #[schema(example = json!([[0, "east", "open"], [1, "east", "open"]]))]
-    pub states: Vec<Vec<Scalar>>,
-    /// `[from, action, to]`: states by index, the action by name or index. At most one per state and action. In another order
-    /// they are other content, though they mean the same.
-    pub transitions: Vec<TransitionDocument>,
-    /// Where the imitator starts: a state's index, or a list of candidates, of which the one closest to the first
-    /// observation is taken; in another order they are other content, though they mean the same. Left out: every safe state is
-    /// a candidate.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub start: Option<StartDocument>,
-    /// States that must never be entered, in any order.
-    #[serde(default, rename = "unsafe")]
-    pub unsafe_states: Vec<StateIdx>,
-}
-
-/// `[from, action, to]`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
-#[schema(as = TransitionEntry, example = json!([0, "forward", 1]))]
-pub struct TransitionDocument(pub StateIdx, pub ActionReference, pub StateIdx);
-
-/// An action, by name or index.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
-#[serde(untagged)]
-pub enum ActionReference {
-    /// Its name.
-    Name(String),
-    /// Its index in the model's `actions`.
-    Index(ActionIdx),
-}
-
-/// Where the imitator may start.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
-#[serde(untagged)]
-#[schema(as = StartStates)]
-pub enum StartDocument {
-    /// In this state.
-    State(StateIdx),
-    /// In the one of these that is closest to the first observation.
-    Candidates(Vec<StateIdx>),
 }
