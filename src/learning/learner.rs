@@ -246,5 +246,9 @@ mod tests {
         assert_eq!(weights.as_slice(), [2.0, 4.0, 0.5]);
         let missing = learner.weights_for(&schema(&["c"]), &[0.5, 2.0]).unwrap_err().missing;
         assert_eq!(missing, ["a", "b"]);
+        let many: Vec<_> = (0..256).map(|n| format!("{n:0>64}")).collect();
+        let missing =
+            self::learner(&json!({"attributes": many})).weights_for(&schema(&["c"]), &[1.0; 256]).unwrap_err();
+        assert!(missing.missing.len() == 256 && missing.to_string().len() < 1000, "{missing}");
     }
 }

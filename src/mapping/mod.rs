@@ -28,7 +28,7 @@
 //! found is given up only for what costs less. Nodes are expanded in the order of `f` to a thousandth, the most recently found of
 //! equals first; the first way found to a node at its least cost is kept; successors are found in the order `skip`, then
 //! by action `match` before `extra`. Costs are compared as the sums of floats along the path. A search that takes long may be
-//! replaced by a sweep over all nodes, which tells them apart as [`online`] does; when it is depends on the problem and the budget
+//! replaced by a sweep over all nodes, which tells them apart as [`OnlineMapping`] does; when it is depends on the problem and the budget
 //! alone.
 
 mod completion;
