@@ -726,6 +726,20 @@ async fn no_more_streams_run_than_may() {
 }
 
 #[tokio::test]
+async fn a_lookahead_that_reaches_too_far_for_its_model_opens_no_session() {
+    let service = Service::start(&[]).await;
+    let world = json!({"dynamics": {"kind": "wumpus", "width": 40, "height": 40, "gold": [[1, 1], [2, 2]]}});
+    assert_eq!(service.put("/v1/models/world", &world).await.0, 201);
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "open", "model": "world", "lookahead": 100_000})).await;
+    let problem = client.receive().await["problem"].clone();
+    assert_eq!(problem["errors"][0]["pointer"], "/lookahead", "{problem}");
+    assert_eq!(client.closed().await, 4400);
+    let mut client = Client::connect(&service).await;
+    client.open(json!({"type": "open", "model": "world", "lookahead": 1000})).await;
+}
+
+#[tokio::test]
 async fn who_asks_for_a_stream_without_a_websocket_is_told_to_upgrade() {
     let service = Service::start(&[]).await;
     let response = service.send(Method::GET, "/v1/stream", &Value::Null).await;

@@ -6,7 +6,7 @@ use super::learners::Ready;
 use super::policies::{Envelope, base_weights};
 use crate::attribute::Weights;
 use crate::document::{Faults, Object, Path};
-use crate::mapping::{Mapper, read_lookahead};
+use crate::mapping::{Conditions, Demonstration, Mapper, Request, read_lookahead};
 use crate::model::Origin;
 
 /// Lookahead of a session that names none.
@@ -58,6 +58,7 @@ impl Opening {
     pub(super) fn read(
         mapper: &Mapper,
         learner: Option<&Ready>,
+        lookahead: Option<NonZeroU32>,
         object: &Object<'_, '_>,
         faults: &mut Faults,
     ) -> Option<Self> {
@@ -67,20 +68,11 @@ impl Opening {
             faults.note_at(&Path::Member(&Path::Root, "model"), detail);
         }
         let base = base_weights(model, learner, faults);
-        let named = match object.optional("weights") {
-            Some(place) => model.schema().read_named_weights(&place, faults),
-            None => Some(Vec::new()),
-        };
-        let weights = base.zip(named).map(|(mut weights, named)| {
-            for (position, weight) in named {
-                weights.set(position, weight);
-            }
-            weights
-        });
-        let start = match object.optional("start") {
-            Some(place) => model.read_start(&place, faults).map(Origin::state),
-            None => Some(None),
-        };
-        Some(Self { weights: weights?, start: start? })
+        let conditions = Conditions::read(model, object, faults);
+        if let (Some(lookahead), Some(place)) = (lookahead, object.optional("lookahead")) {
+            Request::check_window(model, lookahead, Demonstration::MAX_OBSERVATIONS, &place, faults);
+        }
+        let (base, conditions) = base.zip(conditions)?;
+        Some(Self { weights: conditions.weights_over(base), start: conditions.start.and_then(Origin::state) })
     }
 }

@@ -181,7 +181,8 @@ impl Etude {
         let Some(Names { envelope, explores, lookahead }) = names else { return Err(faults.into()) };
         let Named { learner, model_hash, mapper } = self.find(&envelope, faults.clone(), &place).await?;
         drop(place);
-        let opening = object.as_ref().and_then(|object| Opening::read(&mapper, learner.as_ref(), object, &mut faults));
+        let opening =
+            object.as_ref().and_then(|object| Opening::read(&mapper, learner.as_ref(), lookahead, object, &mut faults));
         let Opening { mut weights, start } = faults.check(opening)?;
         let model = envelope.model;
 

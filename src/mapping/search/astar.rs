@@ -11,8 +11,8 @@ use crate::mapping::heuristic::Heuristic;
 use crate::mapping::{Budget, Problem};
 use crate::model::{ActionIdx, Space, StateIdx};
 
-/// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows, among those of at most `most_f`, of which
-/// there must be one. A node is expanded again if a cheaper
+/// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows, among those of at most `most_f`. If there is
+/// none, it comes to its end without one. A node is expanded again if a cheaper
 /// way to it is found, so the heuristic need not be consistent.
 ///
 /// # Errors
@@ -91,7 +91,9 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             }
         }
     }
-    unreachable!("every node before the last observation can be left by a skip")
+    // Whatever is left costs more than `most_f`: there is no such mapping.
+    let paths = [farthest.id, 0].map(|id| nodes.path(id)).to_vec();
+    Ok(Found { paths, is_complete: true, least_f: f64::INFINITY, n_expanded, n_generated })
 }
 
 /// The cheapest way found so far to a node.
