@@ -305,17 +305,22 @@ async fn local_items_of_a_batch_are_refined_in_the_background() {
 #[tokio::test]
 async fn a_batch_takes_one_place_and_lets_others_in_between() {
     let service = figure_4(&["--search-threads", "1", "--search-queue", "1"]).await;
-    // Many times as many items as there are places.
-    let batch = json!({"model": "figure-4", "items": vec![json!({"demonstration": demonstration(16)}); 1000]});
+    // Many times as many items as there are places. It ends with one that takes minutes, so that it is not over before others.
+    let mut items = vec![json!({"demonstration": demonstration(16)}); 2_000];
+    items.push(json!({"demonstration": long_demonstration(), "heuristic": "paper"}));
+    let batch = json!({"model": "figure-4", "items": items, "deadline_ms": 60_000});
     let waiting = tokio::spawn(service.client.post(service.url(BATCH)).json(&batch).send());
     while service.measurement("etude_search_jobs").await < 1.0 {
+        assert!(!waiting.is_finished(), "the batch was refused");
         tokio::task::yield_now().await;
     }
     let request = example("figure-4/request.json");
     assert_eq!(service.post("/v1/policies", &request).await.0, 201);
     assert!(!waiting.is_finished(), "the batch was over before the single request");
-    let (status, answer) = answer(waiting.await.unwrap().unwrap()).await;
-    assert_eq!((status, answer["items"].as_array().unwrap().len()), (200, 1000));
+    waiting.abort();
+    while service.measurement("etude_search_jobs").await > 0.0 {
+        tokio::task::yield_now().await;
+    }
 }
 
 #[tokio::test]

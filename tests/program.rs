@@ -112,7 +112,16 @@ fn faults_of_files_are_told_with_their_places() {
 struct Process {
     child: Child,
     address: String,
-    log: std::thread::JoinHandle<String>,
+    log: Option<std::thread::JoinHandle<String>>,
+}
+
+/// Also when a test fails.
+impl Drop for Process {
+    fn drop(&mut self) {
+        // It has ended already, unless the test failed.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
 }
 
 impl Process {
@@ -124,14 +133,14 @@ impl Process {
         let address = first.split("http://").nth(1).unwrap();
         let address = address.split(['"', ' ']).next().unwrap().to_owned();
         let log = std::thread::spawn(move || lines.collect::<Vec<_>>().join("\n"));
-        Self { child, address, log }
+        Self { child, address, log: Some(log) }
     }
 
     /// Sends a signal, and gives the exit code and the log.
     fn signal(mut self, signal: &str) -> (Option<i32>, String) {
         let killed = Command::new("kill").args([signal, &self.child.id().to_string()]).status().unwrap();
         assert!(killed.success());
-        (self.child.wait().unwrap().code(), self.log.join().unwrap())
+        (self.child.wait().unwrap().code(), self.log.take().unwrap().join().unwrap())
     }
 }
 

@@ -136,12 +136,38 @@ async fn a_model_in_pieces_is_compiled_anew_after_a_restart() {
 #[tokio::test]
 async fn every_body_may_be_compressed() {
     let service = Service::start(&[]).await;
-    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
-    let request = example("figure-4/request.json").to_string();
-    for (encoding, body) in [("gzip", gzip(request.as_bytes())), ("zstd", zstd(request.as_bytes()))] {
-        let sent = service.client.post(service.url("/v1/policies")).header(CONTENT_TYPE, JSON);
-        let (status, policy) = answer(sent.header(CONTENT_ENCODING, encoding).body(body).send().await.unwrap()).await;
+    let send = async |encoding: &str, method: Method, path: &str, body: &Value| {
+        let text = body.to_string();
+        let packed = if encoding == "gzip" { gzip(text.as_bytes()) } else { zstd(text.as_bytes()) };
+        let sent = service.client.request(method, service.url(path)).header(CONTENT_TYPE, JSON);
+        answer(sent.header(CONTENT_ENCODING, encoding).body(packed).send().await.unwrap()).await
+    };
+    let request = example("figure-4/request.json");
+    let demonstration = &request["demonstration"];
+    for encoding in ["gzip", "zstd"] {
+        let (model, learner) = (format!("model-{encoding}"), format!("learner-{encoding}"));
+        let put = async |path: &str, body: &Value| send(encoding, Method::PUT, path, body).await;
+        let post = async |path: &str, body: &Value| send(encoding, Method::POST, path, body).await;
+        let (status, put_model) = put(&format!("/v1/models/{model}"), &example("figure-4/model.json")).await;
+        assert_eq!(status, 201, "{put_model}");
+        let request = json!({"model": model, "demonstration": demonstration});
+        let (status, policy) = post("/v1/policies", &request).await;
         assert_eq!((status, &policy["cost"]["total"]), (201, &json!(48.0)), "{policy}");
+        let batch = json!({"model": model, "items": [{"demonstration": demonstration}]});
+        let (status, policies) = post("/v1/policies:batch", &batch).await;
+        assert_eq!((status, &policies["items"][0]["cost"]["total"]), (200, &json!(48.0)), "{policies}");
+        let (status, put_learner) = put(&format!("/v1/learners/{learner}"), &json!({"attributes": ["x", "y"]})).await;
+        assert_eq!(status, 201, "{put_learner}");
+        let mut trials = Vec::new();
+        for _ in 0..2 {
+            let (status, trial) = post(&format!("/v1/learners/{learner}/trials"), &request).await;
+            assert_eq!(status, 201, "{trial}");
+            trials.push(format!("/v1/trials/{}", trial["id"].as_str().unwrap()));
+        }
+        let (status, rewarded) = put(&format!("{}/reward", trials[0]), &json!({"reward": 974})).await;
+        assert_eq!((status, &rewarded["reward"]), (200, &json!(974.0)), "{rewarded}");
+        let (status, failed) = post(&format!("{}/fail", trials[1]), &json!({"reason": "dark"})).await;
+        assert_eq!((status, &failed["reason"]), (200, &json!("dark")), "{failed}");
     }
 }
 

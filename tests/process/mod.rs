@@ -45,8 +45,16 @@ impl Process {
     }
 
     /// SIGKILL: no handler runs, nothing is flushed.
-    pub(crate) fn kill(mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
+    pub(crate) fn kill(self) {
+        drop(self);
+    }
+}
+
+/// `SIGKILL`, also when a test fails.
+impl Drop for Process {
+    fn drop(&mut self) {
+        let killed = self.child.kill().and_then(|()| self.child.wait());
+        // A second panic would hide what failed.
+        assert!(killed.is_ok() || std::thread::panicking(), "{killed:?}");
     }
 }
