@@ -1,0 +1,200 @@
+//! Searches that get more help the longer they take.
+
+use std::sync::PoisonError;
+
+use super::{Budget, Mapper, Mapping, Settings, conclude, within};
+use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::mapping::heuristic::GroupingPatience;
+use crate::mapping::heuristic::projected::{MAX_ENTRIES, Projected};
+use crate::mapping::search::Found;
+use crate::mapping::search::best_first;
+use crate::mapping::{OnlineMapping, Problem};
+use crate::model::Space;
+
+impl Mapper {
+    /// Searches best first, with more help the longer it takes: at first with tables of projections only where they are small,
+    /// then with all of them; and where it has still looked at a good part of all nodes, what is left is to look at all of them,
+    /// layer by layer, which takes a fraction of the time for each.
+    pub(super) fn best_first<S: Space>(
+        &self,
+        space: &mut S,
+        problem: &Problem<'_>,
+        settings: Settings,
+        most_f: f64,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        let Settings { budget, grouping, .. } = settings;
+        let n_nodes =
+            space.n_states().map_or(u64::MAX, |n| (n as u64).saturating_mul(problem.demonstration.len() as u64));
+        let may_be_swept = space.n_states().is_some_and(|n_states| n_states <= MAX_SWEPT_STATES);
+        let n_observations = problem.demonstration.len();
+        // Where there are not even expansions enough to look at every observation, much depends on good estimates.
+        let is_small_budget = budget.max_expansions < n_observations as u64;
+        let patience = self.patience;
+        let few_entries = patience.few_entries.max(n_observations * patience.few_entries_per_observation);
+        let few_entries = few_entries.min(MAX_ENTRIES);
+        let mut before: Option<(Projected<'_>, Found)> = None;
+        for max_entries in [if is_small_budget { MAX_ENTRIES } else { few_entries }, MAX_ENTRIES] {
+            let solved = Projected::solve(&self.projections, problem, grouping, max_entries, interrupt)?;
+            // No time for estimates, so none for a search with them.
+            let Some(mut projected) = solved else { break };
+            projected.set_patience(patience.grouping);
+            let n_before = before.as_ref().map_or(0, |(_, found)| found.n_expanded);
+            let max_expansions = budget.max_expansions - n_before;
+            // What would be done instead, should it take that long.
+            let n_untabled = if max_entries < MAX_ENTRIES { projected.n_left_out() } else { 0 };
+            let before_sweep = patience.min_expansions_before_sweep.max(n_nodes / patience.nodes_per_expansion);
+            let may_sweep = may_be_swept && before_sweep.saturating_add(n_nodes) <= max_expansions;
+            let enough = match n_untabled {
+                0 if may_sweep => before_sweep,
+                0 => u64::MAX,
+                n_untabled => n_untabled / patience.entries_per_expansion,
+            };
+            let capped = Budget { max_expansions: max_expansions.min(enough), ..budget };
+            let mut found = self.search(space, problem, &mut projected, capped, most_f, interrupt)?;
+            let is_enough = !found.is_complete && enough < max_expansions && found.n_expanded >= enough;
+            if let Some((_, before)) = before.take() {
+                found = joined(before, found);
+            }
+            if is_enough && n_untabled > 0 {
+                before = Some((projected, found));
+                continue;
+            }
+            if is_enough {
+                let swept = self.sweep(problem, budget, interrupt)?;
+                found.n_expanded += swept.n_expanded;
+                found.n_generated += swept.n_generated;
+                match swept.outcome {
+                    Outcome::Mapped(mapping) => {
+                        let Found { n_expanded, n_generated, .. } = found;
+                        return Ok(Mapping { n_expanded, n_generated, ..mapping });
+                    }
+                    Outcome::CutShort => {}
+                    Outcome::TooLarge => {
+                        let max_expansions = budget.max_expansions - found.n_expanded;
+                        let rest = Budget { max_expansions, ..budget };
+                        let more = self.search(space, problem, &mut projected, rest, most_f, interrupt)?;
+                        found = joined(found, more);
+                    }
+                }
+            }
+            return conclude(problem, space, &projected, within(most_f, found, problem), interrupt);
+        }
+        if let Some((projected, found)) = before {
+            return conclude(problem, space, &projected, found, interrupt);
+        }
+        let mut blind = Projected::blind(problem);
+        let budget = Budget { max_expansions: 0, ..budget };
+        let found = self.search(space, problem, &mut blind, budget, most_f, interrupt)?;
+        conclude(problem, space, &blind, found, interrupt)
+    }
+
+    fn search<S: Space>(
+        &self,
+        space: &mut S,
+        problem: &Problem<'_>,
+        projected: &mut Projected<'_>,
+        budget: Budget,
+        most_f: f64,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Found, Cancelled> {
+        let kept = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let mut buffers = kept.unwrap_or_default();
+        let found = best_first::search(problem, space, projected, budget, most_f, &mut buffers, interrupt)?;
+        if buffers.are_small() {
+            self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
+        }
+        Ok(found)
+    }
+
+    /// The cheapest mapping, from the cheapest ways to all states at each observation after the other.
+    fn sweep(&self, problem: &Problem<'_>, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Swept, Cancelled> {
+        let mut online = OnlineMapping::new(self, problem.weights.clone(), Some(problem.start), None);
+        let mut is_cut_short = None;
+        for observation in problem.demonstration.iter() {
+            is_cut_short = match interrupt.poll() {
+                Signal::Continue if online.size_bytes() > budget.max_bytes() => Some(Outcome::TooLarge),
+                Signal::Continue => None,
+                Signal::Finish => Some(Outcome::CutShort),
+                Signal::Cancel => return Err(Cancelled),
+            };
+            if is_cut_short.is_some() {
+                break;
+            }
+            online.observe(observation, interrupt)?;
+        }
+        let (n_expanded, n_generated) = (online.n_expanded(), online.n_generated());
+        let end = || online.end().map_or(Outcome::CutShort, |(_, mapping)| Outcome::Mapped(mapping));
+        Ok(Swept { outcome: is_cut_short.unwrap_or_else(end), n_expanded, n_generated })
+    }
+}
+
+/// What a sweep gave, and what it took.
+#[derive(Debug)]
+struct Swept {
+    outcome: Outcome,
+    n_expanded: u64,
+    n_generated: u64,
+}
+
+/// How a sweep ended.
+#[derive(Debug, PartialEq)]
+enum Outcome {
+    /// With the cheapest mapping.
+    Mapped(Mapping),
+    /// The interrupt said to finish.
+    CutShort,
+    /// The ways would have taken more memory than the budget allows.
+    TooLarge,
+}
+
+/// What two searches for the same mappings found together, of which the later one is `found`.
+fn joined(before: Found, found: Found) -> Found {
+    let mut paths = found.paths;
+    paths.extend(before.paths);
+    Found {
+        paths,
+        least_f: found.least_f.max(before.least_f),
+        n_expanded: before.n_expanded + found.n_expanded,
+        n_generated: before.n_generated + found.n_generated,
+        is_complete: found.is_complete,
+    }
+}
+
+/// When a search that takes long gets more help.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Patience {
+    /// Most entries of the tables of a search's first attempt,
+    few_entries: usize,
+    /// or so many per observation, if that is more.
+    few_entries_per_observation: usize,
+    /// How many entries of a table take as long as an expansion.
+    entries_per_expansion: u64,
+    /// After how many expansions all nodes are looked at instead,
+    min_expansions_before_sweep: u64,
+    /// or after one for so many nodes, if that is more.
+    nodes_per_expansion: u64,
+    /// When attributes are projected together.
+    grouping: GroupingPatience,
+}
+
+impl Patience {
+    pub(super) const DEFAULT: Self = Self {
+        // They take half a millisecond.
+        few_entries: 1 << 16,
+        // Two microseconds, which is no more than the search is bound to take.
+        few_entries_per_observation: 1 << 8,
+        entries_per_expansion: 16,
+        // Nodes of fewer expansions are in the caches, where an expansion takes less time.
+        min_expansions_before_sweep: 1 << 16,
+        // So many are swept in about the time of an expansion, where there are many.
+        nodes_per_expansion: 16,
+        grouping: GroupingPatience::DEFAULT,
+    };
+}
+
+/// Most states of a model whose layers are swept: a layer takes tens of milliseconds then, between two looks at the interrupt.
+const MAX_SWEPT_STATES: usize = 1 << 20;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,250 @@
+use proptest::prelude::*;
+use serde_json::{Value, json};
+
+use super::*;
+use crate::document::{Faults, Place};
+use crate::interrupt::Uninterrupted;
+use crate::mapping::Request;
+use crate::mapping::heuristic::{Grouping, HeuristicName};
+use crate::mapping::mapper::Status;
+use crate::model::{Definition, Limits, Model};
+
+/// A belt of places with a dial of ten at each, and a demonstration that turns it in a way that the body cannot.
+fn belt(n_places: usize, n_observations: usize) -> (Mapper, Value) {
+    let states: Value = (0..n_places * 10).map(|state| json!([state / 10, state % 10])).collect();
+    let transitions = (0..n_places * 10).flat_map(|state| {
+        let (place, dial) = (state / 10, state % 10);
+        let on = (place + 1 < n_places).then(|| json!([state, "on", state + 10]));
+        let back = (place > 0).then(|| json!([state, "back", state - 10]));
+        on.into_iter().chain(back).chain([json!([state, "turn", place * 10 + (dial + 3) % 10])])
+    });
+    let model = json!({
+        "attributes": [{"name": "place", "kind": "number"}, {"name": "dial", "kind": "cyclic", "period": 10}],
+        "actions": [{"name": "on", "cost": 0.3}, {"name": "back", "cost": 0.3}, {"name": "turn", "cost": 0.3}],
+        "dynamics": {"kind": "table", "start": 0, "states": states, "transitions": transitions.collect::<Value>()},
+    });
+    let seen = (0..n_observations).map(|i| json!({"place": i % n_places, "dial": i * 2 % 10}));
+    (prepared(&model), json!({"model": "belt", "demonstration": seen.collect::<Value>()}))
+}
+
+fn prepared(model: &Value) -> Mapper {
+    let definition = Definition::read(model, Limits::NONE, &mut Uninterrupted).unwrap();
+    let model = Model::compile(&definition, Limits::NONE, &mut Uninterrupted).unwrap();
+    Mapper::new(model, &mut Uninterrupted).unwrap()
+}
+
+fn read<'m>(mapper: &'m Mapper, request: &Value) -> Request<'m> {
+    let mut faults = Faults::default();
+    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    Request::read(mapper.model(), &object, &mut faults).unwrap()
+}
+
+/// A body in a world of small numbers, and a demonstration. States look alike now and then, and actions may cost nothing.
+fn wander() -> impl Strategy<Value = (Value, Value)> {
+    let states = prop::collection::vec((0..6_u32, 0..4_u32, 0..3_u32), 5..60);
+    let transitions = prop::collection::vec((0..60_usize, 0..3_usize, 0..60_usize), 10..200);
+    let seen = (0..8_u32, prop::option::weighted(0.7, 0..4_u32), prop::option::weighted(0.7, 0..3_u32));
+    let costs = prop_oneof![Just([0.0, 0.5, 2.0]), Just([0.3, 0.7, 1.1])];
+    (states, transitions, prop::collection::vec(seen, 3..16), costs).prop_map(
+        |(states, mut transitions, seen, costs)| {
+            for (from, _, to) in &mut transitions {
+                (*from, *to) = (*from % states.len(), *to % states.len());
+            }
+            transitions.sort_unstable();
+            transitions.dedup_by_key(|(from, action, _)| (*from, *action));
+            let model = json!({
+                "attributes": [
+                    {"name": "x", "kind": "number"},
+                    {"name": "y", "kind": "number", "weight": 2.5},
+                    {"name": "c", "kind": "category", "weight": 1.3},
+                ],
+                "actions": (0..3).map(|n| json!({"name": format!("a{n}"), "cost": costs[n]})).collect::<Value>(),
+                "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
+            });
+            (model, json!({"model": "wander", "demonstration": seen}))
+        },
+    )
+}
+
+/// A body that goes where it looks, in a hall with walls, and a demonstration. Attributes of it are worth projecting together.
+fn hall() -> impl Strategy<Value = (Value, Value)> {
+    let seen = (0..4_u32, 0..9_u32, prop::option::of(0..4_u32));
+    let walls = prop::collection::vec(prop::bool::weighted(0.1), 4 * 9 * 4);
+    (walls, prop::collection::vec(seen, 3..16)).prop_map(|(walls, seen)| {
+        let state = |x: i32, y: i32, heading: i32| usize::try_from((x * 9 + y) * 4 + heading).unwrap();
+        let places = (0..4).flat_map(|x| (0..9).flat_map(move |y| (0..4).map(move |heading| (x, y, heading))));
+        let transitions = places.clone().flat_map(|(x, y, heading)| {
+            let (ahead_x, ahead_y) = [(x + 1, y), (x, y + 1), (x - 1, y), (x, y - 1)][state(0, 0, heading)];
+            let here = state(x, y, heading);
+            let is_free = (0..4).contains(&ahead_x) && (0..9).contains(&ahead_y) && !walls[here];
+            let ahead = is_free.then(|| json!([here, "forward", state(ahead_x, ahead_y, heading)]));
+            ahead.into_iter().chain([json!([here, "left", state(x, y, (heading + 1) % 4)])])
+        });
+        let model = json!({
+            "attributes": [
+                {"name": "x", "kind": "number"},
+                {"name": "y", "kind": "number"},
+                {"name": "heading", "kind": "cyclic", "period": 4},
+            ],
+            "actions": [{"name": "forward", "cost": 0.3}, {"name": "left", "cost": 0.3}],
+            "dynamics": {
+                "kind": "table",
+                "states": places.collect::<Vec<_>>(),
+                "transitions": transitions.collect::<Value>(),
+                "start": 0,
+            },
+        });
+        (model, json!({"model": "hall", "demonstration": seen}))
+    })
+}
+
+/// Whatever takes long is done as soon as may be.
+const IMPATIENT: Patience = Patience {
+    few_entries: 0,
+    few_entries_per_observation: 8,
+    entries_per_expansion: 16,
+    min_expansions_before_sweep: 40,
+    nodes_per_expansion: u64::MAX,
+    grouping: GroupingPatience { min_expansions: 8, expansions_per_transition: 0, expansions_per_entry: 0 },
+};
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 600, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn whatever_helps_a_long_search_leads_to_the_optimum_and_to_true_bounds(
+        (model, request) in prop_oneof![wander(), hall()],
+        helps in prop_oneof![
+            Just(IMPATIENT),
+            Just(Patience { min_expansions_before_sweep: u64::MAX, ..IMPATIENT }),
+            Just(Patience { grouping: GroupingPatience::DEFAULT, ..IMPATIENT }),
+        ],
+        few in 0..300_u64,
+        looseness in prop_oneof![Just(None), Just(Some(1.0)), Just(Some(1.3))],
+    ) {
+        let mapper = Mapper { patience: helps, ..prepared(&model) };
+        let request = read(&mapper, &request);
+        let without = Settings { heuristic: HeuristicName::None, ..Settings::default() };
+        let optimum = mapper.map(&request.problem, without, &mut Uninterrupted).unwrap().cost.total;
+        let close = |cost: f64| (cost - optimum).abs() <= 1e-9 * optimum;
+        let settings = Settings { upper_bound: looseness.map(|factor| optimum * factor), ..Settings::default() };
+        let map = |budget, interrupt: &mut dyn Interrupt| {
+            mapper.map(&request.problem, Settings { budget, ..settings }, interrupt).unwrap()
+        };
+        let is_true = |mapping: &Mapping| {
+            let lower_bound = mapping.lower_bound.unwrap();
+            lower_bound <= optimum * (1.0 + 1e-9)
+                && optimum * (1.0 - 1e-9) <= mapping.cost.total
+                && (mapping.status == Status::Bounded || close(mapping.cost.total))
+        };
+
+        let mapping = map(Budget::DEFAULT, &mut Uninterrupted);
+        prop_assert!(mapping.status == Status::Optimal && close(mapping.cost.total), "{mapping:?}, not {optimum}");
+        let mapping = map(Budget { max_expansions: few, ..Budget::DEFAULT }, &mut Uninterrupted);
+        prop_assert!(is_true(&mapping) && mapping.n_expanded <= few, "{mapping:?}, of {optimum} and {few}");
+        let max_nodes = usize::try_from(few).unwrap();
+        let mapping = map(Budget { max_nodes, ..Budget::DEFAULT }, &mut Uninterrupted);
+        prop_assert!(is_true(&mapping), "{mapping:?}, of {optimum} in {max_nodes} nodes");
+        let mut n_left = few / 8;
+        let mapping = map(Budget::DEFAULT, &mut || {
+            n_left = n_left.saturating_sub(1);
+            if n_left > 0 { Signal::Continue } else { Signal::Finish }
+        });
+        prop_assert!(is_true(&mapping), "{mapping:?}, of {optimum}");
+    }
+}
+
+#[test]
+fn tables_left_out_at_first_and_sweeps_come_to_the_same_cost_as_a_search_without_heuristic() {
+    // The places' table is too large for a first attempt, which is not enough.
+    let (mapper, request) = belt(3_000, 30);
+    let request = read(&mapper, &request);
+    let few = Projected::solve(
+        &mapper.projections,
+        &request.problem,
+        Grouping::WhenItPays,
+        Patience::DEFAULT.few_entries,
+        &mut Uninterrupted,
+    );
+    assert!(few.unwrap().unwrap().n_left_out() >= 90_000);
+    let map = |heuristic| {
+        let settings = Settings { heuristic, ..Settings::default() };
+        mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap()
+    };
+    let (by_default, without) = (map(HeuristicName::Default), map(HeuristicName::None));
+    assert_eq!((by_default.cost.total, by_default.status), (without.cost.total, Status::Optimal));
+
+    // Cut short between the two attempts, it keeps what the first one found.
+    let optimum = without.cost.total;
+    for n_polls in 1..60 {
+        let mut n_left = n_polls;
+        let mut interrupt = || {
+            n_left -= i32::from(n_left > 0);
+            if n_left > 0 { Signal::Continue } else { Signal::Finish }
+        };
+        let mapping = mapper.map(&request.problem, Settings::default(), &mut interrupt).unwrap();
+        let lower_bound = mapping.lower_bound.unwrap();
+        assert!(lower_bound <= optimum + 1e-9 && optimum <= mapping.cost.total + 1e-9, "after {n_polls} polls");
+    }
+    for max_expansions in [0, 10, 1_000, 6_000, 10_000] {
+        let settings = Settings { budget: Budget { max_expansions, ..Budget::DEFAULT }, ..Settings::default() };
+        let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+        assert!(mapping.n_expanded <= max_expansions && mapping.lower_bound.unwrap() <= optimum + 1e-9);
+    }
+
+    let (mapper, request) = belt(6, 40);
+    let request = read(&mapper, &request);
+    let sweep = |interrupt: &mut dyn Interrupt| mapper.sweep(&request.problem, Budget::DEFAULT, interrupt);
+    let swept = sweep(&mut Uninterrupted).unwrap();
+    assert_eq!(swept.n_expanded, 60 * 40);
+    let Outcome::Mapped(swept) = swept.outcome else { panic!("{swept:?}") };
+    let settings = Settings { heuristic: HeuristicName::None, ..Settings::default() };
+    let without = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+    assert_eq!((swept.cost.total, swept.status), (without.cost.total, Status::Optimal));
+    assert_eq!(swept.lower_bound, Some(swept.cost.total));
+    assert_eq!(sweep(&mut || Signal::Finish).unwrap().outcome, Outcome::CutShort);
+    assert_eq!(sweep(&mut || Signal::Cancel).unwrap_err(), Cancelled);
+}
+
+#[test]
+fn an_upper_bound_below_the_optimum_proves_that_there_is_no_such_mapping() {
+    let (mapper, request) = belt(6, 40);
+    let request = read(&mapper, &request);
+    let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap().cost.total;
+    for factor in [0.0, 0.5, 0.99, 0.999_999] {
+        let upper_bound = Some(optimum * factor);
+        let settings = Settings { upper_bound, ..Settings::default() };
+        let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+        assert_eq!(mapping.status, Status::Bounded, "{factor}");
+        assert!(mapping.lower_bound.unwrap() <= optimum && optimum <= mapping.cost.total, "{factor}: {mapping:?}");
+        assert!(mapping.lower_bound.unwrap() >= optimum * factor);
+    }
+}
+
+#[test]
+fn a_search_goes_on_where_there_is_no_room_for_a_sweep_and_none_is_begun_that_would_take_too_many_expansions() {
+    let (mapper, request) = belt(3_000, 30);
+    let patience = Patience {
+        few_entries: MAX_ENTRIES,
+        min_expansions_before_sweep: 100,
+        nodes_per_expansion: u64::MAX,
+        ..Patience::DEFAULT
+    };
+    let mapper = Mapper { patience, ..mapper };
+    let request = read(&mapper, &request);
+    let map = |budget| {
+        let settings = Settings { budget, ..Settings::default() };
+        mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap()
+    };
+    let swept = map(Budget::DEFAULT);
+    assert_eq!((swept.status, swept.n_expanded), (Status::Optimal, 100 + 30_000 * 30));
+    // The newest layer alone has 30,000 nodes.
+    let searched = map(Budget { max_nodes: 20_000, ..Budget::DEFAULT });
+    assert_eq!((searched.status, searched.cost.total), (Status::Optimal, swept.cost.total));
+    assert!(searched.n_expanded < swept.n_expanded / 4, "a few layers, and a search: {}", searched.n_expanded);
+
+    let n_all = swept.n_expanded;
+    assert_eq!(map(Budget { max_expansions: n_all, ..Budget::DEFAULT }).n_expanded, n_all);
+    let searched = map(Budget { max_expansions: n_all - 1, ..Budget::DEFAULT });
+    assert!(searched.status == Status::Optimal && searched.n_expanded < 30_000, "{}", searched.n_expanded);
+}

@@ -1,0 +1,311 @@
+//! A model prepared for mapping.
+
+mod escalation;
+
+use std::sync::{Arc, Mutex};
+
+use rustc_hash::FxHashMap;
+use serde::{Deserialize, Serialize};
+use utoipa::ToSchema;
+
+use super::Problem;
+use super::completion::{Allowance, Extras, complete};
+use super::cost::{Cost, ROUNDING, SLACK, cost_of};
+use super::heuristic::paper::Paper;
+use super::heuristic::projected::{MAX_ENTRIES, Projected};
+use super::heuristic::projection::Projections;
+use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
+use super::search::best_first::Buffers;
+use super::search::{Found, Move, astar};
+use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
+use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
+use escalation::Patience;
+
+/// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Budget {
+    /// Most nodes expanded.
+    pub max_expansions: u64,
+    /// Most nodes kept in memory, about 64 bytes each. If the model is searched lazily, the states that are found count too, by
+    /// their size.
+    pub max_nodes: usize,
+}
+
+impl Budget {
+    /// Any number of expansions, within 16 million nodes: about 1 GB. The tables of the default heuristic come on top: up to
+    /// 256 MB, and as much again where attributes are projected together.
+    pub const DEFAULT: Self = Self { max_expansions: u64::MAX, max_nodes: 16_000_000 };
+}
+
+impl Budget {
+    /// How much memory a node takes, in bytes.
+    const NODE_BYTES: usize = 64;
+
+    /// How much memory its nodes take, in bytes.
+    fn max_bytes(self) -> usize {
+        self.max_nodes.saturating_mul(Self::NODE_BYTES)
+    }
+
+    /// Whether there is no more memory: for `n_nodes`, and what was found in `space`.
+    #[inline]
+    pub(in crate::mapping) fn is_full(self, n_nodes: usize, space: &impl Space) -> bool {
+        n_nodes + space.found_bytes() / Self::NODE_BYTES >= self.max_nodes
+    }
+}
+
+impl Default for Budget {
+    fn default() -> Self {
+        Self::DEFAULT
+    }
+}
+
+/// How a mapping is searched for.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Settings {
+    /// What guides the search.
+    pub heuristic: HeuristicName,
+    /// What it may spend.
+    pub budget: Budget,
+    /// The cost of a mapping that is known already: nothing that costs more is looked at. If it is below the optimum, the mapping
+    /// is bounded by it. Has no effect with the paper's heuristic.
+    pub upper_bound: Option<f64>,
+    /// When the default heuristic projects attributes together.
+    pub grouping: Grouping,
+}
+
+/// What was proven of a mapping.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Status {
+    /// No mapping costs less.
+    Optimal,
+    /// No mapping costs less than `lower_bound`: a budget ran out, or the heuristic proves nothing.
+    Bounded,
+    /// Nothing: a finite lookahead decided.
+    Local,
+}
+
+impl Status {
+    /// The status, as in JSON.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Optimal => "optimal",
+            Self::Bounded => "bounded",
+            Self::Local => "local",
+        }
+    }
+}
+
+/// The best sequence of imitator states and actions that was found for a demonstration, with its alignment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mapping {
+    /// The steps, from [`Start`](super::MoveKind::Start) to the last observation.
+    pub moves: Vec<Move>,
+    /// What they cost.
+    pub cost: Cost,
+    /// What was proven.
+    pub status: Status,
+    /// No mapping costs less. Equal to `cost.total` if optimal; `None` if local.
+    pub lower_bound: Option<f64>,
+    /// Nodes expanded.
+    pub n_expanded: u64,
+    /// Successors looked at.
+    pub n_generated: u64,
+    /// The states of the moves, in the order in which they are first passed, if the model is searched lazily; else they are those
+    /// of the model.
+    pub states: Option<States>,
+}
+
+/// A model, and what is computed once per model to search it.
+#[derive(Debug)]
+pub struct Mapper {
+    model: Arc<Model>,
+    projections: Projections,
+    /// Of searches that have ended, for those that come: at most as many as ran at the same time.
+    buffers: Mutex<Vec<Buffers>>,
+    patience: Patience,
+}
+
+impl Mapper {
+    /// Prepares `model`. Takes time and memory proportional to its states and transitions times attributes.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
+    pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
+        let projections = Projections::new(&model, interrupt)?;
+        Ok(Self { model: Arc::new(model), projections, buffers: Mutex::default(), patience: Patience::DEFAULT })
+    }
+
+    /// The model.
+    #[must_use]
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    pub(in crate::mapping) fn shared_model(&self) -> Arc<Model> {
+        Arc::clone(&self.model)
+    }
+
+    /// Approximate size in memory, in bytes.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        self.model.size_bytes() + self.projections.size_bytes()
+    }
+
+    /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the
+    /// search by default. Consistent, for nodes that the start leads to; 0 at the last observation. For other searches, and to
+    /// look at.
+    ///
+    /// # Panics
+    ///
+    /// If `problem` is of another model; the function, if the observation is not of the problem, or the state has no number in the
+    /// model, as all but the start of one that is searched lazily.
+    pub fn lower_bounds<'p>(&'p self, problem: &'p Problem<'p>) -> impl Fn(u32, StateIdx) -> f64 + 'p {
+        self.check(problem);
+        let projected =
+            Projected::solve(&self.projections, problem, Grouping::WhenItPays, MAX_ENTRIES, &mut Uninterrupted)
+                .ok()
+                .flatten();
+        let projected = projected.expect("nothing interrupts");
+        move |observation, state| projected.cost_to_go(observation as usize, self.model.states().row(state))
+    }
+
+    /// The cheapest mapping of `problem`, which must be of this mapper's model; the best one found if the budget runs out or
+    /// `interrupt` says to finish. Deterministic but for where `interrupt` cuts it off.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    ///
+    /// # Panics
+    ///
+    /// If `problem` is of another model.
+    pub fn map(
+        &self,
+        problem: &Problem<'_>,
+        settings: Settings,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        self.check(problem);
+        let Some(cave) = self.model.unexplored() else {
+            return self.map_in(&mut Whole::of(&self.model), problem, settings, interrupt);
+        };
+        let mut explored = Explored::new(cave, problem.cave_start.unwrap_or_else(|| cave.first_state()));
+        let mut mapping = self.map_in(&mut explored, problem, settings, interrupt)?;
+        mapping.states = Some(explored.keep(&renumber(&mut mapping.moves)));
+        Ok(mapping)
+    }
+
+    fn map_in<S: Space>(
+        &self,
+        space: &mut S,
+        problem: &Problem<'_>,
+        settings: Settings,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        let Settings { budget, upper_bound, .. } = settings;
+        // Sums in another order may be a little larger; a little room costs nothing.
+        let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
+        match settings.heuristic {
+            HeuristicName::Default => self.best_first(space, problem, settings, most_f, interrupt),
+            HeuristicName::None => {
+                let found = astar::search(problem, space, &Blind, budget, most_f, interrupt)?;
+                conclude(problem, space, &Blind, within(most_f, found, problem), interrupt)
+            }
+            HeuristicName::Paper => {
+                let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
+                // The paper's estimate proves nothing; the projections bound the optimum all the same.
+                let first = problem.distances.distance(0, space.row(problem.start));
+                match Projected::solve(&self.projections, problem, settings.grouping, MAX_ENTRIES, interrupt)? {
+                    Some(projected) => {
+                        let least_f = first + projected.cost_to_go(0, space.row(problem.start));
+                        conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
+                    }
+                    None => conclude(problem, space, &Blind, Found { least_f: first, ..found }, interrupt),
+                }
+            }
+        }
+    }
+
+    fn check(&self, problem: &Problem<'_>) {
+        assert!(std::ptr::eq(problem.model, &raw const *self.model), "the problem must be of this mapper's model");
+    }
+
+    /// A mapping of `problem` that begins with `moves` and goes on greedily; of whole states, as for a lookahead. Nothing is
+    /// proven of it.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    pub(in crate::mapping) fn complete(
+        &self,
+        problem: &Problem<'_>,
+        moves: Vec<Move>,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        let found = Found { paths: vec![moves], is_complete: false, least_f: 0.0, n_expanded: 0, n_generated: 0 };
+        let mapping = conclude(problem, &mut Whole::of(&self.model), &Blind, found, interrupt)?;
+        Ok(Mapping { status: Status::Local, lower_bound: None, ..mapping })
+    }
+}
+
+/// Numbers the states of `moves` anew, in the order in which they are first passed. Gives their former numbers, by the new ones.
+fn renumber(moves: &mut [Move]) -> Vec<StateIdx> {
+    let mut former = Vec::new();
+    let mut numbers: FxHashMap<StateIdx, StateIdx> = FxHashMap::default();
+    for step in moves {
+        #[expect(clippy::cast_possible_truncation, reason = "no more than there were")]
+        let next = former.len() as StateIdx;
+        let number = *numbers.entry(step.state).or_insert(next);
+        if number == next {
+            former.push(step.state);
+        }
+        step.state = number;
+    }
+    former
+}
+
+/// What was found by a search among the mappings that cost at most `most_f`. If it came to its end without one, there is none, so
+/// that is a lower bound.
+fn within(most_f: f64, found: Found, problem: &Problem<'_>) -> Found {
+    let is_whole = |path: &Vec<Move>| path.last().is_some_and(|end| end.observation as usize == problem.last());
+    if found.is_complete && !found.paths.iter().any(is_whole) {
+        Found { is_complete: false, least_f: most_f, ..found }
+    } else {
+        found
+    }
+}
+
+/// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than its `least_f`.
+fn conclude<S: Space, H: Heuristic>(
+    problem: &Problem<'_>,
+    space: &mut S,
+    heuristic: &H,
+    found: Found,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Mapping, Cancelled> {
+    let Found { paths, is_complete, least_f: lower_bound, n_expanded, n_generated } = found;
+    let mut allowance = Allowance::new(interrupt);
+    let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };
+    let mut costed = Vec::new();
+    for path in paths {
+        for extras in ways {
+            let moves = complete(problem, space, heuristic, *extras, path.clone(), &mut allowance)?;
+            costed.push((cost_of(problem, space, &moves), moves));
+        }
+    }
+    let best = costed.into_iter().min_by(|(cost, _), (other, _)| cost.total.total_cmp(&other.total));
+    let (cost, moves) = best.expect("a search gives at least one path");
+    let is_optimal = cost.total * (1.0 - ROUNDING) <= lower_bound;
+    Ok(Mapping {
+        moves,
+        cost,
+        status: if is_optimal { Status::Optimal } else { Status::Bounded },
+        lower_bound: Some(if is_optimal { cost.total } else { lower_bound }),
+        n_expanded,
+        n_generated,
+        states: None,
+    })
+}

@@ -1,0 +1,375 @@
+//! An open session: observations in, committed steps out.
+
+use std::num::NonZeroU32;
+use std::sync::Arc;
+use std::time::Instant;
+
+use jiff::Timestamp;
+use serde_json::Value;
+use tokio_util::sync::CancellationToken;
+use uuid::Uuid;
+
+use super::{SessionError, read_stored};
+use crate::attribute::{ByAttribute, Weights};
+use crate::document::{Faults, Place};
+use crate::interrupt::{Interrupt, Uninterrupted};
+use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status};
+use crate::model::Origin;
+use crate::service::owners::Ownership;
+use crate::service::policies::{PolicyText, as_micros, report, write_policy};
+use crate::service::{Etude, PoolError, ServiceError};
+use crate::store::{AcceptedReward, NewObservations, NewRefinement, SessionEnd, TrialRow};
+
+/// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
+/// in the pool.
+const MAX_INLINE_WORK: usize = 1 << 14;
+
+/// An open session, and the right to drive it.
+#[derive(Debug)]
+pub struct Session {
+    pub(super) id: String,
+    pub(super) model: String,
+    pub(super) model_hash: String,
+    pub(super) mapper: Arc<Mapper>,
+    pub(super) weights: Weights,
+    pub(super) lookahead: Option<NonZeroU32>,
+    pub(super) start: Option<u32>,
+    pub(super) source: Source,
+    pub(super) n_received: u32,
+    pub(super) n_steps: usize,
+    /// `None` once the session has ended.
+    pub(super) online: Option<OnlineMapping>,
+    pub(super) ownership: Ownership,
+}
+
+/// Where a session's weights come from.
+#[derive(Clone, Debug)]
+pub(super) struct Source {
+    pub(super) learner: Option<String>,
+    pub(super) weights_version: Option<u64>,
+    pub(super) trial_id: Option<String>,
+}
+
+/// What became of observations that were received, besides being durable.
+#[derive(Debug)]
+pub enum Received {
+    /// They were mapped at the same time, and commit these steps.
+    Mapped(Vec<CommittedStep>),
+    /// They take longer to be mapped: see [`Session::advance`].
+    Waiting(Vec<Observation>),
+}
+
+/// The end of a session.
+#[derive(Debug)]
+pub struct Ended {
+    /// The steps committed by the end.
+    pub steps: Vec<CommittedStep>,
+    /// The policy of the whole, stored.
+    pub policy: Policy,
+}
+
+/// What has become of the reward of a session.
+#[derive(Clone, Debug, PartialEq)]
+pub enum RewardState {
+    /// It is still to come.
+    Awaited,
+    /// It is on disk.
+    Accepted {
+        /// The trial that earned it.
+        trial: String,
+        /// The reward.
+        reward: AcceptedReward,
+    },
+    /// None will come: the session does not explore, its trial has failed, or its learner was deleted.
+    Never,
+}
+
+impl Session {
+    /// Every field of a request to open a session.
+    pub const OPEN_FIELDS: [&'static str; 7] = ["type", "model", "learner", "explore", "weights", "lookahead", "start"];
+
+    /// Its id.
+    #[must_use]
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+
+    /// The trial that it explores, if any.
+    #[must_use]
+    pub fn trial_id(&self) -> Option<&str> {
+        self.source.trial_id.as_deref()
+    }
+
+    /// Whether its demonstration has ended.
+    #[must_use]
+    pub fn has_ended(&self) -> bool {
+        self.online.is_none()
+    }
+
+    /// The weights of the distance.
+    #[must_use]
+    pub fn weights(&self) -> ByAttribute<f64> {
+        self.mapper.model().schema().by_attribute(self.weights.as_slice().iter().copied())
+    }
+
+    /// How many observations are durable.
+    #[must_use]
+    pub fn n_received(&self) -> u32 {
+        self.n_received
+    }
+
+    /// How many steps were committed.
+    #[must_use]
+    pub fn n_steps(&self) -> usize {
+        self.n_steps
+    }
+
+    /// Cancelled when another connection takes the session over.
+    #[must_use]
+    pub fn taken_over(&self) -> &CancellationToken {
+        &self.ownership.taken_over
+    }
+
+    /// What has become of its reward.
+    ///
+    /// # Errors
+    ///
+    /// If the store failed.
+    pub async fn reward(&self, etude: &Etude) -> Result<RewardState, SessionError> {
+        let Some(trial) = &self.source.trial_id else { return Ok(RewardState::Never) };
+        Ok(match etude.store.trial(trial).await? {
+            Some(TrialRow { reward: Some(reward), id, .. }) => RewardState::Accepted { trial: id, reward },
+            Some(TrialRow { failed: None, .. }) => RewardState::Awaited,
+            Some(_) | None => RewardState::Never,
+        })
+    }
+
+    /// Takes the states from `seq` on, of which those received before are ignored: they are durable when this returns. What
+    /// takes less time than the disk is mapped while that writes.
+    ///
+    /// # Errors
+    ///
+    /// If something is wrong with them; then none was taken. After [`SessionError::NotOpen`] and
+    /// [`SessionError::Service`] the session is to be dropped.
+    pub async fn receive(
+        &mut self,
+        etude: &Etude,
+        seq: u32,
+        states: &Place<'_, '_>,
+        now: Timestamp,
+    ) -> Result<Received, SessionError> {
+        if self.has_ended() {
+            return Err(SessionError::Ended);
+        }
+        if seq > self.n_received {
+            return Err(SessionError::Gap { expected: self.n_received });
+        }
+        let mut faults = Faults::default();
+        let Some(items) = states.array(&mut faults) else { return Err(faults.into()) };
+        let n_known = (self.n_received - seq) as usize;
+        let new = items.get(n_known..).unwrap_or_default();
+        if new.is_empty() {
+            if !etude.store.touch_session(&self.id, now).await? {
+                return Err(SessionError::NotOpen);
+            }
+            return Ok(Received::Mapped(Vec::new()));
+        }
+        if self.n_received as usize + new.len() > Demonstration::MAX_OBSERVATIONS {
+            return Err(SessionError::TooMany);
+        }
+        let n_observations = self.n_received as usize + new.len();
+        if !Policy::check_size(self.mapper.model(), n_observations, states, &mut faults) {
+            return Err(faults.into());
+        }
+        let schema = self.mapper.model().schema();
+        let read = new.iter().enumerate().map(|(n, state)| {
+            let place = states.item(n_known + n, state);
+            schema.read_observation(&place, &mut faults)
+        });
+        let observations: Vec<_> = read.collect();
+        let observations = faults.check(observations.into_iter().collect::<Option<Vec<_>>>())?;
+        #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
+        let n_states = new.len() as u32;
+        let adding = etude.store.add_observations(NewObservations {
+            session_id: self.id.clone(),
+            seq: self.n_received,
+            n_states,
+            states: serde_json::to_string(new).map_err(ServiceError::Write)?,
+            at: now,
+        });
+        let mapping = async {
+            if self.is_inline(observations.len()) {
+                self.advance(etude, observations).await.map(Received::Mapped)
+            } else {
+                Ok(Received::Waiting(observations))
+            }
+        };
+        // In this order: the disk is at work before the mapping begins.
+        let (added, mapped) = tokio::join!(biased; adding, mapping);
+        if !added? {
+            return Err(SessionError::NotOpen);
+        }
+        self.n_received += n_states;
+        mapped
+    }
+
+    /// Whether so many observations are mapped where they arrive.
+    fn is_inline(&self, n_observations: usize) -> bool {
+        let graph = self.mapper.model().graph();
+        is_inline(graph.n_states() + graph.n_transitions(), self.lookahead, n_observations)
+    }
+
+    /// Maps observations that were received, and gives the steps that they commit.
+    ///
+    /// # Errors
+    ///
+    /// If the service ends; the session is then to be resumed.
+    pub async fn advance(
+        &mut self,
+        etude: &Etude,
+        observations: Vec<Observation>,
+    ) -> Result<Vec<CommittedStep>, SessionError> {
+        let mut online = self.online.take().ok_or(SessionError::NotOpen)?;
+        let is_inline = self.is_inline(observations.len());
+        let job = move |interrupt: &mut dyn Interrupt| {
+            let mut steps = Vec::new();
+            for observation in &observations {
+                steps.extend(online.observe(observation, interrupt)?);
+            }
+            Ok((online, steps))
+        };
+        let (online, steps) = if is_inline {
+            job(&mut Uninterrupted).map_err(|_| PoolError::Stopped)?
+        } else {
+            etude.pool.run_patiently(job).await?
+        };
+        self.online = Some(online);
+        self.n_steps += steps.len();
+        Ok(steps)
+    }
+
+    /// Ends the demonstration, which must have `seq` observations, and stores its policy.
+    ///
+    /// # Errors
+    ///
+    /// If observations are missing, or the service ends. After [`SessionError::TooManySteps`] the session is to be dropped.
+    pub async fn end(&mut self, etude: &Etude, seq: u32, now: Timestamp) -> Result<Ended, SessionError> {
+        if self.has_ended() {
+            return Err(SessionError::Ended);
+        }
+        if seq != self.n_received {
+            return Err(SessionError::Gap { expected: self.n_received });
+        }
+        if seq == 0 {
+            return Err(SessionError::Empty);
+        }
+        let texts = etude.store.observations(&self.id).await?;
+        let online = self.online.take().ok_or(SessionError::NotOpen)?;
+        let (mapper, weights, start) = (Arc::clone(&self.mapper), self.weights.clone(), self.start);
+        let policy_id = match &self.source.trial_id {
+            Some(trial) => etude.store.trial(trial).await?.map(|trial| trial.policy_id),
+            None => None,
+        };
+        let stamp = Stamp {
+            id: Some(policy_id.unwrap_or_else(|| Uuid::now_v7().to_string())),
+            model: self.model.clone(),
+            model_hash: self.model_hash.clone(),
+            learner: self.source.learner.clone(),
+            weights_version: self.source.weights_version,
+            lookahead: self.lookahead.map(NonZeroU32::get),
+            ..Stamp::default()
+        };
+        let job = move |_: &mut dyn Interrupt| Ok(conclude(online, &mapper, &texts, weights, start, stamp));
+        let (steps, policy, row, refinement) = etude.pool.run_patiently(job).await??;
+        let is_refined = refinement.is_some();
+        let end = SessionEnd { session_id: self.id.clone(), policy: row.at(now), refinement };
+        if !etude.store.end_session(end).await? {
+            return Err(SessionError::NotOpen);
+        }
+        if is_refined {
+            etude.refiner.wake();
+        }
+        self.n_steps += steps.len();
+        Ok(Ended { steps, policy })
+    }
+}
+
+/// Whether so many observations are mapped where they arrive, in a model of `size` states and transitions.
+fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) -> bool {
+    let n_layers = n_observations.saturating_mul(lookahead.map_or(1, |lookahead| lookahead.get() as usize));
+    n_layers.saturating_mul(size) <= MAX_INLINE_WORK
+}
+
+/// An observation as it was read. Shape `[n_attributes]`; `None` where an attribute was not observed.
+pub type Observation = Vec<Option<crate::attribute::Value>>;
+
+type Concluded = (Vec<CommittedStep>, Policy, PolicyText, Option<NewRefinement>);
+
+/// Commits the rest, and writes the policy of the whole.
+fn conclude(
+    online: OnlineMapping,
+    mapper: &Mapper,
+    texts: &[String],
+    weights: Weights,
+    start: Option<u32>,
+    stamp: Stamp,
+) -> Result<Concluded, SessionError> {
+    let started = Instant::now();
+    let (steps, mapping) = online.end().ok_or(SessionError::Empty)?;
+    Policy::check_steps(mapper.model(), &mapping)?;
+    let demonstration = Demonstration::of(read_stored(mapper, texts)?).ok_or(SessionError::Empty)?;
+    let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
+    let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
+    report(&stamp, &mapping);
+    let policy = Policy::new(stamp.clone(), &problem, &mapping);
+    let (_, row) = write_policy(stamp, &problem, &mapping)?;
+    let refinement = (policy.status == Status::Local).then(|| {
+        let parsed = texts.iter().map(|text| serde_json::from_str::<Vec<Value>>(text).unwrap_or_default());
+        let demonstration: Vec<Value> = parsed.flatten().collect();
+        let request = serde_json::json!({
+            "model": policy.model,
+            "weights": policy.weights,
+            "start": problem.start(),
+            "demonstration": demonstration,
+        });
+        let request = request.to_string();
+        NewRefinement {
+            policy_id: policy.id.clone().unwrap_or_default(),
+            model_hash: policy.model_hash.clone(),
+            request,
+        }
+    });
+    Ok((steps, policy, row, refinement))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::model::{Definition, Limits, Model};
+
+    #[test]
+    fn what_is_mapped_where_it_arrives_is_measured_by_transitions_too() {
+        let size = |definition: &Value| {
+            let definition = Definition::read(definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+            let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+            model.graph().n_states() + model.graph().n_transitions()
+        };
+        let lookahead = NonZeroU32::new(8);
+        let cave = size(&json!({"dynamics": {"kind": "wumpus", "width": 7, "height": 4, "gold": [[5, 0]]}}));
+        assert!(is_inline(cave, lookahead, 1) && !is_inline(cave, lookahead, 1000), "{cave}");
+        // Few states, between any two of which an action leads.
+        let n_states = 100;
+        let action = |n: usize| json!({"name": format!("to {n}")});
+        let transitions = (0..n_states).flat_map(|from| (0..n_states).map(move |to| json!([from, to, to])));
+        let complete = json!({
+            "attributes": [{"name": "x", "kind": "number"}], "actions": (0..n_states).map(action).collect::<Vec<_>>(),
+            "dynamics": {
+                "kind": "table", "states": (0..n_states).map(|x| json!([x])).collect::<Vec<_>>(),
+                "transitions": transitions.collect::<Vec<_>>(),
+            },
+        });
+        assert!(!is_inline(size(&complete), lookahead, 1));
+    }
+}
