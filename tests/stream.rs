@@ -740,6 +740,18 @@ async fn a_lookahead_that_reaches_too_far_for_its_model_opens_no_session() {
 }
 
 #[tokio::test]
+async fn a_client_that_waits_to_be_told_to_send_its_frames_is_told() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let service = Service::start(&[]).await;
+    let mut client = TcpStream::connect(service.address).await.unwrap();
+    let head = "POST /v1/stream HTTP/1.1\r\nhost: etude\r\ntransfer-encoding: chunked\r\nexpect: 100-continue\r\n\r\n";
+    client.write_all(head.as_bytes()).await.unwrap();
+    let mut answer = [0; 12];
+    client.read_exact(&mut answer).await.unwrap();
+    assert_eq!(str::from_utf8(&answer).unwrap(), "HTTP/1.1 100");
+}
+
+#[tokio::test]
 async fn who_asks_for_a_stream_without_a_websocket_is_told_to_upgrade() {
     let service = Service::start(&[]).await;
     let response = service.send(Method::GET, "/v1/stream", &Value::Null).await;

@@ -1,15 +1,16 @@
 //! `/v1/stream` and `/v1/sessions`: the stream protocol over websockets and NDJSON.
 
 use std::convert::Infallible;
+use std::pin::Pin;
 use std::time::Duration;
 
-use axum::body::{Body, Bytes};
+use axum::body::{Body, BodyDataStream, Bytes};
 use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, rejection::WebSocketUpgradeRejection};
 use axum::extract::{Request, State};
-use axum::http::header::CONTENT_TYPE;
+use axum::http::header::{CONTENT_TYPE, EXPECT};
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
-use futures_util::stream::{SplitSink, SplitStream};
+use futures_util::stream::{Peekable, SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use jiff::Timestamp;
 use serde::Serialize;
@@ -203,7 +204,7 @@ pub(super) async fn ndjson(State(context): State<Context>, request: Request) -> 
     let (outgoing, goes) = mpsc::channel(MAX_WAITING);
     let (lines, answer) = mpsc::channel::<Result<Bytes, Infallible>>(1);
     let frame_bytes = context.stream_limits.frame_bytes;
-    let body = request.into_body();
+    let body = begin_reading(request).await;
     let streams = context.streams.clone();
     let serving = async move {
         let speaking = async {
@@ -233,11 +234,22 @@ pub(super) async fn ndjson(State(context): State<Context>, request: Request) -> 
     Ok(response)
 }
 
+/// The body of a request. A client that waits to be told to send it (`Expect: 100-continue`, as `curl` does for a second) is told
+/// so when the body is first asked for, which must be before the answer begins.
+async fn begin_reading(request: Request) -> Peekable<BodyDataStream> {
+    let waits = request.headers().contains_key(EXPECT);
+    let mut body = request.into_body().into_data_stream().peekable();
+    if waits {
+        let _asked = futures_util::poll!(Pin::new(&mut body).peek());
+        tokio::task::yield_now().await;
+    }
+    body
+}
+
 /// Passes on lines as frames. Ends with the body, or with a line over the limit.
-async fn read_lines(body: Body, frame_bytes: usize, came: mpsc::Sender<Incoming>) {
-    let mut stream = body.into_data_stream();
+async fn read_lines(mut body: Peekable<BodyDataStream>, frame_bytes: usize, came: mpsc::Sender<Incoming>) {
     let mut line = Vec::new();
-    while let Some(Ok(chunk)) = stream.next().await {
+    while let Some(Ok(chunk)) = body.next().await {
         for part in chunk.split_inclusive(|byte| *byte == b'\n') {
             line.extend_from_slice(part);
             if line.len() > frame_bytes + 1 {
