@@ -590,10 +590,19 @@ async fn a_deadline_holds_for_those_who_wait_for_a_thread() {
     assert_eq!((status, &policy["status"]), (201, &json!("bounded")));
     let batch = json!({
         "model": "figure-4", "deadline_ms": 20,
-        "items": [{"demonstration": small["demonstration"]}, {"demonstration": large["demonstration"]}],
+        "items": [
+            {"demonstration": small["demonstration"]}, {"demonstration": large["demonstration"]},
+            {"demonstration": large["demonstration"], "lookahead": 8},
+        ],
     });
     let (status, answer) = service.post("/v1/policies:batch", &batch).await;
     assert_eq!((status, &answer["items"][1]["status"]), (200, &json!("bounded")));
+    assert_eq!(answer["items"][2]["status"], "local");
+    large["heuristic"] = Value::Null;
+    large["lookahead"] = json!(8);
+    let (status, policy) = service.post("/v1/policies", &large).await;
+    assert_eq!((status, &policy["status"]), (201, &json!("local")));
+    assert_eq!(policy["steps"].as_array().unwrap().last().unwrap()["observation"], 19_999);
     assert!(!waiting.is_finished(), "the one before them is still searched");
     waiting.abort();
     while service.measurement("etude_search_jobs").await > 0.0 {

@@ -10,9 +10,9 @@
 //! comes meanwhile waits for a slice, not for the batch.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::iter::Enumerate;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
-use std::vec;
 
 use futures_util::future::try_join_all;
 use jiff::Timestamp;
@@ -64,28 +64,27 @@ impl Etude {
         let document = parse(body, &place).await?;
         let (envelope, faults) = Envelope::read(&document, &BATCH_FIELDS, "items");
         let Some(envelope) = envelope else { return Err(faults.into()) };
-        let deadline = envelope.deadline.and_then(|deadline| arrived.checked_add(deadline));
-        let impatient = place.clone().with_patience(deadline);
-        let named = self.find(&envelope, faults, &impatient).await?;
-        let batch = impatient.run(None, move |_| Ok(Batch::read(document, envelope.model, named))).await??;
+        let deadline = envelope.deadline(arrived);
+        let place = place.with_patience(deadline);
+        let named = self.find(&envelope, faults, &place).await?;
+        let batch = place.run(None, move |_| Ok(Batch::read(document, envelope.model, named))).await??;
 
         let batch = Arc::new(batch);
         let runners = (0..self.pool.n_threads()).map(|_| async {
             let mut made = Vec::new();
-            for (which, place, deadline) in
-                [(Which::WithoutLookahead, &impatient, deadline), (Which::WithLookahead, &place, None)]
-            {
-                while !batch.is_over(which) {
-                    let batch = Arc::clone(&batch);
-                    made.extend(place.run(deadline, move |interrupt| batch.run_slice(which, interrupt)).await?);
+            loop {
+                let batch = Arc::clone(&batch);
+                let slice = place.run(deadline, move |interrupt| batch.run_slice(interrupt)).await?;
+                if slice.is_empty() {
+                    return Ok::<_, ServiceError>(made);
                 }
+                made.extend(slice);
             }
-            Ok::<_, ServiceError>(made)
         });
         let mut made: Vec<_> = try_join_all(runners).await?.into_iter().flatten().collect();
         made.sort_unstable_by_key(|(n, _)| *n);
         // The disk is no concern of those who wait for a thread.
-        drop((place, impatient));
+        drop(place);
 
         let (mut rows, mut refinements) = (Vec::new(), Vec::new());
         let mut answer = Vec::with_capacity(made.len());
@@ -119,16 +118,7 @@ struct Batch {
     /// What an item has unless it has its own.
     options: Map<String, Value>,
     /// The items that wait, with their places in the batch.
-    waiting: Mutex<vec::IntoIter<(usize, Value)>>,
-    /// Likewise those with a lookahead of their own, on which a deadline has no effect.
-    waiting_with_lookahead: Mutex<vec::IntoIter<(usize, Value)>>,
-}
-
-/// Which items of a batch.
-#[derive(Clone, Copy)]
-enum Which {
-    WithoutLookahead,
-    WithLookahead,
+    waiting: Mutex<Enumerate<std::vec::IntoIter<Value>>>,
 }
 
 /// What became of an item, and its place in the batch.
@@ -164,31 +154,15 @@ impl Batch {
             weights_version: learner.as_ref().map(|ready| ready.weights.version),
             ..Stamp::default()
         };
-        let has_lookahead = |(_, item): &(usize, Value)| item.get("lookahead").is_some_and(|own| !own.is_null());
-        let (with, without): (Vec<_>, Vec<_>) = items.into_iter().enumerate().partition(has_lookahead);
-        let [waiting, waiting_with_lookahead] = [without, with].map(|items| Mutex::new(items.into_iter()));
-        Ok(Self { mapper, stamp, weights, options, waiting, waiting_with_lookahead })
-    }
-
-    fn waiting(&self, which: Which) -> MutexGuard<'_, vec::IntoIter<(usize, Value)>> {
-        let waiting = match which {
-            Which::WithoutLookahead => &self.waiting,
-            Which::WithLookahead => &self.waiting_with_lookahead,
-        };
-        waiting.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Whether none of these waits any more.
-    fn is_over(&self, which: Which) -> bool {
-        self.waiting(which).as_slice().is_empty()
+        Ok(Self { mapper, stamp, weights, options, waiting: Mutex::new(items.into_iter().enumerate()) })
     }
 
     /// Follows items that wait, one after the other, until a slice is over. Nothing if none waits any more.
-    fn run_slice(&self, which: Which, interrupt: &mut dyn Interrupt) -> Result<Vec<Outcome>, Cancelled> {
+    fn run_slice(&self, interrupt: &mut dyn Interrupt) -> Result<Vec<Outcome>, Cancelled> {
         let started = Instant::now();
         let mut slice = Vec::new();
         while slice.is_empty() || started.elapsed() < SLICE {
-            let next = self.waiting(which).next();
+            let next = self.waiting.lock().unwrap_or_else(PoisonError::into_inner).next();
             let Some((n, item)) = next else { break };
             slice.push((n, self.follow(n, item, interrupt)?));
         }

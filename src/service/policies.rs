@@ -201,7 +201,6 @@ pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admis
 pub(super) struct Envelope {
     pub(super) model: String,
     pub(super) learner: Option<String>,
-    /// None if there is a lookahead, which it has no effect on.
     pub(super) deadline: Option<Duration>,
 }
 
@@ -264,13 +263,13 @@ impl Envelope {
         let envelope = names.map(|(model, learner)| Self {
             model: model.to_owned(),
             learner: learner.map(str::to_owned),
-            deadline: options.filter(|options| options.lookahead.is_none()).and_then(|options| options.deadline),
+            deadline: options.and_then(|options| options.deadline),
         });
         (envelope, faults)
     }
 
     /// When a request that came at `arrived` is to be answered.
-    fn deadline(&self, arrived: Instant) -> Option<Instant> {
+    pub(super) fn deadline(&self, arrived: Instant) -> Option<Instant> {
         self.deadline.and_then(|deadline| arrived.checked_add(deadline))
     }
 
