@@ -318,9 +318,7 @@ async fn a_batch_takes_one_place_and_lets_others_in_between() {
     assert_eq!(service.post("/v1/policies", &request).await.0, 201);
     assert!(!waiting.is_finished(), "the batch was over before the single request");
     waiting.abort();
-    while service.measurement("etude_search_jobs").await > 0.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_idle().await;
 }
 
 #[tokio::test]
@@ -330,13 +328,9 @@ async fn a_client_that_goes_away_leaves_nothing_of_its_batch() {
     let slow = json!({"demonstration": long_demonstration(), "heuristic": "paper"});
     let batch = json!({"model": "figure-4", "items": [quick, slow, quick]});
     let waiting = tokio::spawn(service.client.post(service.url(BATCH)).json(&batch).send());
-    while service.measurement("etude_search_jobs").await < 1.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_searching().await;
     waiting.abort();
-    while service.measurement("etude_search_jobs").await > 0.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_idle().await;
     assert_eq!(service.get("/v1/policies").await.1["items"], json!([]));
     assert_eq!(items(&service, &json!({"model": "figure-4", "items": [quick]})).await.len(), 1);
 }

@@ -532,9 +532,7 @@ async fn a_client_that_goes_away_cancels_its_search() {
     service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
     let request = service.client.post(service.url("/v1/policies")).json(&slow_request());
     let waiting = tokio::spawn(request.send());
-    while service.measurement("etude_search_jobs").await < 1.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_searching().await;
 
     // Meanwhile nobody else gets in, and is told when to try again.
     let response = service.send(Method::POST, "/v1/policies", &example("figure-4/request.json")).await;
@@ -543,9 +541,7 @@ async fn a_client_that_goes_away_cancels_its_search() {
     assert_eq!((status, &problem["type"]), (503, &json!("/problems/busy")));
 
     waiting.abort();
-    while service.measurement("etude_search_jobs").await > 0.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_idle().await;
     assert_eq!(service.post("/v1/policies", &example("figure-4/request.json")).await.0, 201);
 }
 
@@ -567,9 +563,7 @@ async fn a_small_request_in_a_world_searched_lazily_leaves_the_service_awake() {
     assert_eq!(service.measurement("etude_search_jobs").await, 1.0, "it is still being searched");
 
     waiting.abort();
-    while service.measurement("etude_search_jobs").await > 0.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_idle().await;
     assert_eq!(service.get("/v1/policies").await.1["items"], json!([]), "it was cancelled");
 }
 
@@ -578,9 +572,7 @@ async fn a_deadline_holds_for_those_who_wait_for_a_thread() {
     let service = Service::start(&["--search-threads", "1"]).await;
     service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
     let waiting = tokio::spawn(service.client.post(service.url("/v1/policies")).json(&slow_request()).send());
-    while service.measurement("etude_search_jobs").await < 1.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_searching().await;
     let mut small = example("figure-4/request.json");
     small["deadline_ms"] = json!(20);
     assert_eq!(service.post("/v1/policies", &small).await.0, 201);
@@ -605,9 +597,7 @@ async fn a_deadline_holds_for_those_who_wait_for_a_thread() {
     assert_eq!(policy["steps"].as_array().unwrap().last().unwrap()["observation"], 19_999);
     assert!(!waiting.is_finished(), "the one before them is still searched");
     waiting.abort();
-    while service.measurement("etude_search_jobs").await > 0.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_idle().await;
 }
 
 #[tokio::test]
@@ -662,9 +652,7 @@ async fn a_shutdown_answers_what_still_runs_and_closes_the_database() {
     service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
     let request = service.client.post(service.url("/v1/policies")).json(&slow_request());
     let waiting = tokio::spawn(request.send());
-    while service.measurement("etude_search_jobs").await < 1.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_searching().await;
     let directory = service.stop().await;
     let (status, problem) = answer(waiting.await.unwrap().unwrap()).await;
     assert_eq!((status, &problem["type"]), (503, &json!("/problems/stopping")));

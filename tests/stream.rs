@@ -774,9 +774,7 @@ async fn a_service_with_too_much_to_do_opens_no_session_and_goes_on_with_those_t
     let request = json!({"model": "figure-4", "demonstration": long, "heuristic": "paper"});
     let request = service.client.post(service.url("/v1/policies")).json(&request);
     let searching = tokio::spawn(request.send());
-    while service.measurement("etude_search_jobs").await < 1.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_searching().await;
     let mut refused = Client::connect(&service).await;
     refused.send(open.clone()).await;
     assert_eq!(refused.receive().await["problem"]["type"], "/problems/overloaded");
@@ -787,9 +785,7 @@ async fn a_service_with_too_much_to_do_opens_no_session_and_goes_on_with_those_t
 
     searching.abort();
     before.receive_until("done").await;
-    while service.measurement("etude_search_jobs").await > 0.0 {
-        tokio::task::yield_now().await;
-    }
+    service.until_idle().await;
     Client::connect(&service).await.open(open).await;
 }
 

@@ -313,6 +313,8 @@ impl Interrupt for Watch {
 
 #[cfg(test)]
 mod tests {
+    use tokio::task::JoinHandle;
+
     use super::*;
 
     fn pool(n_threads: usize, max_waiting: usize) -> (SearchPool, CancellationToken) {
@@ -330,16 +332,23 @@ mod tests {
         }
     }
 
-    #[tokio::test]
-    async fn a_dropped_waiter_cancels_its_job_and_frees_the_thread() {
-        let (pool, _abort) = pool(1, 0);
-        let waiting = tokio::spawn({
+    /// A job that is in the pool until it is cancelled.
+    async fn busy(pool: &SearchPool) -> JoinHandle<Result<(), PoolError>> {
+        let n_before = pool.n_jobs();
+        let job = tokio::spawn({
             let pool = pool.clone();
             async move { pool.admit()?.run(None, until_cancelled).await }
         });
-        while pool.n_jobs() == 0 {
+        while pool.n_jobs() == n_before {
             tokio::task::yield_now().await;
         }
+        job
+    }
+
+    #[tokio::test]
+    async fn a_dropped_waiter_cancels_its_job_and_frees_the_thread() {
+        let (pool, _abort) = pool(1, 0);
+        let waiting = busy(&pool).await;
         waiting.abort();
         while pool.n_jobs() > 0 {
             tokio::task::yield_now().await;
@@ -350,17 +359,7 @@ mod tests {
     #[tokio::test]
     async fn a_full_queue_refuses_at_once_and_a_shutdown_stops_what_runs() {
         let (pool, abort) = pool(1, 1);
-        let running = tokio::spawn({
-            let pool = pool.clone();
-            async move { pool.admit()?.run(None, until_cancelled).await }
-        });
-        let waiting = tokio::spawn({
-            let pool = pool.clone();
-            async move { pool.admit()?.run(None, until_cancelled).await }
-        });
-        while pool.n_jobs() < 2 {
-            tokio::task::yield_now().await;
-        }
+        let (running, waiting) = (busy(&pool).await, busy(&pool).await);
         assert_eq!(pool.admit().map(drop), Err(PoolError::Busy));
         abort.cancel();
         assert_eq!(running.await.unwrap(), Err(PoolError::Stopped));
@@ -370,13 +369,7 @@ mod tests {
     #[tokio::test]
     async fn a_job_that_runs_where_it_is_waits_its_turn() {
         let (pool, abort) = pool(1, 1);
-        let running = tokio::spawn({
-            let pool = pool.clone();
-            async move { pool.admit()?.run(None, until_cancelled).await }
-        });
-        while pool.n_jobs() == 0 {
-            tokio::task::yield_now().await;
-        }
+        let running = busy(&pool).await;
         let place = pool.admit().unwrap();
         assert_eq!(pool.admit().map(drop), Err(PoolError::Busy), "it is counted");
         let mut waiting = Box::pin(place.run_here(None, |_| Ok(7)));
@@ -391,13 +384,7 @@ mod tests {
     #[tokio::test]
     async fn a_job_whose_patience_ends_and_one_that_reads_do_not_wait_for_searches() {
         let (pool, _abort) = pool(1, 1);
-        let running = tokio::spawn({
-            let pool = pool.clone();
-            async move { pool.admit()?.run(None, until_cancelled).await }
-        });
-        while pool.n_jobs() == 0 {
-            tokio::task::yield_now().await;
-        }
+        let running = busy(&pool).await;
         let place = pool.admit().unwrap();
         assert_eq!(place.run_reading(|| 7).await, Ok(7));
         let now = Instant::now();

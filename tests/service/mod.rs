@@ -96,6 +96,20 @@ impl Service {
         let line = text.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(' '));
         line.map_or(0.0, |value| value.parse().unwrap())
     }
+
+    /// Waits until something is searched.
+    pub(crate) async fn until_searching(&self) {
+        while self.measurement("etude_search_jobs").await < 1.0 {
+            tokio::task::yield_now().await;
+        }
+    }
+
+    /// Waits until nothing is searched any more.
+    pub(crate) async fn until_idle(&self) {
+        while self.measurement("etude_search_jobs").await > 0.0 {
+            tokio::task::yield_now().await;
+        }
+    }
 }
 
 /// Status and body of an answer; a body that is not JSON is given as a string.
