@@ -194,14 +194,14 @@ fn states_that_are_found_count_as_memory() {
     let mut faults = Faults::default();
     let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
     let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
-    let expanded = |max_nodes| {
-        let settings = Settings { budget: Budget { max_nodes, ..Budget::DEFAULT }, ..Settings::default() };
+    let expanded = |max_bytes| {
+        let settings = Settings { budget: Budget { max_bytes, ..Budget::DEFAULT }, ..Settings::default() };
         let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
         assert_eq!(mapping.moves.last().unwrap().observation, 59);
         (mapping.n_expanded, mapping.status)
     };
     assert_eq!(expanded(1).0, 0);
-    let (n_expanded, status) = expanded(100);
+    let (n_expanded, status) = expanded(6400);
     assert_eq!(status, Status::Bounded);
     assert!((1..50).contains(&n_expanded), "a state takes more than a node does: {n_expanded} expansions");
 }

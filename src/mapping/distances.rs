@@ -19,7 +19,7 @@ pub(crate) struct Distances<'m> {
 
 /// An attribute that takes part in the distance.
 #[derive(Debug)]
-struct ActiveAttribute<'m> {
+pub(crate) struct ActiveAttribute<'m> {
     position: usize,
     attribute: &'m Attribute,
     weight: f64,
@@ -74,19 +74,24 @@ impl<'m> Distances<'m> {
     /// What the attribute at `position` adds to the distance for the value at `value` of its domain; 0 if it takes
     /// no part.
     pub(crate) fn term(&self, position: usize, observation: usize, value: u32) -> f64 {
-        let active = self.active.iter().find(|active| active.position == position);
-        active.map_or(0.0, |active| active.term(observation, value))
+        self.of(position).map_or(0.0, |active| active.term(observation, value))
+    }
+
+    /// The attribute at `position`, if it takes part.
+    pub(crate) fn of(&self, position: usize) -> Option<&ActiveAttribute<'m>> {
+        self.active.iter().find(|active| active.position == position)
     }
 
     /// Whether the attribute at `position` takes part.
     pub(crate) fn is_active(&self, position: usize) -> bool {
-        self.active.iter().any(|active| active.position == position)
+        self.of(position).is_some()
     }
 }
 
 impl ActiveAttribute<'_> {
+    /// What it adds for the value at `value` of its domain.
     #[inline]
-    fn term(&self, observation: usize, value: u32) -> f64 {
+    pub(crate) fn term(&self, observation: usize, value: u32) -> f64 {
         let (row, value) = (self.rows[observation] as usize, value as usize);
         match self.table.get(row * self.domain.len() + value) {
             Some(term) => *term,

@@ -112,6 +112,10 @@ impl Space for Explored<'_> {
         self.states.row(state)
     }
 
+    fn keeps_numbers(&self) -> bool {
+        false
+    }
+
     fn n_states(&self) -> Option<usize> {
         None
     }

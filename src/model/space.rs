@@ -13,6 +13,9 @@ pub(crate) trait Space {
     /// The row of `state`: per attribute, the index of its value in the domain. Shape `[n_attributes]`.
     fn row(&self, state: StateIdx) -> &[u32];
 
+    /// Whether a state has the same number in every search.
+    fn keeps_numbers(&self) -> bool;
+
     /// How many states there are, if that is known.
     fn n_states(&self) -> Option<usize>;
 
@@ -45,6 +48,10 @@ impl Space for Whole<'_> {
     #[inline]
     fn row(&self, state: StateIdx) -> &[u32] {
         self.states.row(state)
+    }
+
+    fn keeps_numbers(&self) -> bool {
+        true
     }
 
     fn n_states(&self) -> Option<usize> {

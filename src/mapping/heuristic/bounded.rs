@@ -22,21 +22,19 @@
 
 use std::collections::BinaryHeap;
 
-use super::projected::Estimate;
+use super::projected::{Estimate, Table};
 use super::projection::{ClassIdx, Group, ProjectedEdge};
 use crate::interrupt::{Meter, Signal};
 use crate::mapping::open_list::CheapestFirst;
 
 /// What the tables of the single attributes say, on which those of a group rest.
 pub(super) struct Basis<'b> {
-    /// By the group's digits: where the attribute's values begin in a row; `None` if it has no table.
+    /// By the group's digits: where the attribute's values begin in the tables; `None` if it is not in them.
     pub(super) columns: &'b [Option<usize>],
-    /// Entries per observation.
-    pub(super) width: usize,
-    /// Distances. Shape `[n_observations, width]`.
-    pub(super) entries: &'b [Estimate],
-    /// Least costs from the start, with the distance. Shape `[n_observations, width]`.
-    pub(super) forward: &'b [f64],
+    /// Distances.
+    pub(super) table: &'b Table<Estimate>,
+    /// Least costs from the start, with the distance.
+    pub(super) forward: &'b Table<f64>,
     /// The least distance of any state, and the least of what the group's attributes add to it. Shape `[n_observations]`.
     pub(super) least_distances: &'b [f64],
     pub(super) least_terms: &'b [f64],
@@ -99,11 +97,12 @@ impl<'p> Bounded<'p> {
         n_left: &mut usize,
         meter: &mut Meter<'_>,
     ) -> Result<Self, Unsolved> {
-        let n_observations = basis.entries.len() / basis.width;
+        let n_observations = basis.least_terms.len();
         let mut table = Self { group, layers: vec![Layer::default(); n_observations], slots: Vec::new() };
-        let mut here = Making { group, basis, row: 0, places: vec![NO_PLACE; group.n_classes()], entries: Vec::new() };
+        let mut here =
+            Making { group, basis, observation: 0, places: vec![NO_PLACE; group.n_classes()], entries: Vec::new() };
         let mut open = BinaryHeap::new();
-        here.row = (n_observations - 1) * basis.width;
+        here.observation = n_observations - 1;
         here.enumerate(*n_left)?;
         table.finish_layer(n_observations - 1, &here.entries, n_left)?;
         for i in (0..n_observations - 1).rev() {
@@ -207,8 +206,8 @@ fn spend(meter: &mut Meter<'_>, units: u64) -> Result<(), Unsolved> {
 struct Making<'b> {
     group: &'b Group,
     basis: &'b Basis<'b>,
-    /// Where the observation's row begins in the basis.
-    row: usize,
+    /// The observation.
+    observation: usize,
     /// By class, where it is in `entries`, or [`NO_PLACE`].
     places: Vec<u32>,
     entries: Vec<Entry>,
@@ -221,7 +220,7 @@ impl Making<'_> {
         for entry in &entries {
             self.places[entry.class as usize] = NO_PLACE;
         }
-        self.row = i * self.basis.width;
+        self.observation = i;
         entries
     }
 
@@ -259,8 +258,8 @@ impl Making<'_> {
     #[inline]
     fn at(&self, column: Option<usize>, value: usize) -> (f64, f64) {
         column.map_or((0.0, 0.0), |column| {
-            let at = self.row + column + value;
-            (self.basis.entries[at].distance, self.basis.forward[at])
+            let (class, i) = (column + value, self.observation);
+            (self.basis.table.at(class, i).distance, self.basis.forward.at(class, i))
         })
     }
 

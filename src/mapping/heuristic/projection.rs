@@ -29,9 +29,7 @@ use rustc_hash::FxHashMap;
 
 use super::edges::EdgeSets;
 use super::grouping::{self, Partition};
-use super::projected::Estimate;
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
-use crate::mapping::Problem;
 use crate::model::{ActionIdx, Model, Operator, Rows};
 
 /// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
@@ -353,24 +351,6 @@ impl Group {
 
     pub(super) fn has(&self, position: usize) -> bool {
         self.positions().any(|at| at == position)
-    }
-
-    /// Writes what its attributes add to the distance of the observation `i`, by class.
-    pub(super) fn write_terms(&self, problem: &Problem<'_>, i: usize, row: &mut [Estimate]) {
-        for digit in &self.digits {
-            if !problem.distances.is_active(digit.position) {
-                continue;
-            }
-            // Classes with equal digits come in runs, and the runs of all values follow each other again and again.
-            for runs in row.chunks_exact_mut(digit.stride * digit.n_values) {
-                for (run, value) in runs.chunks_exact_mut(digit.stride).zip(0..) {
-                    let term = problem.distances.term(digit.position, i, value);
-                    for entry in run {
-                        entry.distance += term;
-                    }
-                }
-            }
-        }
     }
 
     fn size_bytes(&self) -> usize {

@@ -26,30 +26,21 @@ use escalation::Patience;
 pub struct Budget {
     /// Most nodes expanded.
     pub max_expansions: u64,
-    /// Most nodes kept in memory, about 64 bytes each. If the model is searched lazily, the states that are found count too, by
-    /// their size.
-    pub max_nodes: usize,
+    /// Most memory for the nodes and states that it finds, in bytes. The tables of the default heuristic come on top: up to 256 MB,
+    /// and as much again where attributes are projected together.
+    pub max_bytes: usize,
 }
 
 impl Budget {
-    /// Any number of expansions, within 16 million nodes: about 1 GB. The tables of the default heuristic come on top: up to
-    /// 256 MB, and as much again where attributes are projected together.
-    pub const DEFAULT: Self = Self { max_expansions: u64::MAX, max_nodes: 16_000_000 };
+    /// Any number of expansions, within 1 GB.
+    pub const DEFAULT: Self = Self { max_expansions: u64::MAX, max_bytes: 1 << 30 };
 }
 
 impl Budget {
-    /// How much memory a node takes, in bytes.
-    const NODE_BYTES: usize = 64;
-
-    /// How much memory its nodes take, in bytes.
-    fn max_bytes(self) -> usize {
-        self.max_nodes.saturating_mul(Self::NODE_BYTES)
-    }
-
-    /// Whether there is no more memory: for `n_nodes`, and what was found in `space`.
+    /// Whether there is no more memory: for `n_bytes`, and what was found in `space`.
     #[inline]
-    pub(in crate::mapping) fn is_full(self, n_nodes: usize, space: &impl Space) -> bool {
-        n_nodes + space.found_bytes() / Self::NODE_BYTES >= self.max_nodes
+    pub(in crate::mapping) fn is_full(self, n_bytes: usize, space: &impl Space) -> bool {
+        n_bytes + space.found_bytes() >= self.max_bytes
     }
 }
 

@@ -55,7 +55,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             let paths = [entry.id, farthest.id, 0].map(|id| nodes.path(id)).to_vec();
             Ok(Found { paths, is_complete: false, least_f: entry.f, n_expanded, n_generated })
         };
-        let is_spent = n_expanded >= budget.max_expansions || budget.is_full(nodes.len(), space);
+        let is_spent = n_expanded >= budget.max_expansions || budget.is_full(nodes.size_bytes(), space);
         match meter.spend(1) {
             Signal::Cancel => return Err(Cancelled),
             Signal::Continue if !is_spent => {}
@@ -142,8 +142,10 @@ impl Nodes {
         Self { ways: Vec::new(), index, n_keys }
     }
 
-    fn len(&self) -> usize {
-        self.ways.len()
+    /// How much memory they take, in bytes, with their places in the index and in the open list.
+    fn size_bytes(&self) -> usize {
+        const NODE_BYTES: usize = size_of::<Way>() + size_of::<NodeId>() + size_of::<Open>();
+        self.ways.len() * NODE_BYTES
     }
 
     fn get(&self, id: NodeId) -> &Way {

@@ -15,16 +15,18 @@
 //! known; it is then expanded again.
 
 use std::collections::BinaryHeap;
+use std::ops::Range;
 
 use super::buckets::Buckets;
-use super::nodes::{Arrival, NO_NODE, Node, NodeId, Nodes};
+use super::nodes::{Arrival, Estimates, NO_NODE, NodeId, Nodes, Place, Reached, Step};
+use super::seen::{Seen, SeenEstimates, SeenIdx, Way};
 use super::{Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{Deepened, Projected};
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::{Budget, Problem};
-use crate::model::{Space, Transition};
+use crate::model::Space;
 
 /// How many times as wide each probe is as the one before.
 const PROBE_WIDENING: u64 = 8;
@@ -35,15 +37,24 @@ const PROBE_SHARE: u64 = 16;
 /// Buffers of a search, kept to be used again.
 #[derive(Debug, Default)]
 pub(in crate::mapping) struct Buffers {
+    seen: Seen,
     nodes: Nodes,
-    open: Buckets,
+    open: Open,
+}
+
+/// The nodes that are to be expanded next.
+#[derive(Debug, Default)]
+struct Open {
+    buckets: Buckets,
+    /// Those of the observation that a probe is at.
     probed: BinaryHeap<CheapestFirst>,
 }
 
 impl Buffers {
-    /// Whether they are small enough to be kept: 12 MB of nodes.
+    /// Whether they are small enough to be kept.
     pub(in crate::mapping) fn are_small(&self) -> bool {
-        self.nodes.capacity() <= 1 << 18
+        const MAX_BYTES: usize = 16 << 20;
+        self.seen.kept_bytes() + self.nodes.kept_bytes() <= MAX_BYTES
     }
 }
 
@@ -61,27 +72,27 @@ pub(in crate::mapping) fn search<S: Space>(
     buffers: &mut Buffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
-    buffers.nodes.clear(problem.demonstration.len().saturating_mul(space.n_states().unwrap_or(usize::MAX)));
-    let start = Arrival {
-        kind: MoveKind::Start,
-        observation: 0,
-        state: problem.start,
-        cost: 0.0,
-        parent: NO_NODE,
-        action: NO_ACTION,
-    };
+    let Buffers { seen, nodes, open } = buffers;
+    seen.prepare(space, projected);
+    nodes.clear(problem.demonstration.len());
+    let state = seen.number_of(problem.start, space, projected);
+    let start = Arrival { kind: MoveKind::Start, observation: 0, state, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
     // The start is kept whatever it costs: it is what is left to complete if there is no budget at all.
-    let first = buffers.nodes.offer(start, space, &projected.at(0), f64::INFINITY).unwrap_or(NO_NODE);
+    let estimates = &SeenEstimates { seen, projected, space };
+    let first = nodes.take(&mut nodes.find(state, 0), start, estimates, f64::INFINITY);
+    let first = first.map_or(NO_NODE, |first| first.id);
     let mut search = Search {
         problem,
         space,
         projected,
         budget,
-        buffers,
+        seen,
+        nodes,
         limit: most.next_up(),
         incumbent: (problem.last() == 0).then_some(first),
         n_expanded: 0,
         n_generated: 0,
+        unspent_until: 0,
         #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
         last: problem.last() as u32,
         rounding: rounding_of_sums(problem.demonstration.len()),
@@ -89,9 +100,9 @@ pub(in crate::mapping) fn search<S: Space>(
     };
     let mut end = End::Done;
     if search.incumbent.is_none() {
-        end = search.probe(1)?;
+        end = search.probe(1, open)?;
         if end == End::Done {
-            end = search.expand_best_first()?;
+            end = search.expand_best_first(open)?;
         }
     }
     Ok(search.found(first, end))
@@ -111,13 +122,16 @@ struct Search<'s, 'p, S> {
     space: &'s mut S,
     projected: &'s mut Projected<'p>,
     budget: Budget,
-    buffers: &'s mut Buffers,
+    seen: &'s mut Seen,
+    nodes: &'s mut Nodes,
     /// Mappings of this cost or more are of no interest.
     limit: f64,
     /// The end of the cheapest mapping that was found.
     incumbent: Option<NodeId>,
     n_expanded: u64,
     n_generated: u64,
+    /// The budget lasts at least until so many nodes are expanded.
+    unspent_until: u64,
     /// The last observation.
     last: u32,
     /// What is less than this cheaper, as a part of the cost, is not looked for.
@@ -128,39 +142,36 @@ struct Search<'s, 'p, S> {
 impl<S: Space> Search<'_, '_, S> {
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
-    fn probe(&mut self, width: u64) -> Result<End, Cancelled> {
+    fn probe(&mut self, width: u64, Open { probed, .. }: &mut Open) -> Result<End, Cancelled> {
         let mut layers = vec![Vec::new(); self.problem.last()];
-        for (id, node) in self.buffers.nodes.iter().filter(|(_, node)| self.is_open(node)) {
-            if let Some(layer) = layers.get_mut(node.observation as usize) {
-                layer.push(id);
+        for Reached { id, f, .. } in self.open() {
+            if let Some(layer) = layers.get_mut(self.nodes.step(id).observation as usize) {
+                layer.push(CheapestFirst { cost: f, id });
             }
         }
         let mut ahead = Vec::new();
-        for (observation, mut layer) in layers.into_iter().enumerate() {
+        for (observation, mut layer) in (0..).zip(layers) {
             layer.append(&mut ahead);
-            self.buffers.probed.clear();
-            for id in layer {
-                let cost = self.buffers.nodes.get(id).f();
-                self.buffers.probed.push(CheapestFirst { cost, id });
-            }
+            probed.clear();
+            probed.extend(layer);
             let mut n_left = width;
-            while let Some(CheapestFirst { id, .. }) = self.buffers.probed.pop() {
-                if !self.is_open(&self.buffers.nodes.get(id)) {
+            while let Some(CheapestFirst { id, .. }) = probed.pop() {
+                let Reached { g, f, .. } = self.nodes.get(id);
+                if self.nodes.is_closed(id) || f >= self.limit {
                     continue;
                 }
                 if n_left == 0 {
                     break;
                 }
                 n_left -= 1;
-                if self.spend(id)? == End::CutShort {
-                    return Ok(End::CutShort);
-                }
-                self.expand(id, |buffers, id| {
-                    let node = buffers.nodes.get(id);
-                    if node.observation as usize == observation {
-                        buffers.probed.push(CheapestFirst { cost: node.f(), id });
+                let step = self.nodes.step(id);
+                let Some(ways) = self.spend(step.state)? else { return Ok(End::CutShort) };
+                self.expand(id, g, step, ways, |Reached { id, f, .. }, at| {
+                    let found = CheapestFirst { cost: f, id };
+                    if at == observation {
+                        probed.push(found);
                     } else {
-                        ahead.push(id);
+                        ahead.push(found);
                     }
                 });
             }
@@ -169,99 +180,107 @@ impl<S: Space> Search<'_, '_, S> {
     }
 
     /// Expands the nodes that may lead to a cheaper mapping than the incumbent, the most promising first.
-    fn expand_best_first(&mut self) -> Result<End, Cancelled> {
+    fn expand_best_first(&mut self, open: &mut Open) -> Result<End, Cancelled> {
         let n_layers = self.problem.last() as u64;
+        let probe_at = |width: u64| width.saturating_mul(n_layers).saturating_mul(PROBE_SHARE);
         let mut probe_width = PROBE_WIDENING;
         while self.is_deepening_due() {
-            if self.deepen()? == End::CutShort {
+            if self.deepen(open)? == End::CutShort {
                 return Ok(End::CutShort);
             }
         }
-        let mut bucketed_limit = self.fill_buckets();
-        while let Some(id) = self.buffers.open.pop() {
-            if !self.is_open(&self.buffers.nodes.get(id)) {
+        let mut bucketed_limit = self.fill_buckets(&mut open.buckets);
+        let mut help_at = self.deepening_at().min(probe_at(probe_width));
+        while let Some(Reached { id, g, f }) = open.buckets.pop() {
+            // Of a node that was put in more than once, the cheapest way comes out first.
+            if self.nodes.is_closed(id) || f >= self.limit {
                 continue;
             }
-            if self.spend(id)? == End::CutShort {
+            let step = self.nodes.step(id);
+            let Some(ways) = self.spend(step.state)? else { return Ok(End::CutShort) };
+            self.expand(id, g, step, ways, |found, _| open.buckets.push(found));
+            if self.n_expanded < help_at && self.limit >= bucketed_limit / 4.0 {
+                continue;
+            }
+            if self.is_deepening_due() && self.deepen(open)? == End::CutShort {
                 return Ok(End::CutShort);
             }
-            self.expand(id, |buffers, id| {
-                let f = buffers.nodes.get(id).f();
-                buffers.open.push(id, f);
-            });
-            let is_deepening_due = self.is_deepening_due();
-            if is_deepening_due && self.deepen()? == End::CutShort {
-                return Ok(End::CutShort);
-            }
-            let is_probe_due = self.n_expanded / PROBE_SHARE >= probe_width.saturating_mul(n_layers);
-            if is_probe_due {
+            if self.n_expanded >= probe_at(probe_width) {
                 probe_width *= PROBE_WIDENING;
-                if self.probe(probe_width / PROBE_WIDENING)? == End::CutShort {
+                if self.probe(probe_width / PROBE_WIDENING, open)? == End::CutShort {
                     return Ok(End::CutShort);
                 }
             }
             // What a probe found is not in the buckets, and better estimates are for others; and those for a much higher limit
             // are too wide.
-            if is_deepening_due || is_probe_due || self.limit < bucketed_limit / 4.0 {
-                bucketed_limit = self.fill_buckets();
-            }
+            bucketed_limit = self.fill_buckets(&mut open.buckets);
+            help_at = self.deepening_at().min(probe_at(probe_width));
         }
         Ok(End::Done)
     }
 
-    /// Whether better estimates are worth a try. They are for what is cheaper than a known mapping; until there is one, a
-    /// completion may need the estimates of all nodes.
-    #[inline]
+    /// After how many expansions better estimates are worth a try. They are for what is cheaper than a known mapping; until there is
+    /// one, a completion may need the estimates of all nodes.
+    fn deepening_at(&self) -> u64 {
+        if self.incumbent.is_some() { self.projected.deepening_due() } else { u64::MAX }
+    }
+
     fn is_deepening_due(&self) -> bool {
-        self.n_expanded >= self.projected.deepening_due() && self.incumbent.is_some()
+        self.n_expanded >= self.deepening_at()
     }
 
     /// Has better estimates made, if there are any, and gives them to all nodes.
     #[cold]
-    fn deepen(&mut self) -> Result<End, Cancelled> {
+    fn deepen(&mut self, open: &mut Open) -> Result<End, Cancelled> {
         match self.projected.deepen(self.limit, self.n_expanded, &mut self.meter)? {
             Deepened::CutShort => return Ok(End::CutShort),
             Deepened::No => return Ok(End::Done),
             Deepened::Yes => {}
         }
-        #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
-        for id in 0..self.buffers.nodes.len() as NodeId {
-            let Node { observation, state, .. } = self.buffers.nodes.get(id);
-            self.buffers.nodes.estimate(id, self.projected.at(observation as usize).of(self.space.row(state)));
-        }
-        self.probe(1)
+        let Self { nodes, seen, projected, space, .. } = self;
+        let estimates = SeenEstimates { seen, projected, space: &**space };
+        nodes.estimate_again(|Step { state, observation, .. }| estimates.of(state, observation));
+        self.probe(1, open)
     }
 
     /// Puts all open nodes into the buckets, and gives the limit that these are for.
-    fn fill_buckets(&mut self) -> f64 {
-        let limit = self.limit;
-        let Buffers { nodes, open, .. } = &mut *self.buffers;
-        let is_open = |node: &Node| !node.is_closed && node.f() < limit;
-        let least = nodes.iter().filter(|(_, node)| is_open(node)).map(|(_, node)| node.f()).fold(limit, f64::min);
-        open.reset(least, limit);
-        for (id, node) in nodes.iter().filter(|(_, node)| is_open(node)) {
-            open.push(id, node.f());
+    fn fill_buckets(&mut self, buckets: &mut Buckets) -> f64 {
+        let open: Vec<Reached> = self.open().collect();
+        buckets.reset(open.iter().map(|node| node.f).fold(self.limit, f64::min), self.limit);
+        for node in open {
+            buckets.push(node);
         }
-        limit
+        self.limit
     }
 
-    fn is_open(&self, node: &Node) -> bool {
-        !node.is_closed && node.f() < self.limit
+    /// The nodes that are to be expanded.
+    fn open(&self) -> impl Iterator<Item = Reached> {
+        self.nodes.open().filter(|node| node.f < self.limit)
     }
 
-    /// Counts the expansion of a node that is about to be done. Says whether it may be.
-    #[inline]
-    fn spend(&mut self, id: NodeId) -> Result<End, Cancelled> {
-        let state = self.buffers.nodes.get(id).state;
-        self.space.explore(state);
-        let n_successors = self.space.successors(state).len();
-        let is_spent =
-            self.n_expanded >= self.budget.max_expansions || self.budget.is_full(self.buffers.nodes.len(), self.space);
-        match self.meter.spend(1 + 2 * n_successors as u64) {
+    /// Counts the expansion of a node of `state` that is about to be done, and gives where the ways out are; `None` if it may not be.
+    #[expect(clippy::inline_always, reason = "it is done for every expansion")]
+    #[inline(always)]
+    fn spend(&mut self, state: SeenIdx) -> Result<Option<Range<usize>>, Cancelled> {
+        let ways = self
+            .seen
+            .explored(state)
+            .unwrap_or_else(|| self.seen.explore(state, self.space, self.projected, self.problem.model.actions()));
+        match self.meter.spend(1 + 2 * ways.len() as u64) {
             Signal::Cancel => Err(Cancelled),
-            Signal::Continue if !is_spent => Ok(End::Done),
-            Signal::Continue | Signal::Finish => Ok(End::CutShort),
+            Signal::Continue if self.n_expanded < self.unspent_until || !self.is_spent() => Ok(Some(ways)),
+            Signal::Continue | Signal::Finish => Ok(None),
         }
+    }
+
+    /// Whether there are no expansions left, or no memory.
+    #[cold]
+    fn is_spent(&mut self) -> bool {
+        /// How many expansions may be done between two looks at the memory.
+        const LOOK_EVERY: u64 = 16;
+        let n_bytes = self.nodes.size_bytes() + self.seen.size_bytes();
+        self.unspent_until = (self.n_expanded + LOOK_EVERY).min(self.budget.max_expansions);
+        self.n_expanded >= self.budget.max_expansions || self.budget.is_full(n_bytes, self.space)
     }
 
     /// Follows the moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper
@@ -270,57 +289,83 @@ impl<S: Space> Search<'_, '_, S> {
     /// A skip and an extra action, in either order, cost no less than the action as a match: it comes to the same node without the
     /// distance in between. So what was come to by the one is not left by the other.
     #[inline]
-    fn expand(&mut self, id: NodeId, mut found: impl FnMut(&mut Buffers, NodeId)) {
-        let Self { buffers, projected, space, limit, incumbent, last, rounding, .. } = self;
-        let actions = self.problem.model.actions();
-        let node = buffers.nodes.get(id);
-        let (g, here, next) = (node.g(), node.observation, node.observation + 1);
-        buffers.nodes.close(id);
-        let (at_here, at_next) = (projected.at(here as usize), projected.at(next as usize));
-        let successors = space.successors(node.state);
-        let (may_skip, may_linger) = (node.kind != MoveKind::Extra, node.kind != MoveKind::Skip);
+    fn expand(&mut self, id: NodeId, g: f64, step: Step, ways: Range<usize>, mut found: impl FnMut(Reached, u32)) {
+        let Step { state, observation: here, kind } = step;
+        let next = here + 1;
+        let (may_skip, may_linger) = (kind != MoveKind::Extra, kind != MoveKind::Skip);
+        self.nodes.close(id);
+        if may_skip {
+            let is_near = Nodes::are_together(next);
+            let mut place = if is_near { Nodes::place_of(id) } else { self.nodes.find(state, next) };
+            if self.nodes.may_take(place, next, g) {
+                let kind = MoveKind::Skip;
+                let skip = Arrival { kind, observation: next, state, cost: g, parent: id, action: NO_ACTION };
+                if let Some(node) = self.take(&mut place, skip) {
+                    found(node, next);
+                }
+            }
+        }
         self.n_expanded += 1;
-        self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * successors.len() as u64;
-        let skip = [Transition { action: NO_ACTION, to: node.state }];
-        let skip = &skip[..usize::from(may_skip)];
-        let skips = [(MoveKind::Skip, next, &at_next)];
-        let moves = [(MoveKind::Match, next, &at_next), (MoveKind::Extra, here, &at_here)];
-        let moves = &moves[..=usize::from(may_linger)];
-        for Transition { action, to: state } in skip.iter().chain(successors) {
-            let (cost, moves) = match actions.get(usize::from(*action)) {
-                Some(action) => (g + action.cost, moves),
-                None => (g, &skips[..]),
-            };
-            for (kind, observation, estimates) in moves {
-                let (action, kind, state) = (*action, *kind, *state);
-                let arrival = Arrival { kind, observation: *observation, state, cost, parent: id, action };
-                let Some(id) = buffers.nodes.offer(arrival, &**space, estimates, *limit) else { continue };
-                if observation == last {
-                    *limit = buffers.nodes.get(id).g() * (1.0 - *rounding);
-                    *incumbent = Some(id);
-                } else {
-                    found(buffers, id);
+        self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
+        for way in ways {
+            let Way { cost, to: state, action } = self.seen.way(way);
+            let cost = g + cost;
+            let mut place = self.nodes.find(state, next);
+            if self.nodes.may_take(place, next, cost) {
+                let kind = MoveKind::Match;
+                let arrival = Arrival { kind, observation: next, state, cost, parent: id, action };
+                if let Some(node) = self.take(&mut place, arrival) {
+                    found(node, next);
+                }
+            }
+            if !may_linger {
+                continue;
+            }
+            if !Nodes::are_together(next) {
+                place = self.nodes.find(state, here);
+            }
+            if self.nodes.may_take(place, here, cost) {
+                let kind = MoveKind::Extra;
+                let arrival = Arrival { kind, observation: here, state, cost, parent: id, action };
+                if let Some(node) = self.take(&mut place, arrival) {
+                    found(node, here);
                 }
             }
         }
     }
 
+    /// Takes a cheaper way to a node, if mappings that go on from there are of interest. Gives the node, unless it is of the last
+    /// observation.
+    #[expect(clippy::inline_always, reason = "it is what a search does most")]
+    #[inline(always)]
+    fn take(&mut self, place: &mut Place, arrival: Arrival) -> Option<Reached> {
+        let observation = arrival.observation;
+        let Self { nodes, seen, projected, space, .. } = self;
+        let node = nodes.take(place, arrival, &SeenEstimates { seen, projected, space: &**space }, self.limit)?;
+        if observation == self.last {
+            self.limit = node.g * (1.0 - self.rounding);
+            self.incumbent = Some(node.id);
+            return None;
+        }
+        Some(node)
+    }
+
     fn found(self, first: NodeId, end: End) -> Found {
-        let nodes = &self.buffers.nodes;
+        let nodes = &*self.nodes;
         let is_complete = end == End::Done;
-        let open = || nodes.iter().filter(|(_, node)| self.is_open(node));
         let least_f =
-            if is_complete { f64::INFINITY } else { open().map(|(_, node)| node.f()).fold(self.limit, f64::min) };
+            if is_complete { f64::INFINITY } else { self.open().map(|node| node.f).fold(self.limit, f64::min) };
         let ends = if let Some(incumbent) = self.incumbent {
             vec![incumbent]
         } else {
             // The farthest nodes, and among those the most promising: where it is best to go on greedily.
-            let farthest = open().max_by(|(_, node), (_, other)| {
-                node.observation.cmp(&other.observation).then(other.f().total_cmp(&node.f()))
-            });
-            farthest.map(|(id, _)| id).into_iter().chain([first]).collect()
+            let observation = |node: &Reached| nodes.step(node.id).observation;
+            let farthest = self
+                .open()
+                .max_by(|node, other| observation(node).cmp(&observation(other)).then(other.f.total_cmp(&node.f)));
+            farthest.map(|node| node.id).into_iter().chain([first]).collect()
         };
-        let paths = ends.into_iter().map(|id| nodes.path(id)).collect();
+        let paths = ends.into_iter().map(|id| nodes.path(id, self.seen)).collect();
         Found { paths, is_complete, least_f, n_expanded: self.n_expanded, n_generated: self.n_generated }
     }
 }

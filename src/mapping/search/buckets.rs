@@ -1,6 +1,6 @@
 //! An open list of buckets: nodes in the order of `f`, but for differences that do not matter.
 
-use super::nodes::NodeId;
+use super::nodes::{NodeId, Reached};
 
 /// An open list for nodes of `f` below a known limit. A bucket holds the nodes whose `f` agree in their first
 /// [`MANTISSA_BITS`] binary digits, so its width is about a thousandth of `f`; of the nodes in one bucket, the one that came last is
@@ -20,7 +20,9 @@ pub(super) struct Buckets {
 
 #[derive(Clone, Copy, Debug)]
 struct Entry {
-    node: NodeId,
+    g: f64,
+    f: f64,
+    id: NodeId,
     /// The entry before it in its bucket, as in the heads.
     next: u32,
 }
@@ -32,6 +34,9 @@ const MANTISSA_BITS: u32 = 10;
 const MAX_OCTAVES: i32 = 16;
 
 impl Buckets {
+    /// How much memory an entry takes, in bytes.
+    pub(super) const ENTRY_BYTES: usize = size_of::<Entry>();
+
     /// Empties the list, which is then for nodes of `least <= f < limit`.
     pub(super) fn reset(&mut self, least: f64, limit: f64) {
         self.offset = limit * 0.5_f64.powi(MAX_OCTAVES);
@@ -51,11 +56,12 @@ impl Buckets {
 
     /// Adds a node.
     #[inline]
-    pub(super) fn push(&mut self, node: NodeId, f: f64) {
+    pub(super) fn push(&mut self, node: Reached) {
         // By rounding, what comes later may be a little less.
-        let bucket = self.bucket_of(f).max(self.current);
+        let bucket = self.bucket_of(node.f).max(self.current);
         let Some(head) = self.heads.get_mut(bucket) else { return };
-        self.entries.push(Entry { node, next: *head });
+        let Reached { id, g, f } = node;
+        self.entries.push(Entry { g, f, id, next: *head });
         #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
         let entry = self.entries.len() as u32;
         *head = entry;
@@ -63,12 +69,12 @@ impl Buckets {
 
     /// Takes a node of the first bucket that has one.
     #[inline]
-    pub(super) fn pop(&mut self) -> Option<NodeId> {
+    pub(super) fn pop(&mut self) -> Option<Reached> {
         while let Some(head) = self.heads.get_mut(self.current) {
             if let Some(entry) = (*head as usize).checked_sub(1) {
-                let Entry { node, next } = self.entries[entry];
+                let Entry { g, f, id, next } = self.entries[entry];
                 *head = next;
-                return Some(node);
+                return Some(Reached { id, g, f });
             }
             self.current += 1;
         }
@@ -86,8 +92,8 @@ mod tests {
         for (least, limit) in [(0.0, 100.0), (63.4, 138.8), (0.0, 1e150), (5.4, 5.400_000_1), (1e-9, 1e9)] {
             open.reset(least, limit);
             let f = |n: u32| least + (limit - least) * f64::from(n * 7919 % 1000) / 1000.0;
-            (0..1000).for_each(|n| open.push(n, f(n)));
-            let order: Vec<f64> = std::iter::from_fn(|| open.pop()).map(f).collect();
+            (0..1000).for_each(|id| open.push(Reached { id, g: 0.0, f: f(id) }));
+            let order: Vec<f64> = std::iter::from_fn(|| open.pop()).map(|node| node.f).collect();
             assert_eq!(order.len(), 1000);
             let width = |f: f64| (f + limit / 65536.0) / 1024.0;
             assert!(order.windows(2).all(|pair| pair[1] > pair[0] - width(pair[0])), "{least} to {limit}");
@@ -98,7 +104,8 @@ mod tests {
     fn of_equals_the_last_comes_first() {
         let mut open = Buckets::default();
         open.reset(1.0, 2.0);
-        (0..3).for_each(|n| open.push(n, 1.5));
-        assert_eq!(std::iter::from_fn(|| open.pop()).collect::<Vec<_>>(), [2, 1, 0]);
+        (0..3).for_each(|id| open.push(Reached { id, g: 0.0, f: 1.5 }));
+        let order: Vec<_> = std::iter::from_fn(|| open.pop()).map(|node| node.id).collect();
+        assert_eq!(order, [2, 1, 0]);
     }
 }

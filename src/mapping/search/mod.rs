@@ -4,12 +4,14 @@
 //! |---|---|---|
 //! | [`best_first`] | A* for consistent estimates, with an incumbent and buckets | the default heuristic |
 //! | [`astar`] | A* as in the textbook | the paper's heuristic, which is not consistent, and none |
-//! | [`nodes`], [`buckets`] | the closed and the open list of [`best_first`] | |
+//! | [`seen`], [`nodes`] with [`index`], [`buckets`] | the states, the closed and the open list of [`best_first`] | |
 
 pub(super) mod astar;
 pub(super) mod best_first;
 mod buckets;
+mod index;
 mod nodes;
+mod seen;
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;

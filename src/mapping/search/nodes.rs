@@ -1,66 +1,64 @@
 //! The nodes that a search has found.
+//!
+//! Nodes of one state at neighbouring observations lie together, in a *block*: an action is looked at both as a match and as an extra
+//! action, which lead to neighbours, and most often each of them is known already and was come to more cheaply. Of a block,
+//! that takes one look into the index and one at the costs.
 
-use std::ops::RangeInclusive;
-
+use super::buckets::Buckets;
+use super::index::{Index, Key, NO_BLOCK};
+use super::seen::{Seen, SeenIdx};
 use super::{Move, MoveKind, NO_ACTION};
-use crate::mapping::heuristic::projected::{Estimate, EstimatesAt};
-use crate::model::{ActionIdx, Space, StateIdx};
+use crate::mapping::cost::SLACK;
+use crate::mapping::heuristic::projected::{CHUNK_LEN, Estimate};
+use crate::model::ActionIdx;
 
-/// Where a node is in [`Nodes`].
+/// Where a node is in [`Nodes`]: its block, and its place in that.
 pub(super) type NodeId = u32;
 
 /// Stands for "no node".
 pub(super) const NO_NODE: NodeId = NodeId::MAX;
 
-/// A node `(i, s)`, and the cheapest way to it that was found.
+/// How many observations a block is for.
+pub(super) const BLOCK_LEN: usize = CHUNK_LEN;
+const BLOCK_BITS: u32 = BLOCK_LEN.ilog2();
+const IN_BLOCK: u32 = (1 << BLOCK_BITS) - 1;
+
+/// Where a node is, and how the way to it ends; all that an expansion asks for but the costs.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Node {
-    /// Cost of the way, before the distance is paid.
-    cost: f64,
-    pub(super) state: StateIdx,
+pub(super) struct Step {
+    pub(super) state: SeenIdx,
     pub(super) observation: u32,
-    pub(super) estimate: Estimate,
-    /// The node before, [`NO_NODE`] for the first.
-    pub(super) parent: NodeId,
-    /// The action that led here, or [`NO_ACTION`].
-    pub(super) action: ActionIdx,
-    /// How the way ends.
+    /// [`MoveKind::Match`] at the start, too.
     pub(super) kind: MoveKind,
-    /// Whether it was expanded since its way last became cheaper.
-    pub(super) is_closed: bool,
 }
 
-/// What most looks at a node are for: whether it is the one that is looked for, and whether another way is cheaper.
-#[derive(Clone, Copy, Debug)]
-struct Key {
-    /// Cost of the way, before the distance is paid.
-    cost: f64,
-    state: StateIdx,
-    observation: u32,
-}
-
-/// The rest of a node.
-#[derive(Clone, Copy, Debug)]
-struct Rest {
-    estimate: Estimate,
-    parent: NodeId,
-    action: ActionIdx,
-    kind: MoveKind,
-    is_closed: bool,
-}
-
-impl Node {
-    /// Cost of the way to it.
-    #[inline]
-    pub(super) fn g(&self) -> f64 {
-        self.cost + self.estimate.distance
-    }
-
+/// A node to which a way was found.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Reached {
+    pub(super) id: NodeId,
+    /// Cost of the way.
+    pub(super) g: f64,
     /// What a mapping through it costs at least.
+    pub(super) f: f64,
+}
+
+impl Reached {
+    /// By a way of `cost` before the distance is paid.
     #[inline]
-    pub(super) fn f(&self) -> f64 {
-        self.g() + self.estimate.cost_to_go
+    fn by(id: NodeId, cost: f64, estimate: Estimate) -> Self {
+        let g = cost + estimate.distance;
+        Self { id, g, f: g + estimate.cost_to_go }
     }
+}
+
+/// What nodes cost, and what is still to be paid after them.
+pub(super) trait Estimates {
+    /// At a node.
+    fn of(&self, state: SeenIdx, observation: u32) -> Estimate;
+
+    /// At all nodes of a block, of which the first is of this observation; `None` if that is more than a little work. What they
+    /// are beyond the last observation is of no interest.
+    fn of_all(&self, state: SeenIdx, first: u32) -> Option<[Estimate; BLOCK_LEN]>;
 }
 
 /// A way to a node, before its distance is paid.
@@ -68,148 +66,270 @@ impl Node {
 pub(super) struct Arrival {
     pub(super) kind: MoveKind,
     pub(super) observation: u32,
-    pub(super) state: StateIdx,
+    pub(super) state: SeenIdx,
     pub(super) cost: f64,
     pub(super) parent: NodeId,
     pub(super) action: ActionIdx,
 }
 
-/// Nodes in the order in which they were found, and an index of them by observation and state: a hash table with linear
-/// probing that holds no keys, as the nodes do.
+/// The last step of the way to a node: its parent, [`NO_NODE`] for the first, and the action, or [`NO_ACTION`].
+#[derive(Clone, Copy, Debug)]
+struct Link {
+    parent: NodeId,
+    action: ActionIdx,
+}
+
+const NO_LINK: Link = Link { parent: NO_NODE, action: NO_ACTION };
+
+/// Below which cost, before the distance is paid, a way to each node of a block is of interest: the cheapest that was found or turned
+/// away, or what the limit leaves. A line of the cache.
+#[derive(Clone, Copy, Debug)]
+#[repr(align(64))]
+struct Costs([f64; BLOCK_LEN]);
+
+const NO_LIMITS: Costs = Costs([f64::INFINITY; BLOCK_LEN]);
+
+/// What is known of a node, in bits: its estimate was made,
+const ESTIMATED: u8 = 1;
+/// a way to it was found,
+const FOUND: u8 = 2;
+/// it was expanded since its way last became cheaper;
+const CLOSED: u8 = 4;
+/// and how the way ends.
+const SKIPPED_TO: u8 = 8;
+const LINGERED_TO: u8 = 16;
+
+/// Blocks of nodes, in the order in which the first node of each was found.
 #[derive(Debug, Default)]
 pub(super) struct Nodes {
     keys: Vec<Key>,
-    /// The rest of each node, in the same order.
-    rest: Vec<Rest>,
-    /// Ids, [`NO_NODE`] where free. Of these, the first `2^bits` are in use.
-    index: Vec<NodeId>,
-    bits: u32,
+    marks: Vec<[u8; BLOCK_LEN]>,
+    costs: Vec<Costs>,
+    estimates: Vec<[Estimate; BLOCK_LEN]>,
+    links: Vec<[Link; BLOCK_LEN]>,
+    index: Index,
 }
 
-/// Sizes of an index at first, by how many nodes there may be at most: 4 kB to 128 kB.
-const FIRST_BITS: RangeInclusive<u32> = 10..=15;
+/// The key of [`NO_BLOCK`], which never has a node.
+const NO_KEY: Key = Key { state: SeenIdx::MAX, number: u32::MAX };
+
+/// What a block takes, with the entries of the open list for half of its nodes: as many as there are, most often.
+const BLOCK_BYTES: usize = BLOCK_LEN / 2 * Buckets::ENTRY_BYTES
+    + size_of::<Key>()
+    + size_of::<[u8; BLOCK_LEN]>()
+    + size_of::<Costs>()
+    + size_of::<[Estimate; BLOCK_LEN]>()
+    + size_of::<[Link; BLOCK_LEN]>();
+
+/// Where the block of a node is, or would be.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Place {
+    block: u32,
+    /// In the index.
+    slot: usize,
+}
 
 impl Nodes {
-    /// Forgets all nodes, and keeps the memory. At most `most` nodes will come.
-    pub(super) fn clear(&mut self, most: usize) {
+    /// Forgets all nodes, and keeps the memory. There will be nodes at so many observations.
+    pub(super) fn clear(&mut self, n_observations: usize) {
+        self.index.clear(&self.keys, n_observations.div_ceil(BLOCK_LEN));
         self.keys.clear();
-        self.rest.clear();
-        let bits = usize::BITS - most.saturating_mul(2).leading_zeros();
-        self.resize_index(bits.clamp(*FIRST_BITS.start(), *FIRST_BITS.end()));
+        self.marks.clear();
+        self.costs.clear();
+        self.estimates.clear();
+        self.links.clear();
+        self.keys.push(NO_KEY);
+        self.marks.push([0; BLOCK_LEN]);
+        self.costs.push(NO_LIMITS);
+        self.estimates.push([Estimate::default(); BLOCK_LEN]);
+        self.links.push([NO_LINK; BLOCK_LEN]);
     }
 
-    pub(super) fn len(&self) -> usize {
-        self.keys.len()
-    }
-
-    /// How many nodes there is memory for.
-    pub(super) fn capacity(&self) -> usize {
-        self.keys.capacity()
-    }
-
-    pub(super) fn iter(&self) -> impl Iterator<Item = (NodeId, Node)> {
-        (0..).zip(self.keys.iter().zip(&self.rest).map(|(key, rest)| joined(key, rest)))
-    }
-
+    /// How much memory they take, in bytes.
     #[inline]
-    pub(super) fn get(&self, id: NodeId) -> Node {
-        joined(&self.keys[id as usize], &self.rest[id as usize])
+    pub(super) fn size_bytes(&self) -> usize {
+        self.keys.len() * BLOCK_BYTES + self.index.size_bytes()
     }
 
-    /// Takes a new estimate of a node.
-    pub(super) fn estimate(&mut self, id: NodeId, estimate: Estimate) {
-        self.rest[id as usize].estimate = estimate;
+    /// How much memory is kept for them, in bytes.
+    pub(super) fn kept_bytes(&self) -> usize {
+        self.keys.capacity() * BLOCK_BYTES + self.index.kept_bytes()
     }
 
+    /// Every node that was not expanded since its way last became cheaper.
+    pub(super) fn open(&self) -> impl Iterator<Item = Reached> {
+        (0..).zip(&self.marks).flat_map(move |(block, marks)| {
+            let marks = u64::from_le_bytes(*marks);
+            // A bit of each byte.
+            let has = |mark: u8| marks >> mark.trailing_zeros() & u64::from_le_bytes([1; BLOCK_LEN]);
+            let mut left = has(FOUND) & !has(CLOSED);
+            std::iter::from_fn(move || {
+                let in_block = (left != 0).then(|| left.trailing_zeros() / u8::BITS)?;
+                left &= left - 1;
+                Some(self.get(block << BLOCK_BITS | in_block))
+            })
+        })
+    }
+
+    /// A node to which a way was found.
+    #[inline]
+    pub(super) fn get(&self, id: NodeId) -> Reached {
+        let (block, in_block) = split(id);
+        Reached::by(id, self.costs[block].0[in_block], self.estimates[block][in_block])
+    }
+
+    /// Where a node is, and how the way to it ends.
+    #[inline]
+    pub(super) fn step(&self, id: NodeId) -> Step {
+        let (block, in_block) = split(id);
+        let Key { state, number } = self.keys[block];
+        let kind = match self.marks[block][in_block] & (SKIPPED_TO | LINGERED_TO) {
+            SKIPPED_TO => MoveKind::Skip,
+            LINGERED_TO => MoveKind::Extra,
+            _ => MoveKind::Match,
+        };
+        Step { state, observation: number << BLOCK_BITS | id & IN_BLOCK, kind }
+    }
+
+    /// Whether a node was expanded since its way last became cheaper.
+    #[inline]
+    pub(super) fn is_closed(&self, id: NodeId) -> bool {
+        let (block, in_block) = split(id);
+        self.marks[block][in_block] & CLOSED != 0
+    }
+
+    /// Takes note that a node is expanded now.
     #[inline]
     pub(super) fn close(&mut self, id: NodeId) {
-        self.rest[id as usize].is_closed = true;
+        let (block, in_block) = split(id);
+        self.marks[block][in_block] |= CLOSED;
     }
 
-    /// Takes a way to a node, if it is cheaper than any before and a mapping that goes on from there may cost less than `limit`.
-    /// Gives the node's id then.
-    #[expect(clippy::inline_always, reason = "without it a search takes a fifth more instructions")]
-    #[inline(always)]
-    pub(super) fn offer(
-        &mut self,
-        arrival: Arrival,
-        space: &impl Space,
-        estimates: &EstimatesAt<'_>,
-        limit: f64,
-    ) -> Option<NodeId> {
-        let Arrival { kind, observation, state, cost, parent, action } = arrival;
-        let mut place = self.place_of(observation, state);
-        loop {
-            let id = self.index[place];
-            let Some(key) = self.keys.get_mut(id as usize) else { break };
-            if key.state == state && key.observation == observation {
-                if cost >= key.cost {
-                    return None;
-                }
-                key.cost = cost;
-                let rest = &mut self.rest[id as usize];
-                *rest = Rest { parent, action, kind, is_closed: false, ..*rest };
-                return (cost + rest.estimate.distance + rest.estimate.cost_to_go < limit).then_some(id);
+    /// Takes new estimates of all nodes.
+    pub(super) fn estimate_again(&mut self, mut estimate: impl FnMut(Step) -> Estimate) {
+        #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
+        for id in 0..self.marks.as_flattened().len() as NodeId {
+            let (block, in_block) = split(id);
+            if self.marks[block][in_block] & FOUND != 0 {
+                self.estimates[block][in_block] = estimate(self.step(id));
+            } else {
+                self.marks[block][in_block] = 0;
             }
-            place = (place + 1) & self.mask();
         }
-        let estimate = estimates.of(space.row(state));
-        if cost + estimate.distance + estimate.cost_to_go >= limit {
+    }
+
+    /// Looks for the block of a node.
+    #[inline]
+    pub(super) fn find(&self, state: SeenIdx, observation: u32) -> Place {
+        let (block, slot) = self.index.find(Key { state, number: observation >> BLOCK_BITS }, &self.keys);
+        Place { block, slot }
+    }
+
+    /// Where the block of a node is that was found.
+    #[inline]
+    pub(super) fn place_of(id: NodeId) -> Place {
+        Place { block: id >> BLOCK_BITS, slot: 0 }
+    }
+
+    /// Whether the node before that of `observation`, of the same state, is in the same block.
+    #[inline]
+    pub(super) fn are_together(observation: u32) -> bool {
+        observation & IN_BLOCK != 0
+    }
+
+    /// Whether a way to a node may be of interest, if it costs so much before the distance is paid. `place` is where its block was
+    /// found.
+    #[inline]
+    pub(super) fn may_take(&self, place: Place, observation: u32, cost: f64) -> bool {
+        cost < self.costs[place.block as usize].0[(observation & IN_BLOCK) as usize]
+    }
+
+    /// Takes a way to a node that [may be](Self::may_take) of interest, if a mapping that goes on from there may cost less than
+    /// `limit`. Gives the node then. `place` is where its block was found, or that of its neighbour
+    /// [together](Self::are_together) with it.
+    #[expect(clippy::inline_always, reason = "it is what a search does most")]
+    #[inline(always)]
+    pub(super) fn take(
+        &mut self,
+        place: &mut Place,
+        arrival: Arrival,
+        estimates: &impl Estimates,
+        limit: f64,
+    ) -> Option<Reached> {
+        let Arrival { kind, observation, state, cost, parent, action } = arrival;
+        if place.block == NO_BLOCK && !self.add(place, state, observation, cost, estimates, limit) {
             return None;
         }
+        let (block, in_block) = (place.block as usize, (observation & IN_BLOCK) as usize);
+        let mark = &mut self.marks[block][in_block];
+        let estimate = &mut self.estimates[block][in_block];
+        if *mark & ESTIMATED == 0 {
+            *mark |= ESTIMATED;
+            *estimate = estimates.of(state, observation);
+        }
+        let reached = Reached::by(place.block << BLOCK_BITS | observation & IN_BLOCK, cost, *estimate);
+        self.costs[block].0[in_block] = cost;
+        if reached.f >= limit && *mark & FOUND == 0 {
+            return None;
+        }
+        *mark = ESTIMATED
+            | FOUND
+            | match kind {
+                MoveKind::Skip => SKIPPED_TO,
+                MoveKind::Extra => LINGERED_TO,
+                MoveKind::Start | MoveKind::Match => 0,
+            };
+        self.links[block][in_block] = Link { parent, action };
+        (reached.f < limit).then_some(reached)
+    }
+
+    /// Adds a block at `place`, unless the way is not of interest for which that is done. Says whether it did.
+    #[inline(never)]
+    fn add(
+        &mut self,
+        place: &mut Place,
+        state: SeenIdx,
+        observation: u32,
+        cost: f64,
+        estimates: &impl Estimates,
+        limit: f64,
+    ) -> bool {
+        let estimate = estimates.of(state, observation);
+        if cost + estimate.distance + estimate.cost_to_go >= limit {
+            return false;
+        }
+        let number = observation >> BLOCK_BITS;
         #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
-        let id = self.keys.len() as NodeId;
-        self.keys.push(Key { cost, state, observation });
-        self.rest.push(Rest { estimate, parent, action, kind, is_closed: false });
-        self.index[place] = id;
-        if self.keys.len() * 2 > self.mask() {
-            self.resize_index(self.bits + 1);
+        {
+            place.block = self.keys.len() as u32;
         }
-        Some(id)
-    }
-
-    fn mask(&self) -> usize {
-        (1 << self.bits) - 1
-    }
-
-    /// Where the search for a node in the index begins.
-    #[inline]
-    fn place_of(&self, observation: u32, state: StateIdx) -> usize {
-        /// 2^64 divided by the golden ratio (Knuth 1973, multiplicative hashing).
-        const MULTIPLIER: u64 = 0x9e37_79b9_7f4a_7c15;
-        let key = u64::from(observation) << 32 | u64::from(state);
-        #[expect(clippy::cast_possible_truncation, reason = "the upper bits, of which there are few")]
-        let place = (key.wrapping_mul(MULTIPLIER) >> (64 - self.bits)) as usize;
-        place
-    }
-
-    #[cold]
-    fn resize_index(&mut self, bits: u32) {
-        self.bits = bits;
-        let size = 1 << bits;
-        self.index.truncate(size);
-        self.index.fill(NO_NODE);
-        self.index.resize(size, NO_NODE);
-        for id in 0..self.keys.len() {
-            let Key { observation, state, .. } = self.keys[id];
-            let mut place = self.place_of(observation, state);
-            while self.index[place] != NO_NODE {
-                place = (place + 1) & self.mask();
-            }
-            #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
-            {
-                self.index[place] = id as NodeId;
-            }
+        self.keys.push(Key { state, number });
+        self.index.insert(place.slot, &self.keys);
+        self.links.push([NO_LINK; BLOCK_LEN]);
+        if let Some(estimates) = estimates.of_all(state, number << BLOCK_BITS) {
+            // A little more, as sums differ by rounding.
+            let most = limit * (1.0 + SLACK);
+            self.marks.push([ESTIMATED; BLOCK_LEN]);
+            self.costs.push(Costs(estimates.map(|estimate| most - estimate.distance - estimate.cost_to_go)));
+            self.estimates.push(estimates);
+        } else {
+            self.marks.push([0; BLOCK_LEN]);
+            self.costs.push(NO_LIMITS);
+            self.estimates.push([Estimate::default(); BLOCK_LEN]);
         }
+        true
     }
 
     /// The way from the start to a node.
-    pub(super) fn path(&self, mut id: NodeId) -> Vec<Move> {
+    pub(super) fn path(&self, mut id: NodeId, seen: &Seen) -> Vec<Move> {
         let mut moves = Vec::new();
         while id != NO_NODE {
-            let Node { state, observation, parent, action, kind, .. } = self.get(id);
+            let (block, in_block) = split(id);
+            let Link { parent, action } = self.links[block][in_block];
+            let Step { state, observation, kind } = self.step(id);
+            let kind = if parent == NO_NODE { MoveKind::Start } else { kind };
             let action = (action != NO_ACTION).then_some(action);
-            moves.push(Move { kind, action, observation, state });
+            moves.push(Move { kind, action, observation, state: seen.state(state) });
             id = parent;
         }
         moves.reverse();
@@ -217,9 +337,8 @@ impl Nodes {
     }
 }
 
+/// A node's block, and its place in that.
 #[inline]
-fn joined(key: &Key, rest: &Rest) -> Node {
-    let Key { cost, state, observation } = *key;
-    let Rest { estimate, parent, action, kind, is_closed } = *rest;
-    Node { cost, state, observation, estimate, parent, action, kind, is_closed }
+fn split(id: NodeId) -> (usize, usize) {
+    ((id >> BLOCK_BITS) as usize, (id & IN_BLOCK) as usize)
 }

@@ -3,7 +3,7 @@
 use std::collections::BinaryHeap;
 
 use super::shares::{Parts, Way, Ways};
-use super::{Column, Projected};
+use super::{Column, Projected, Table};
 use crate::interrupt::{Cancelled, Meter, Signal};
 use crate::mapping::Problem;
 use crate::mapping::cost::SLACK;
@@ -58,8 +58,8 @@ impl GroupingPatience {
 /// Costs from the start.
 #[derive(Debug)]
 struct Forward {
-    /// By observation and class, with the distance. Shape `[n_observations, width]`.
-    costs: Vec<f64>,
+    /// By class and observation, with the distance.
+    costs: Table<f64>,
     /// By column: what it costs in all.
     optima: Vec<f64>,
 }
@@ -119,12 +119,11 @@ impl<'p> Projected<'p> {
                 let columns = self.columns.iter();
                 let joined = columns.filter(|column| joint.iter().any(|table| table.group().has(column.position)));
                 for column in joined {
-                    for row in self.entries.chunks_exact_mut(self.width) {
-                        for entry in &mut row[column.offset..][..column.group.n_classes()] {
-                            entry.cost_to_go = 0.0;
-                        }
+                    for class in 0..column.group.n_classes() {
+                        self.table.of_mut(column.offset + class).iter_mut().for_each(|entry| entry.cost_to_go = 0.0);
                     }
                 }
+                self.tell_unchanged();
                 self.joint = joint;
                 deepening.level += 1;
                 if deepening.grouping == Grouping::WhenItPays {
@@ -183,8 +182,7 @@ impl<'p> Projected<'p> {
                 columns: &offsets,
                 least_distances: &self.least_distances,
                 least_terms: &least_terms,
-                width: self.width,
-                entries: &self.entries,
+                table: &self.table,
                 forward: costs,
                 limit: limit * (1.0 + SLACK) - others,
             };
@@ -207,8 +205,9 @@ impl<'p> Projected<'p> {
         used: &[bool],
         meter: &mut Meter<'_>,
     ) -> Result<Forward, Signal> {
-        let width = self.width;
-        let mut costs = vec![f64::INFINITY; self.entries.len()];
+        let (last, n_observations) = (self.problem.last(), self.problem.demonstration.len());
+        let width = self.columns.iter().map(|column| column.group.n_classes()).sum();
+        let mut costs = Table::filled_with(f64::INFINITY, width, n_observations);
         let mut optima = Vec::new();
         let start = &self.problem.start_row;
         let mut open = BinaryHeap::new();
@@ -217,20 +216,20 @@ impl<'p> Projected<'p> {
             let parts = Parts::new(projections, self.problem, used, &[*position]);
             let ways = Ways::into_classes(group, &parts).reversed();
             let first = start[*position] as usize;
-            for i in 0..self.problem.demonstration.len() {
-                let (before, after) = costs.split_at_mut(i * width);
-                let here = &mut after[*offset..][..n_classes];
-                let terms = &self.entries[i * width + offset..][..n_classes];
+            let (mut before, mut here) = (vec![f64::INFINITY; n_classes], vec![f64::INFINITY; n_classes]);
+            for i in 0..n_observations {
+                let term = |class: usize| self.table.at(offset + class, i).distance;
                 let least = self.least_terms[i * self.columns.len() + number];
+                std::mem::swap(&mut before, &mut here);
+                here.fill(f64::INFINITY);
                 if i == 0 {
-                    here[first] = terms[first].distance;
+                    here[first] = term(first);
                 } else {
-                    let before = &before[(i - 1) * width + offset..][..n_classes];
                     for class in 0..n_classes {
-                        here[class] = here[class].min(before[class] + terms[class].distance);
+                        here[class] = here[class].min(before[class] + term(class));
                         for Way { class: to, share, .. } in ways.of(class) {
                             let to = *to as usize;
-                            here[to] = here[to].min(before[class] + share + terms[to].distance);
+                            here[to] = here[to].min(before[class] + share + term(to));
                         }
                     }
                 }
@@ -245,7 +244,7 @@ impl<'p> Projected<'p> {
                         continue;
                     }
                     for way in ways.of(id as usize) {
-                        let (to, rest) = (way.class as usize, terms[way.class as usize].distance - least);
+                        let (to, rest) = (way.class as usize, term(way.class as usize) - least);
                         let arrived = cost + way.share_of_extra(self.least_distances[i]) + rest;
                         if arrived < here[to] {
                             here[to] = arrived;
@@ -253,9 +252,12 @@ impl<'p> Projected<'p> {
                         }
                     }
                 }
+                for (class, cost) in here.iter().enumerate() {
+                    *costs.at_mut(offset + class, i) = *cost;
+                }
             }
-            let last = &costs[self.problem.last() * width + offset..][..n_classes];
-            optima.push(last.iter().copied().fold(f64::INFINITY, f64::min));
+            let of_last = (0..n_classes).map(|class| costs.at(offset + class, last));
+            optima.push(of_last.fold(f64::INFINITY, f64::min));
         }
         Ok(Forward { costs, optima })
     }

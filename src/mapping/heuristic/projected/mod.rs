@@ -2,10 +2,14 @@
 
 mod deepening;
 mod shares;
+mod table;
 
 use std::collections::BinaryHeap;
+use std::ops::{Add, AddAssign};
 
 pub(in crate::mapping) use deepening::Deepened;
+pub(in crate::mapping) use table::CHUNK_LEN;
+pub(super) use table::Table;
 
 use super::bounded::Bounded;
 use super::projection::{Group, Projections};
@@ -25,6 +29,24 @@ pub(in crate::mapping) struct Estimate {
     pub(in crate::mapping) cost_to_go: f64,
 }
 
+impl AddAssign for Estimate {
+    #[inline]
+    fn add_assign(&mut self, other: Self) {
+        self.distance += other.distance;
+        self.cost_to_go += other.cost_to_go;
+    }
+}
+
+impl Add for Estimate {
+    type Output = Self;
+
+    #[inline]
+    fn add(mut self, other: Self) -> Self {
+        self += other;
+        self
+    }
+}
+
 /// The distances and the costs-to-go of one problem, tabulated by observation and class of each group.
 ///
 /// Both are sums over the groups. Those of single attributes have their tables side by side in memory, and an estimate takes
@@ -33,10 +55,12 @@ pub(in crate::mapping) struct Estimate {
 pub(crate) struct Projected<'p> {
     problem: &'p Problem<'p>,
     columns: Vec<Column<'p>>,
-    /// Entries per observation.
-    width: usize,
-    /// Shape `[n_observations, width]`; in each row the groups' classes, one group after the other.
-    entries: Vec<Estimate>,
+    /// The groups' classes, one group after the other.
+    table: Table<Estimate>,
+    /// What the columns come to that no action changes. Shape `[n_observations]`, with room for whole chunks.
+    unchanged: Vec<Estimate>,
+    /// The other columns, in order.
+    changing: Vec<ChangingColumn>,
     /// Positions of attributes that take part in the distance but are in no table.
     untabled: Vec<usize>,
     /// Entries of tables that were left out.
@@ -57,8 +81,17 @@ struct Column<'p> {
     group: &'p Group,
     /// The attribute's.
     position: usize,
-    /// Where its values begin in a row.
+    /// Where its values begin in the table.
     offset: usize,
+}
+
+/// A column of an attribute that actions change.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::mapping) struct ChangingColumn {
+    /// The attribute's.
+    position: u32,
+    /// Where its values begin in the table.
+    offset: u32,
 }
 
 /// Most entries of all tables together: 256 MB. Groups that do not fit, the largest, are left out, which keeps the bound a
@@ -82,23 +115,25 @@ impl<'p> Projected<'p> {
         const POLL_EVERY: u64 = 1 << 14;
         let (used, n_left_out) = used_groups(projections, problem, max_entries);
         let mut projected = Self { n_left_out, ..Self::blind(problem) };
+        let (mut width, n_observations) = (0, problem.demonstration.len());
         for (group, _) in projections.groups().iter().zip(&used).filter(|(_, is_used)| **is_used) {
             let Some(position) = group.positions().next() else { continue };
-            projected.columns.push(Column { group, position, offset: projected.width });
-            projected.width += group.n_classes();
+            projected.columns.push(Column { group, position, offset: width });
+            width += group.n_classes();
             projected.untabled.retain(|at| *at != position);
         }
-        projected.least_terms.reserve(problem.demonstration.len() * projected.columns.len());
-        projected.least_distances.reserve(problem.demonstration.len());
-        projected.entries = vec![Estimate::default(); problem.demonstration.len() * projected.width];
+        projected.table = Table::filled_with(Estimate::default(), width, n_observations);
+        projected.least_terms = vec![0.0; n_observations * projected.columns.len()];
+        projected.least_distances = vec![0.0; n_observations];
         let mut meter = Meter::new(interrupt, POLL_EVERY);
-        for i in 0..problem.demonstration.len() {
-            match meter.spend(projected.width as u64) {
-                Signal::Continue => projected.write_terms(i),
+        for number in 0..projected.columns.len() {
+            match projected.write_terms(number, &mut meter) {
+                Signal::Continue => {}
                 Signal::Finish => return Ok(None),
                 Signal::Cancel => return Err(Cancelled),
             }
         }
+        projected.add_constants();
         for number in 0..projected.columns.len() {
             let parts = Parts::new(projections, problem, &used, &[projected.columns[number].position]);
             match projected.solve_column(number, &parts, &mut meter) {
@@ -107,6 +142,7 @@ impl<'p> Projected<'p> {
                 Signal::Cancel => return Err(Cancelled),
             }
         }
+        projected.tell_unchanged();
         projected.deepening = Some(Deepening::new(projections, problem, used, grouping));
         Ok(Some(projected))
     }
@@ -117,8 +153,9 @@ impl<'p> Projected<'p> {
         Self {
             problem,
             columns: Vec::new(),
-            width: 0,
-            entries: Vec::new(),
+            table: Table::default(),
+            unchanged: vec![Estimate::default(); problem.demonstration.len().next_multiple_of(CHUNK_LEN)],
+            changing: Vec::new(),
             untabled: untabled.collect(),
             least_distances: Vec::new(),
             least_terms: Vec::new(),
@@ -133,35 +170,124 @@ impl<'p> Projected<'p> {
         self.n_left_out
     }
 
-    /// What the nodes at one observation cost.
-    #[inline]
-    pub(in crate::mapping) fn at(&self, observation: usize) -> EstimatesAt<'_> {
-        let row = &self.entries[observation * self.width..(observation + 1) * self.width];
-        EstimatesAt { projected: self, row, observation }
+    /// The columns that tell states apart, in order.
+    pub(in crate::mapping) fn changing_columns(&self) -> &[ChangingColumn] {
+        &self.changing
     }
 
-    /// Writes the terms of an observation, and the least of them. What no action changes stays as it was at the start.
-    fn write_terms(&mut self, i: usize) {
-        let start = &self.problem.start_row;
-        let row = &mut self.entries[i * self.width..][..self.width];
-        let mut least_distance = 0.0;
-        for Column { group, position, offset } in &self.columns {
-            let row = &mut row[*offset..][..group.n_classes()];
-            group.write_terms(self.problem, i, row);
-            let least = if group.n_edges() == 0 {
-                row[start[*position] as usize].distance
-            } else {
-                row.iter().map(|entry| entry.distance).fold(f64::INFINITY, f64::min)
-            };
-            self.least_terms.push(least);
-            least_distance += least;
+    /// Where the entries of the state with this row are in the table, in each of the [changing columns](Self::changing_columns).
+    #[inline]
+    pub(in crate::mapping) fn places(&self, values: &[u32]) -> impl Iterator<Item = u32> {
+        self.changing.iter().map(|column| column.offset + values[column.position as usize])
+    }
+
+    /// Whether that and what is the same for all states is all that an estimate is made of.
+    #[inline]
+    pub(in crate::mapping) fn are_all_in_columns(&self) -> bool {
+        self.joint.is_empty() && self.untabled.is_empty()
+    }
+
+    /// What the node of a state costs that the start leads to, whose entries are at [these places](Self::places). `values` gives its
+    /// row.
+    #[inline]
+    pub(in crate::mapping) fn estimate<'v>(
+        &self,
+        observation: usize,
+        places: &[u32],
+        values: impl FnOnce() -> &'v [u32],
+    ) -> Estimate {
+        let mut sum = self.unchanged[observation];
+        for place in places {
+            sum += self.table.at(*place as usize, observation);
+        }
+        if self.are_all_in_columns() { sum } else { sum + self.others(observation, values()) }
+    }
+
+    /// The same for as many observations from `first` on, if they are [all in columns](Self::are_all_in_columns). After the last
+    /// observation it is nothing.
+    #[inline]
+    pub(in crate::mapping) fn estimate_chunk(&self, first: usize, places: &[u32]) -> [Estimate; CHUNK_LEN] {
+        let mut sums = self.unchanged[first..].first_chunk().copied().unwrap_or_default();
+        for place in places {
+            let Some(entries) = self.table.chunk(*place as usize, first) else { continue };
+            sums.iter_mut().zip(entries).for_each(|(sum, entry)| *sum += *entry);
+        }
+        sums
+    }
+
+    /// What the node of a state with this row costs.
+    #[cfg(test)]
+    pub(in crate::mapping) fn of(&self, observation: usize, values: &[u32]) -> Estimate {
+        let mut sum = self.others(observation, values);
+        for Column { position, offset, .. } in &self.columns {
+            sum += self.table.at(offset + values[*position] as usize, observation);
+        }
+        sum
+    }
+
+    /// What is not in the columns.
+    #[inline(never)]
+    fn others(&self, observation: usize, values: &[u32]) -> Estimate {
+        let mut sum = Estimate::default();
+        for table in &self.joint {
+            sum.cost_to_go += table.cost_to_go(observation, values);
         }
         for position in &self.untabled {
-            if self.problem.model.states().domain(*position).len() == 1 {
-                least_distance += self.problem.distances.term(*position, i, 0);
+            sum.distance += self.problem.distances.term(*position, observation, values[*position]);
+        }
+        sum
+    }
+
+    /// Writes the terms of a column, and the least of them at each observation. What no action changes stays as it was at the start.
+    fn write_terms(&mut self, number: usize, meter: &mut Meter<'_>) -> Signal {
+        let (n_observations, n_columns) = (self.problem.demonstration.len(), self.columns.len());
+        let Column { group, position, offset } = self.columns[number];
+        let start = self.problem.start_row[position];
+        let is_unchanged = group.n_edges() == 0;
+        let Some(terms) = self.problem.distances.of(position) else { return Signal::Continue };
+        let mut least = vec![f64::INFINITY; n_observations];
+        for value in (0..).take(group.n_classes()) {
+            match meter.spend(n_observations as u64) {
+                Signal::Continue => {}
+                signal => return signal,
+            }
+            let entries = self.table.of_mut(offset + value as usize);
+            for ((i, least), entry) in least.iter_mut().enumerate().zip(entries) {
+                entry.distance = terms.term(i, value);
+                if !is_unchanged || value == start {
+                    *least = least.min(entry.distance);
+                }
             }
         }
-        self.least_distances.push(least_distance);
+        for (i, least) in least.into_iter().enumerate() {
+            self.least_terms[i * n_columns + number] = least;
+            self.least_distances[i] += least;
+        }
+        Signal::Continue
+    }
+
+    /// Adds what attributes of a single value add to the least distances.
+    fn add_constants(&mut self) {
+        for position in self.untabled.iter().filter(|at| self.problem.model.states().domain(**at).len() == 1) {
+            for (i, least) in self.least_distances.iter_mut().enumerate() {
+                *least += self.problem.distances.term(*position, i, 0);
+            }
+        }
+    }
+
+    /// Sums up the columns that no action changes.
+    fn tell_unchanged(&mut self) {
+        self.unchanged.fill(Estimate::default());
+        self.changing.clear();
+        for Column { group, position, offset } in &self.columns {
+            if group.n_edges() == 0 {
+                let entries = self.table.of_mut(offset + self.problem.start_row[*position] as usize);
+                self.unchanged.iter_mut().zip(entries).for_each(|(sum, entry)| *sum += *entry);
+            } else {
+                #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+                self.changing.push(ChangingColumn { offset: *offset as u32, position: *position as u32 });
+            }
+        }
     }
 
     /// Fills the table of a group: with `N_i(v) = term(i+1, v) + H_{i+1}(v)`, what it costs to be next at class `v`,
@@ -182,16 +308,17 @@ impl<'p> Projected<'p> {
         let n_classes = group.n_classes();
         let predecessors = Ways::into_classes(group, parts);
         let mut open = BinaryHeap::new();
+        let mut next: Vec<Estimate> =
+            (0..n_classes).map(|class| self.table.at(offset + class, self.problem.last())).collect();
+        let mut here = next.clone();
         for i in (0..self.problem.last()).rev() {
             match meter.spend(n_classes as u64) {
                 Signal::Continue => {}
                 signal => return signal,
             }
-            let (before, after) = self.entries.split_at_mut((i + 1) * self.width);
-            let here = &mut before[i * self.width + offset..][..n_classes];
-            let next = &after[offset..][..n_classes];
-            for (entry, next) in here.iter_mut().zip(next) {
-                entry.cost_to_go = next.distance + next.cost_to_go;
+            for (class, (here, next)) in here.iter_mut().zip(&next).enumerate() {
+                here.distance = self.table.at(offset + class, i).distance;
+                here.cost_to_go = next.distance + next.cost_to_go;
             }
             for (class, next) in next.iter().enumerate() {
                 let cost = next.distance + next.cost_to_go;
@@ -204,7 +331,7 @@ impl<'p> Projected<'p> {
             let least_distance = self.least_distances[i];
             for class in 0..n_classes {
                 let cost = here[class].distance - least + here[class].cost_to_go;
-                relax(&predecessors, class, cost, least_distance, here, &mut open);
+                relax(&predecessors, class, cost, least_distance, &mut here, &mut open);
             }
             while let Some(CheapestFirst { cost, id: class }) = open.pop() {
                 match meter.spend(1) {
@@ -214,9 +341,13 @@ impl<'p> Projected<'p> {
                 let entry = here[class as usize];
                 if cost <= entry.cost_to_go {
                     let cost = entry.distance - least + cost;
-                    relax(&predecessors, class as usize, cost, least_distance, here, &mut open);
+                    relax(&predecessors, class as usize, cost, least_distance, &mut here, &mut open);
                 }
             }
+            for (class, entry) in here.iter().enumerate() {
+                self.table.at_mut(offset + class, i).cost_to_go = entry.cost_to_go;
+            }
+            std::mem::swap(&mut here, &mut next);
         }
         Signal::Continue
     }
@@ -242,41 +373,13 @@ fn relax(
     }
 }
 
-/// What the nodes at one observation cost.
-#[derive(Clone, Copy, Debug)]
-pub(in crate::mapping) struct EstimatesAt<'p> {
-    projected: &'p Projected<'p>,
-    row: &'p [Estimate],
-    observation: usize,
-}
-
-impl EstimatesAt<'_> {
-    /// What the node of the state with this row costs.
-    #[inline]
-    pub(in crate::mapping) fn of(&self, values: &[u32]) -> Estimate {
-        let projected = self.projected;
-        let mut sum = Estimate::default();
-        let mut add = |entry: Estimate| {
-            sum.distance += entry.distance;
-            sum.cost_to_go += entry.cost_to_go;
-        };
-        for Column { position, offset, .. } in &projected.columns {
-            add(self.row[offset + values[*position] as usize]);
-        }
-        for table in &projected.joint {
-            sum.cost_to_go += table.cost_to_go(self.observation, values);
-        }
-        for position in &projected.untabled {
-            sum.distance += projected.problem.distances.term(*position, self.observation, values[*position]);
-        }
-        sum
-    }
-}
-
 impl Heuristic for Projected<'_> {
     #[inline]
     fn cost_to_go(&self, observation: usize, row: &[u32]) -> f64 {
-        self.at(observation).of(row).cost_to_go
+        let joint: f64 = self.joint.iter().map(|table| table.cost_to_go(observation, row)).sum();
+        self.columns.iter().fold(joint, |sum, Column { position, offset, .. }| {
+            sum + self.table.at(offset + row[*position] as usize, observation).cost_to_go
+        })
     }
 }
 

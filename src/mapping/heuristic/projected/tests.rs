@@ -127,7 +127,7 @@ proptest! {
                 prop_assert_eq!(projected.deepen(limit, 0, &mut meter), Ok(Deepened::Yes));
             }
             for (number, (i, state)) in reached.iter().copied().enumerate() {
-                let estimate = projected.at(i).of(problem.model.states().row(state));
+                let estimate = projected.of(i, problem.model.states().row(state));
                 prop_assert!((estimate.distance - distance(&problem, i, state)).abs() <= close);
                 let h = estimate.cost_to_go;
                 let through = from_start[i][state as usize] + to_end[i][state as usize];
@@ -135,7 +135,7 @@ proptest! {
                     prop_assert!(h <= to_end[i][state as usize] + close, "admissible at ({i}, {state})");
                 }
                 for (next, to, cost) in moves(&problem, i, state) {
-                    let next_h = projected.at(next).of(problem.model.states().row(to)).cost_to_go;
+                    let next_h = projected.of(next, problem.model.states().row(to)).cost_to_go;
                     prop_assert!(h == f64::INFINITY || h <= cost + next_h + close, "consistent at ({i}, {state})");
                 }
                 if is_deep {

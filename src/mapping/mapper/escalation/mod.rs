@@ -113,7 +113,7 @@ impl Mapper {
         let mut is_cut_short = None;
         for observation in problem.demonstration.iter() {
             is_cut_short = match interrupt.poll() {
-                Signal::Continue if online.size_bytes() > budget.max_bytes() => Some(Outcome::TooLarge),
+                Signal::Continue if online.size_bytes() > budget.max_bytes => Some(Outcome::TooLarge),
                 Signal::Continue => None,
                 Signal::Finish => Some(Outcome::CutShort),
                 Signal::Cancel => return Err(Cancelled),

@@ -142,9 +142,9 @@ proptest! {
         prop_assert!(mapping.status == Status::Optimal && close(mapping.cost.total), "{mapping:?}, not {optimum}");
         let mapping = map(Budget { max_expansions: few, ..Budget::DEFAULT }, &mut Uninterrupted);
         prop_assert!(is_true(&mapping) && mapping.n_expanded <= few, "{mapping:?}, of {optimum} and {few}");
-        let max_nodes = usize::try_from(few).unwrap();
-        let mapping = map(Budget { max_nodes, ..Budget::DEFAULT }, &mut Uninterrupted);
-        prop_assert!(is_true(&mapping), "{mapping:?}, of {optimum} in {max_nodes} nodes");
+        let max_bytes = 64 * usize::try_from(few).unwrap();
+        let mapping = map(Budget { max_bytes, ..Budget::DEFAULT }, &mut Uninterrupted);
+        prop_assert!(is_true(&mapping), "{mapping:?}, of {optimum} in {max_bytes} bytes");
         let mut n_left = few / 8;
         let mapping = map(Budget::DEFAULT, &mut || {
             n_left = n_left.saturating_sub(1);
@@ -239,7 +239,7 @@ fn a_search_goes_on_where_there_is_no_room_for_a_sweep_and_none_is_begun_that_wo
     let swept = map(Budget::DEFAULT);
     assert_eq!((swept.status, swept.n_expanded), (Status::Optimal, 100 + 30_000 * 30));
     // The newest layer alone has 30,000 nodes.
-    let searched = map(Budget { max_nodes: 20_000, ..Budget::DEFAULT });
+    let searched = map(Budget { max_bytes: 20_000 * 64, ..Budget::DEFAULT });
     assert_eq!((searched.status, searched.cost.total), (Status::Optimal, swept.cost.total));
     assert!(searched.n_expanded < swept.n_expanded / 4, "a few layers, and a search: {}", searched.n_expanded);
 

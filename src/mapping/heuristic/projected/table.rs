@@ -1,0 +1,44 @@
+//! The entries of all columns.
+
+/// What each class costs at each observation. Those of a class are one after the other, so that what a state costs at neighbouring
+/// observations is read together.
+#[derive(Debug, Default)]
+pub(in crate::mapping::heuristic) struct Table<T> {
+    /// Shape `[n_classes, stride]`.
+    entries: Vec<T>,
+    /// The observations, with room for whole chunks of [`CHUNK_LEN`].
+    stride: usize,
+}
+
+/// How many observations are read together.
+pub(in crate::mapping) const CHUNK_LEN: usize = 8;
+
+impl<T: Copy> Table<T> {
+    /// The same entry everywhere.
+    pub(super) fn filled_with(entry: T, n_classes: usize, n_observations: usize) -> Self {
+        let stride = n_observations.next_multiple_of(CHUNK_LEN);
+        Self { entries: vec![entry; n_classes * stride], stride }
+    }
+
+    /// What a class costs at an observation.
+    #[inline]
+    pub(in crate::mapping::heuristic) fn at(&self, class: usize, observation: usize) -> T {
+        self.entries[class * self.stride + observation]
+    }
+
+    #[inline]
+    pub(super) fn at_mut(&mut self, class: usize, observation: usize) -> &mut T {
+        &mut self.entries[class * self.stride + observation]
+    }
+
+    /// What a class costs at each observation, and as many more as there is room for.
+    pub(super) fn of_mut(&mut self, class: usize) -> &mut [T] {
+        &mut self.entries[class * self.stride..][..self.stride]
+    }
+
+    /// What a class costs at the observations of the chunk that begins with `first`.
+    #[inline]
+    pub(super) fn chunk(&self, class: usize, first: usize) -> Option<&[T; CHUNK_LEN]> {
+        self.entries.get(class * self.stride + first..)?.first_chunk()
+    }
+}
