@@ -113,9 +113,9 @@ enum CliError {
     /// Input or output failed.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// The log filter is none.
-    #[error("--log: {0}")]
-    Log(#[from] tracing_subscriber::filter::ParseError),
+    /// Nothing can be logged.
+    #[error(transparent)]
+    Log(#[from] crate::telemetry::LogError),
 }
 
 /// Runs the program with the arguments of the process.
@@ -124,7 +124,8 @@ pub fn run() -> ExitCode {
     let Cli { log, command } = Cli::parse();
     // Other commands have their output, which log lines would stand between.
     let default_filter = if matches!(command, Command::Serve(_)) { "info" } else { "warn" };
-    let done = start_logging(&log, default_filter).map_err(CliError::from).and_then(|()| match command {
+    // What was logged is written before an error is reported.
+    let done = start_logging(&log, default_filter).map_err(CliError::from).and_then(|_logging| match command {
         Command::Serve(serve) => serve.run(),
         Command::Map(map) => map.run(&mut io::stdout().lock()),
         Command::Stream(stream) => stream.run(&mut io::stdout()),

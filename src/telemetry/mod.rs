@@ -1,9 +1,12 @@
 //! Logs and measurements of the process.
 
-use std::io::IsTerminal;
+mod log_lines;
+
+use std::io::{self, IsTerminal};
 use std::sync::{Mutex, PoisonError};
 
 use clap::{Args, ValueEnum};
+use log_lines::LogLines;
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusHandle};
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::filter::ParseError;
@@ -29,19 +32,41 @@ pub enum LogFormat {
     Json,
 }
 
-/// Starts logging; what `default_filter` says if `config` says nothing.
+/// Why nothing can be logged.
+#[derive(Debug, thiserror::Error)]
+pub enum LogError {
+    /// The filter is none.
+    #[error("--log: {0}")]
+    Filter(#[from] ParseError),
+    /// Nothing can write lines.
+    #[error("cannot log")]
+    Start(#[from] io::Error),
+}
+
+/// Logging, as long as this is there: when it is dropped, all lines are written.
+#[must_use]
+pub struct Logging(LogLines);
+
+impl Drop for Logging {
+    fn drop(&mut self) {
+        self.0.flush();
+    }
+}
+
+/// Starts logging; what `default_filter` says if `config` says nothing. Lines that warn of nothing may be written a moment later.
 ///
 /// # Errors
 ///
-/// If the filter is none.
-pub fn start_logging(config: &LogConfig, default_filter: &str) -> Result<(), ParseError> {
+/// If the filter is none, or there are no more threads.
+pub fn start_logging(config: &LogConfig, default_filter: &str) -> Result<Logging, LogError> {
     let filter = EnvFilter::try_new(config.filter.as_deref().unwrap_or(default_filter))?;
-    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr);
+    let lines = LogLines::start(io::stderr())?;
+    let builder = tracing_subscriber::fmt().with_env_filter(filter).with_writer(lines.clone());
     match config.format {
-        LogFormat::Text => builder.with_ansi(std::io::stderr().is_terminal()).init(),
+        LogFormat::Text => builder.with_ansi(io::stderr().is_terminal()).init(),
         LogFormat::Json => builder.json().flatten_event(true).with_current_span(true).with_span_list(false).init(),
     }
-    Ok(())
+    Ok(Logging(lines))
 }
 
 /// Seconds. From a search of a small world to one that takes minutes.
