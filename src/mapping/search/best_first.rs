@@ -278,7 +278,7 @@ impl<S: Space> Search<'_, '_, S> {
     fn is_spent(&mut self) -> bool {
         /// How many expansions may be done between two looks at the memory.
         const LOOK_EVERY: u64 = 16;
-        let n_bytes = self.nodes.size_bytes() + self.seen.size_bytes();
+        let n_bytes = self.nodes.size_bytes(self.seen.n_states()) + self.seen.size_bytes();
         self.unspent_until = (self.n_expanded + LOOK_EVERY).min(self.budget.max_expansions);
         self.n_expanded >= self.budget.max_expansions || self.budget.is_full(n_bytes, self.space)
     }

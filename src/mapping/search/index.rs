@@ -37,27 +37,30 @@ const SLOTS_PER_BLOCK: usize = 8;
 const FIRST_BITS: u32 = 12;
 
 impl Index {
-    /// Forgets the blocks, which are `keys`, and keeps the memory. There will be at most `row_len` for each state.
+    /// Forgets the blocks, which are `keys`, and keeps the memory, of which it clears no more than was in use: there may be rows for
+    /// many more states than those of a search. There will be at most `row_len` for each state.
     pub(super) fn clear(&mut self, keys: &[Key], row_len: usize) {
         let row_len = if row_len <= MAX_ROW_LEN { row_len } else { 0 };
         if row_len == 0 {
             self.row_len = 0;
             self.resize(FIRST_BITS, &[]);
-        } else if row_len == self.row_len {
+        } else if self.row_len == 0 {
+            self.row_len = row_len;
+            self.slots.clear();
+        } else {
             for key in keys {
                 let slot = self.slot_of(*key);
                 self.slots.get_mut(slot).into_iter().for_each(|slot| *slot = NO_BLOCK);
             }
-        } else {
             self.row_len = row_len;
-            self.slots.clear();
         }
     }
 
-    /// How much memory it takes, in bytes.
-    #[inline]
-    pub(super) fn size_bytes(&self) -> usize {
-        size_of_val(self.slots.as_slice())
+    /// How much memory it takes for the blocks of `n_states` states, in bytes. Rows of other states, which searches before this one came
+    /// to, do not count.
+    pub(super) fn size_bytes(&self, n_states: usize) -> usize {
+        let n_slots = if self.row_len == 0 { self.slots.len() } else { (n_states * self.row_len).next_power_of_two() };
+        n_slots * size_of::<u32>()
     }
 
     /// How much memory is kept for it, in bytes.

@@ -145,10 +145,9 @@ impl Nodes {
         self.links.push([NO_LINK; BLOCK_LEN]);
     }
 
-    /// How much memory they take, in bytes.
-    #[inline]
-    pub(super) fn size_bytes(&self) -> usize {
-        self.keys.len() * BLOCK_BYTES + self.index.size_bytes()
+    /// How much memory they take, in bytes, if they are of `n_states` states.
+    pub(super) fn size_bytes(&self, n_states: usize) -> usize {
+        self.keys.len() * BLOCK_BYTES + self.index.size_bytes(n_states)
     }
 
     /// How much memory is kept for them, in bytes.

@@ -27,52 +27,82 @@ pub(super) struct Way {
 pub(super) struct Seen {
     numbers: FxHashMap<StateIdx, SeenIdx>,
     states: Vec<StateIdx>,
-    /// Where the ways out of each state are; [`UNEXPLORED`] where they are not known yet.
-    bounds: Vec<(u32, u32)>,
+    bounds: Vec<Bounds>,
+    /// By state, the last search that came to it.
+    came: Vec<SearchNumber>,
     ways: Vec<Way>,
     /// Where the states' entries are in the tables of estimates. Shape `[n_seen, columns.len()]`.
     places: Vec<u32>,
     columns: Vec<ChangingColumn>,
-    /// How many bytes they took before this search.
-    bytes_before: usize,
+    /// This search.
+    search: SearchNumber,
+    /// What this search came to, whether or not others were there before: states,
+    n_states: usize,
+    /// and ways out of those that it explored.
+    n_ways: usize,
 }
 
-const UNEXPLORED: (u32, u32) = (u32::MAX, u32::MAX);
+/// A search's number among those for which the states were kept, from 1 on; 0 for none.
+type SearchNumber = u32;
+
+/// Where the ways out of a state are.
+#[derive(Clone, Copy, Debug)]
+struct Bounds {
+    begin: u32,
+    end: u32,
+    /// The last search that explored it, 0 if its ways are not known yet.
+    explored_by: SearchNumber,
+}
+
+const UNEXPLORED: Bounds = Bounds { begin: 0, end: 0, explored_by: 0 };
+
+/// Most states that are kept for later searches. An index may have a row for each, of as many bytes as 128.
+const MAX_KEPT_STATES: usize = 1 << 16;
+
+/// What a state takes, besides its ways, its entry in the index and its places.
+const STATE_BYTES: usize = size_of::<StateIdx>() + size_of::<Bounds>() + size_of::<SearchNumber>();
 
 impl Seen {
-    /// Makes room for a search in `space`, with estimates by `projected`: keeps the states that mean the same to it.
+    /// Makes room for a search in `space`, with estimates by `projected`: keeps the states that mean the same to it, unless they are
+    /// too many.
     pub(super) fn prepare(&mut self, space: &impl Space, projected: &Projected<'_>) {
-        if !space.keeps_numbers() || self.columns != projected.changing_columns() {
+        let mean_the_same = space.keeps_numbers() && self.columns == projected.changing_columns();
+        if !mean_the_same || self.states.len() > MAX_KEPT_STATES || self.search == SearchNumber::MAX {
             self.numbers.clear();
             self.states.clear();
             self.bounds.clear();
+            self.came.clear();
             self.ways.clear();
             self.places.clear();
             self.columns = projected.changing_columns().to_vec();
+            self.search = 0;
         }
-        self.bytes_before = self.n_bytes();
+        self.search += 1;
+        (self.n_states, self.n_ways) = (0, 0);
     }
 
-    /// How much memory those take that this search was the first to see, in bytes.
+    /// How many states this search came to.
+    pub(super) fn n_states(&self) -> usize {
+        self.n_states
+    }
+
+    /// How much memory those take that this search came to, in bytes: the same whether or not others were there before.
     pub(super) fn size_bytes(&self) -> usize {
-        self.n_bytes() - self.bytes_before
-    }
-
-    fn n_bytes(&self) -> usize {
         /// Of the index, which is at most half empty just after it has grown.
         const ENTRY_BYTES: usize = 2 * size_of::<(StateIdx, SeenIdx)>();
-        let state_bytes = size_of::<StateIdx>() + size_of::<(u32, u32)>() + self.columns.len() * size_of::<u32>();
-        self.states.len() * (state_bytes + ENTRY_BYTES) + self.ways.len() * size_of::<Way>()
+        let state_bytes = STATE_BYTES + self.columns.len() * size_of::<u32>();
+        self.n_states * (state_bytes + ENTRY_BYTES) + self.n_ways * size_of::<Way>()
     }
 
     /// How much memory is kept for them, in bytes.
     pub(super) fn kept_bytes(&self) -> usize {
         self.numbers.capacity() * size_of::<(StateIdx, SeenIdx)>()
+            + self.states.capacity() * STATE_BYTES
             + self.ways.capacity() * size_of::<Way>()
             + self.places.capacity() * size_of::<u32>()
     }
 
-    /// The number of a state, from now on.
+    /// The number of a state to which this search comes, from now on.
     #[inline]
     pub(super) fn number_of(&mut self, state: StateIdx, space: &impl Space, projected: &Projected<'_>) -> SeenIdx {
         #[expect(clippy::cast_possible_truncation, reason = "no more than there are states")]
@@ -81,9 +111,19 @@ impl Seen {
         if number == next {
             self.states.push(state);
             self.bounds.push(UNEXPLORED);
+            self.came.push(0);
             self.places.extend(projected.places(space.row(state)));
         }
+        self.come_to(number);
         number
+    }
+
+    /// Counts a state to which this search comes.
+    #[inline]
+    fn come_to(&mut self, number: SeenIdx) {
+        let came = &mut self.came[number as usize];
+        self.n_states += usize::from(*came != self.search);
+        *came = self.search;
     }
 
     /// The model's number of a state.
@@ -92,11 +132,11 @@ impl Seen {
         self.states[number as usize]
     }
 
-    /// Where the ways out of a state are, if it was explored.
+    /// Where the ways out of a state are, if this search explored it.
     #[inline]
     pub(super) fn explored(&self, number: SeenIdx) -> Option<Range<usize>> {
         let bounds = self.bounds[number as usize];
-        (bounds != UNEXPLORED).then_some(bounds.0 as usize..bounds.1 as usize)
+        (bounds.explored_by == self.search).then(|| bounds.ways())
     }
 
     /// Sees where the actions lead from a state. Gives where the ways are.
@@ -108,18 +148,26 @@ impl Seen {
         projected: &Projected<'_>,
         actions: &[Action],
     ) -> Range<usize> {
-        let state = self.state(number);
-        space.explore(state);
-        let begin = self.ways.len();
-        for transition in space.successors(state) {
-            let to = self.number_of(transition.to, space, projected);
-            let cost = actions[usize::from(transition.action)].cost;
-            self.ways.push(Way { cost, to, action: transition.action });
-        }
+        let known = self.bounds[number as usize];
+        let ways = if known.explored_by == 0 {
+            let state = self.state(number);
+            space.explore(state);
+            let begin = self.ways.len();
+            for transition in space.successors(state) {
+                let to = self.number_of(transition.to, space, projected);
+                let cost = actions[usize::from(transition.action)].cost;
+                self.ways.push(Way { cost, to, action: transition.action });
+            }
+            begin..self.ways.len()
+        } else {
+            known.ways().for_each(|at| self.come_to(self.ways[at].to));
+            known.ways()
+        };
+        self.n_ways += ways.len();
         #[expect(clippy::cast_possible_truncation, reason = "models have fewer than 2^32 transitions")]
-        let bounds = [begin, self.ways.len()].map(|bound| bound as u32);
-        self.bounds[number as usize] = bounds.into();
-        begin..self.ways.len()
+        let [begin, end] = [ways.start, ways.end].map(|bound| bound as u32);
+        self.bounds[number as usize] = Bounds { begin, end, explored_by: self.search };
+        ways
     }
 
     /// The way out of a state that is there.
@@ -133,6 +181,13 @@ impl Seen {
     fn places(&self, number: SeenIdx) -> &[u32] {
         let n_places = self.columns.len();
         &self.places[number as usize * n_places..][..n_places]
+    }
+}
+
+impl Bounds {
+    #[inline]
+    fn ways(self) -> Range<usize> {
+        self.begin as usize..self.end as usize
     }
 }
 

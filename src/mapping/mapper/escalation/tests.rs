@@ -154,6 +154,47 @@ proptest! {
     }
 }
 
+/// What is asked again and again of one mapper: a demonstration of this length, with these weights of the first two attributes, from
+/// this state, within so many bytes.
+fn variations() -> impl Strategy<Value = Vec<(usize, [f64; 2], usize, usize)>> {
+    let length = prop_oneof![8 => 1..40_usize, 2 => prop::sample::select(vec![8, 9, 16, 17]), 1 => 255..300_usize];
+    let weights = prop::array::uniform2(prop_oneof![Just(0.0), Just(1.0), 0.0..5.0]);
+    let max_bytes = prop_oneof![Just(usize::MAX), 0..100_000_usize];
+    prop::collection::vec((length, weights, 0..5_usize, max_bytes), 2..6)
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 60, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn what_a_mapper_searched_before_makes_no_difference(
+        (model, request) in prop_oneof![wander(), hall()],
+        variations in variations(),
+        patience in prop::sample::select(vec![Patience::DEFAULT, IMPATIENT]),
+    ) {
+        let fresh = || Mapper { patience, ..prepared(&model) };
+        let reused = fresh();
+        let seen = request["demonstration"].as_array().unwrap();
+        for (n_observations, [x, y], start, max_bytes) in variations.iter().chain(&variations) {
+            let demonstration: Vec<&Value> = seen.iter().cycle().take(*n_observations).collect();
+            let request = json!({
+                "model": "any", "demonstration": demonstration, "weights": {"x": x, "y": y}, "start": start,
+            });
+            let settings = Settings { budget: Budget { max_bytes: *max_bytes, ..Budget::DEFAULT }, ..Settings::default() };
+            let map = |mapper: &Mapper, settings| {
+                mapper.map(&read(mapper, &request).problem, settings, &mut Uninterrupted).unwrap()
+            };
+            let mapping = map(&reused, settings);
+            prop_assert_eq!(&mapping, &map(&fresh(), settings));
+            let without = Settings { heuristic: HeuristicName::None, ..Settings::default() };
+            let optimum = map(&reused, without).cost.total;
+            let is_least = (mapping.cost.total - optimum).abs() <= 1e-9 * optimum;
+            prop_assert!(is_least || (*max_bytes < usize::MAX && mapping.status == Status::Bounded), "{mapping:?}, of {optimum}");
+            prop_assert!(mapping.lower_bound.unwrap() <= optimum * (1.0 + 1e-9), "{mapping:?}, of {optimum}");
+        }
+    }
+}
+
 #[test]
 fn tables_left_out_at_first_and_sweeps_come_to_the_same_cost_as_a_search_without_heuristic() {
     // The places' table is too large for a first attempt, which is not enough.
