@@ -54,7 +54,8 @@ impl Buffers {
     /// Whether they are small enough to be kept.
     pub(in crate::mapping) fn are_small(&self) -> bool {
         const MAX_BYTES: usize = 16 << 20;
-        self.seen.kept_bytes() + self.nodes.kept_bytes() <= MAX_BYTES
+        let open_bytes = self.open.buckets.kept_bytes() + self.open.probed.capacity() * size_of::<CheapestFirst>();
+        self.seen.kept_bytes() + self.nodes.kept_bytes() + open_bytes <= MAX_BYTES
     }
 }
 
@@ -75,6 +76,7 @@ pub(in crate::mapping) fn search<S: Space>(
     let Buffers { seen, nodes, open } = buffers;
     seen.prepare(space, projected);
     nodes.clear(problem.demonstration.len());
+    open.buckets.clear();
     let state = seen.number_of(problem.start, space, projected);
     let start = Arrival { kind: MoveKind::Start, observation: 0, state, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
     // The start is kept whatever it costs: it is what is left to complete if there is no budget at all.
@@ -142,7 +144,7 @@ struct Search<'s, 'p, S> {
 impl<S: Space> Search<'_, '_, S> {
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
-    fn probe(&mut self, width: u64, Open { probed, .. }: &mut Open) -> Result<End, Cancelled> {
+    fn probe(&mut self, width: u64, Open { probed, buckets }: &mut Open) -> Result<End, Cancelled> {
         let mut layers = vec![Vec::new(); self.problem.last()];
         for Reached { id, f, .. } in self.open() {
             if let Some(layer) = layers.get_mut(self.nodes.step(id).observation as usize) {
@@ -165,7 +167,7 @@ impl<S: Space> Search<'_, '_, S> {
                 }
                 n_left -= 1;
                 let step = self.nodes.step(id);
-                let Some(ways) = self.spend(step.state)? else { return Ok(End::CutShort) };
+                let Some(ways) = self.spend(step.state, buckets)? else { return Ok(End::CutShort) };
                 self.expand(id, g, step, ways, |Reached { id, f, .. }, at| {
                     let found = CheapestFirst { cost: f, id };
                     if at == observation {
@@ -197,7 +199,7 @@ impl<S: Space> Search<'_, '_, S> {
                 continue;
             }
             let step = self.nodes.step(id);
-            let Some(ways) = self.spend(step.state)? else { return Ok(End::CutShort) };
+            let Some(ways) = self.spend(step.state, &open.buckets)? else { return Ok(End::CutShort) };
             self.expand(id, g, step, ways, |found, _| open.buckets.push(found));
             if self.n_expanded < help_at && self.limit >= bucketed_limit / 4.0 {
                 continue;
@@ -261,25 +263,29 @@ impl<S: Space> Search<'_, '_, S> {
     /// Counts the expansion of a node of `state` that is about to be done, and gives where the ways out are; `None` if it may not be.
     #[expect(clippy::inline_always, reason = "it is done for every expansion")]
     #[inline(always)]
-    fn spend(&mut self, state: SeenIdx) -> Result<Option<Range<usize>>, Cancelled> {
+    fn spend(&mut self, state: SeenIdx, buckets: &Buckets) -> Result<Option<Range<usize>>, Cancelled> {
         let ways = self
             .seen
             .explored(state)
             .unwrap_or_else(|| self.seen.explore(state, self.space, self.projected, self.problem.model.actions()));
         match self.meter.spend(1 + 2 * ways.len() as u64) {
             Signal::Cancel => Err(Cancelled),
-            Signal::Continue if self.n_expanded < self.unspent_until || !self.is_spent() => Ok(Some(ways)),
+            Signal::Continue if self.n_expanded < self.unspent_until || !self.is_spent(buckets) => Ok(Some(ways)),
             Signal::Continue | Signal::Finish => Ok(None),
         }
     }
 
     /// Whether there are no expansions left, or no memory.
     #[cold]
-    fn is_spent(&mut self) -> bool {
-        /// How many expansions may be done between two looks at the memory.
+    fn is_spent(&mut self, buckets: &Buckets) -> bool {
+        /// How many expansions may be done between two looks at the memory,
         const LOOK_EVERY: u64 = 16;
-        let n_bytes = self.nodes.size_bytes(self.seen.n_states()) + self.seen.size_bytes();
-        self.unspent_until = (self.n_expanded + LOOK_EVERY).min(self.budget.max_expansions);
+        /// and how many ways may be followed: they find as many nodes, and twice as many where blocks begin.
+        const N_WAYS: u64 = 1 << 10;
+        let n_bytes = self.nodes.size_bytes(self.seen.n_states()) + self.seen.size_bytes() + buckets.size_bytes();
+        let n_actions = self.problem.model.actions().len() as u64;
+        let look_every = (N_WAYS / n_actions.max(1)).clamp(1, LOOK_EVERY);
+        self.unspent_until = (self.n_expanded + look_every).min(self.budget.max_expansions);
         self.n_expanded >= self.budget.max_expansions || self.budget.is_full(n_bytes, self.space)
     }
 

@@ -34,8 +34,21 @@ const MANTISSA_BITS: u32 = 10;
 const MAX_OCTAVES: i32 = 16;
 
 impl Buckets {
-    /// How much memory an entry takes, in bytes.
-    pub(super) const ENTRY_BYTES: usize = size_of::<Entry>();
+    /// Empties the list, which takes nothing until it is [reset](Self::reset).
+    pub(super) fn clear(&mut self) {
+        self.heads.clear();
+        self.entries.clear();
+    }
+
+    /// How much memory the nodes take that were added, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        size_of_val(self.entries.as_slice())
+    }
+
+    /// How much memory is kept for them, in bytes.
+    pub(super) fn kept_bytes(&self) -> usize {
+        self.entries.capacity() * size_of::<Entry>()
+    }
 
     /// Empties the list, which is then for nodes of `least <= f < limit`.
     pub(super) fn reset(&mut self, least: f64, limit: f64) {
@@ -98,6 +111,17 @@ mod tests {
             let width = |f: f64| (f + limit / 65536.0) / 1024.0;
             assert!(order.windows(2).all(|pair| pair[1] > pair[0] - width(pair[0])), "{least} to {limit}");
         }
+    }
+
+    #[test]
+    fn what_was_taken_takes_memory_until_the_list_is_emptied() {
+        let mut open = Buckets::default();
+        open.reset(1.0, 2.0);
+        (0..3).for_each(|id| open.push(Reached { id, g: 0.0, f: 1.5 }));
+        open.pop();
+        assert_eq!(open.size_bytes(), 3 * size_of::<Entry>());
+        open.clear();
+        assert_eq!((open.size_bytes(), open.pop()), (0, None));
     }
 
     #[test]

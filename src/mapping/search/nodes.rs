@@ -4,7 +4,6 @@
 //! action, which lead to neighbours, and most often each of them is known already and was come to more cheaply. Of a block,
 //! that takes one look into the index and one at the costs.
 
-use super::buckets::Buckets;
 use super::index::{Index, Key, NO_BLOCK};
 use super::seen::{Seen, SeenIdx};
 use super::{Move, MoveKind, NO_ACTION};
@@ -113,9 +112,7 @@ pub(super) struct Nodes {
 /// The key of [`NO_BLOCK`], which never has a node.
 const NO_KEY: Key = Key { state: SeenIdx::MAX, number: u32::MAX };
 
-/// What a block takes, with the entries of the open list for half of its nodes: as many as there are, most often.
-const BLOCK_BYTES: usize = BLOCK_LEN / 2 * Buckets::ENTRY_BYTES
-    + size_of::<Key>()
+const BLOCK_BYTES: usize = size_of::<Key>()
     + size_of::<[u8; BLOCK_LEN]>()
     + size_of::<Costs>()
     + size_of::<[Estimate; BLOCK_LEN]>()

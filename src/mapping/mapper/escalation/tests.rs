@@ -196,6 +196,25 @@ proptest! {
 }
 
 #[test]
+fn a_state_with_thousands_of_ways_out_does_not_overrun_the_memory() {
+    const N_WAYS: usize = 3_000;
+    let actions: Value = (1..=N_WAYS).map(|n| json!({"name": format!("to {n}")})).collect();
+    let transitions: Value = (1..=N_WAYS).map(|n| json!([0, format!("to {n}"), n])).collect();
+    let model = json!({
+        "attributes": [{"name": "x", "kind": "number"}],
+        "actions": actions,
+        "dynamics": {
+            "kind": "table", "states": (0..=N_WAYS).map(|n| [n]).collect::<Value>(), "transitions": transitions, "start": 0,
+        },
+    });
+    let mapper = prepared(&model);
+    let request = read(&mapper, &json!({"model": "star", "demonstration": vec![json!({"x": 0}); 30]})).problem;
+    // Less than the nodes take that the first expansion finds.
+    let settings = Settings { budget: Budget { max_bytes: 100 * N_WAYS, ..Budget::DEFAULT }, ..Settings::default() };
+    assert_eq!(mapper.map(&request, settings, &mut Uninterrupted).unwrap().n_expanded, 1);
+}
+
+#[test]
 fn tables_left_out_at_first_and_sweeps_come_to_the_same_cost_as_a_search_without_heuristic() {
     // The places' table is too large for a first attempt, which is not enough.
     let (mapper, request) = belt(3_000, 30);
