@@ -10,6 +10,7 @@ use std::ops::{Add, AddAssign};
 pub(in crate::mapping) use deepening::Deepened;
 pub(in crate::mapping) use table::CHUNK_LEN;
 pub(super) use table::Table;
+use table::stride_for;
 
 use super::bounded::Bounded;
 use super::projection::{Group, Projections};
@@ -154,7 +155,7 @@ impl<'p> Projected<'p> {
             problem,
             columns: Vec::new(),
             table: Table::default(),
-            unchanged: vec![Estimate::default(); problem.demonstration.len().next_multiple_of(CHUNK_LEN)],
+            unchanged: vec![Estimate::default(); stride_for(problem.demonstration.len())],
             changing: Vec::new(),
             untabled: untabled.collect(),
             least_distances: Vec::new(),
@@ -398,7 +399,7 @@ fn used_groups(projections: &Projections, problem: &Problem<'_>, max_entries: us
     let mut n_entries = 0_usize;
     let mut n_left_out = 0;
     for number in wanted {
-        let of_group = problem.demonstration.len().saturating_mul(groups[number].n_classes());
+        let of_group = stride_for(problem.demonstration.len()).saturating_mul(groups[number].n_classes());
         n_entries = n_entries.saturating_add(of_group);
         match n_entries {
             n if n <= max_entries => used[number] = true,

@@ -13,11 +13,22 @@ pub(in crate::mapping::heuristic) struct Table<T> {
 /// How many observations are read together.
 pub(in crate::mapping) const CHUNK_LEN: usize = 8;
 
+/// How many entries there are for each class.
+pub(super) fn stride_for(n_observations: usize) -> usize {
+    n_observations.next_multiple_of(CHUNK_LEN)
+}
+
 impl<T: Copy> Table<T> {
     /// The same entry everywhere.
     pub(super) fn filled_with(entry: T, n_classes: usize, n_observations: usize) -> Self {
-        let stride = n_observations.next_multiple_of(CHUNK_LEN);
+        let stride = stride_for(n_observations);
         Self { entries: vec![entry; n_classes * stride], stride }
+    }
+
+    /// How many there are, with the room.
+    #[cfg(test)]
+    pub(super) fn n_entries(&self) -> usize {
+        self.entries.len()
     }
 
     /// What a class costs at an observation.

@@ -147,3 +147,28 @@ proptest! {
         }
     }
 }
+
+#[test]
+fn tables_have_no_more_entries_than_allowed_however_short_the_demonstration() {
+    let states: Value = (0..100).map(|n| json!([n, n % 7])).collect();
+    let model = json!({
+        "attributes": [{"name": "a", "kind": "number"}, {"name": "b", "kind": "number"}],
+        "actions": [{"name": "go", "cost": 1}],
+        "dynamics": {"kind": "table", "states": states, "transitions": [[0, "go", 1]], "start": 0},
+    });
+    let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    let projections = Projections::new(&model, &mut Uninterrupted).unwrap();
+    for n_observations in [1, 2, 8, 9] {
+        let request = json!({"model": "m", "demonstration": vec![json!({"a": 50, "b": 3}); n_observations]});
+        let mut faults = Faults::default();
+        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
+        for max_entries in [0, 7, 107, 856, 1_000, 1_712] {
+            let grouping = Grouping::WhenItPays;
+            let solved = Projected::solve(&projections, &problem, grouping, max_entries, &mut Uninterrupted).unwrap();
+            let n_entries = solved.unwrap().table.n_entries();
+            assert!(n_entries <= max_entries, "{n_entries}, not {max_entries}, of {n_observations} observations");
+        }
+    }
+}
