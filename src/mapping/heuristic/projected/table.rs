@@ -13,9 +13,13 @@ pub(in crate::mapping::heuristic) struct Table<T> {
 /// How many observations are read together.
 pub(in crate::mapping) const CHUNK_LEN: usize = 8;
 
-/// How many entries there are for each class.
+/// How many entries there are for each class: those of whole chunks. If these are many, their number is odd, as tables are made by
+/// going through all classes at each observation: with a stride of a large power of two, few of the cache's sets would hold these.
 pub(super) fn stride_for(n_observations: usize) -> usize {
-    n_observations.next_multiple_of(CHUNK_LEN)
+    const MANY: usize = 8;
+    let n_chunks = n_observations.div_ceil(CHUNK_LEN);
+    let n_chunks = if n_chunks < MANY { n_chunks } else { n_chunks | 1 };
+    n_chunks * CHUNK_LEN
 }
 
 impl<T: Copy> Table<T> {
