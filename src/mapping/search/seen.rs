@@ -66,8 +66,8 @@ impl Seen {
     /// Makes room for a search in `space`, with estimates by `projected`: keeps the states that mean the same to it, unless they are
     /// too many.
     pub(super) fn prepare(&mut self, space: &impl Space, projected: &Projected<'_>) {
-        let mean_the_same = space.keeps_numbers() && self.columns == projected.changing_columns();
-        if !mean_the_same || self.states.len() > MAX_KEPT_STATES || self.search == SearchNumber::MAX {
+        let are_alike = space.keeps_numbers() && self.columns == projected.changing_columns();
+        if !are_alike || self.states.len() > MAX_KEPT_STATES || self.search == SearchNumber::MAX {
             self.numbers.clear();
             self.states.clear();
             self.bounds.clear();
