@@ -18,8 +18,8 @@ use std::collections::BinaryHeap;
 use std::ops::Range;
 
 use super::buckets::Buckets;
-use super::nodes::{Arrival, Estimates, NO_NODE, NodeId, Nodes, Place, Reached, Step};
-use super::seen::{Seen, SeenEstimates, SeenIdx, Way};
+use super::nodes::{Arrival, NO_NODE, NodeId, Nodes, Place, Reached, Step};
+use super::seen::{Estimates, Seen, SeenIdx, Way};
 use super::{Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
@@ -80,7 +80,7 @@ pub(in crate::mapping) fn search<S: Space>(
     let state = seen.number_of(problem.start, space, projected);
     let start = Arrival { kind: MoveKind::Start, observation: 0, state, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
     // The start is kept whatever it costs: it is what is left to complete if there is no budget at all.
-    let estimates = &SeenEstimates { seen, projected, space };
+    let estimates = &Estimates { seen, projected, space };
     let first = nodes.take(&mut nodes.find(state, 0), start, estimates, f64::INFINITY);
     let first = first.map_or(NO_NODE, |first| first.id);
     let mut search = Search {
@@ -240,7 +240,7 @@ impl<S: Space> Search<'_, '_, S> {
             Deepened::Yes => {}
         }
         let Self { nodes, seen, projected, space, .. } = self;
-        let estimates = SeenEstimates { seen, projected, space: &**space };
+        let estimates = Estimates { seen, projected, space: &**space };
         nodes.estimate_again(|Step { state, observation, .. }| estimates.of(state, observation));
         self.probe(1, open)
     }
@@ -347,7 +347,7 @@ impl<S: Space> Search<'_, '_, S> {
     fn take(&mut self, place: &mut Place, arrival: Arrival) -> Option<Reached> {
         let observation = arrival.observation;
         let Self { nodes, seen, projected, space, .. } = self;
-        let node = nodes.take(place, arrival, &SeenEstimates { seen, projected, space: &**space }, self.limit)?;
+        let node = nodes.take(place, arrival, &Estimates { seen, projected, space: &**space }, self.limit)?;
         if observation == self.last {
             self.limit = node.g * (1.0 - self.rounding);
             self.incumbent = Some(node.id);

@@ -5,11 +5,11 @@
 //! that takes one look into the index and one at the costs.
 
 use super::index::{Index, Key, NO_BLOCK};
-use super::seen::{Seen, SeenIdx};
+use super::seen::{Estimates, Seen, SeenIdx};
 use super::{Move, MoveKind, NO_ACTION};
 use crate::mapping::cost::SLACK;
 use crate::mapping::heuristic::projected::{CHUNK_LEN, Estimate};
-use crate::model::ActionIdx;
+use crate::model::{ActionIdx, Space};
 
 /// Where a node is in [`Nodes`]: its block, and its place in that.
 pub(super) type NodeId = u32;
@@ -48,16 +48,6 @@ impl Reached {
         let g = cost + estimate.distance;
         Self { id, g, f: g + estimate.cost_to_go }
     }
-}
-
-/// What nodes cost, and what is still to be paid after them.
-pub(super) trait Estimates {
-    /// At a node.
-    fn of(&self, state: SeenIdx, observation: u32) -> Estimate;
-
-    /// At all nodes of a block, of which the first is of this observation; `None` if that is more than a little work. What they
-    /// are beyond the last observation is of no interest.
-    fn of_all(&self, state: SeenIdx, first: u32) -> Option<[Estimate; BLOCK_LEN]>;
 }
 
 /// A way to a node, before its distance is paid.
@@ -249,7 +239,7 @@ impl Nodes {
         &mut self,
         place: &mut Place,
         arrival: Arrival,
-        estimates: &impl Estimates,
+        estimates: &Estimates<'_, '_, impl Space>,
         limit: f64,
     ) -> Option<Reached> {
         let Arrival { kind, observation, state, cost, parent, action } = arrival;
@@ -287,7 +277,7 @@ impl Nodes {
         state: SeenIdx,
         observation: u32,
         cost: f64,
-        estimates: &impl Estimates,
+        estimates: &Estimates<'_, '_, impl Space>,
         limit: f64,
     ) -> bool {
         let estimate = estimates.of(state, observation);

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use rustc_hash::FxHashMap;
 
-use super::nodes::{BLOCK_LEN, Estimates};
+use super::nodes::BLOCK_LEN;
 use crate::mapping::heuristic::projected::{ChangingColumn, Estimate, Projected};
 use crate::model::{Action, ActionIdx, Space, StateIdx};
 
@@ -31,8 +31,8 @@ pub(super) struct Seen {
     /// By state, the last search that came to it.
     came: Vec<SearchNumber>,
     ways: Vec<Way>,
-    /// Where the states' entries are in the tables of estimates. Shape `[n_seen, columns.len()]`.
-    places: Vec<u32>,
+    /// The states' classes in the tables of estimates. Shape `[n_seen, columns.len()]`.
+    classes: Vec<u32>,
     columns: Vec<ChangingColumn>,
     /// This search.
     search: SearchNumber,
@@ -59,7 +59,7 @@ const UNEXPLORED: Bounds = Bounds { begin: 0, end: 0, explored_by: 0 };
 /// Most states that are kept for later searches. An index may have a row for each, of as many bytes as 128.
 const MAX_KEPT_STATES: usize = 1 << 16;
 
-/// What a state takes, besides its ways, its entry in the index and its places.
+/// What a state takes, besides its ways, its entry in the index and its classes.
 const STATE_BYTES: usize = size_of::<StateIdx>() + size_of::<Bounds>() + size_of::<SearchNumber>();
 
 impl Seen {
@@ -73,7 +73,7 @@ impl Seen {
             self.bounds.clear();
             self.came.clear();
             self.ways.clear();
-            self.places.clear();
+            self.classes.clear();
             self.columns = projected.changing_columns().to_vec();
             self.search = 0;
         }
@@ -99,7 +99,7 @@ impl Seen {
         self.numbers.capacity() * size_of::<(StateIdx, SeenIdx)>()
             + self.states.capacity() * STATE_BYTES
             + self.ways.capacity() * size_of::<Way>()
-            + self.places.capacity() * size_of::<u32>()
+            + self.classes.capacity() * size_of::<u32>()
     }
 
     /// The number of a state to which this search comes, from now on.
@@ -112,7 +112,7 @@ impl Seen {
             self.states.push(state);
             self.bounds.push(UNEXPLORED);
             self.came.push(0);
-            self.places.extend(projected.places(space.row(state)));
+            self.classes.extend(projected.classes(space.row(state)));
         }
         self.come_to(number);
         number
@@ -176,11 +176,11 @@ impl Seen {
         self.ways[at]
     }
 
-    /// Where the entries of a state are.
+    /// The classes of a state.
     #[inline]
-    fn places(&self, number: SeenIdx) -> &[u32] {
-        let n_places = self.columns.len();
-        &self.places[number as usize * n_places..][..n_places]
+    fn classes(&self, number: SeenIdx) -> &[u32] {
+        let n_classes = self.columns.len();
+        &self.classes[number as usize * n_classes..][..n_classes]
     }
 }
 
@@ -191,24 +191,27 @@ impl Bounds {
     }
 }
 
-/// Estimates of the states that were seen.
+/// What the nodes of the states that were seen cost, and what is still to be paid after them.
 #[derive(Debug)]
-pub(super) struct SeenEstimates<'s, 'p, S> {
+pub(super) struct Estimates<'s, 'p, S> {
     pub(super) seen: &'s Seen,
     pub(super) projected: &'s Projected<'p>,
     pub(super) space: &'s S,
 }
 
-impl<S: Space> Estimates for SeenEstimates<'_, '_, S> {
+impl<S: Space> Estimates<'_, '_, S> {
+    /// At a node.
     #[inline]
-    fn of(&self, state: SeenIdx, observation: u32) -> Estimate {
+    pub(super) fn of(&self, state: SeenIdx, observation: u32) -> Estimate {
         let values = || self.space.row(self.seen.state(state));
-        self.projected.estimate(observation as usize, self.seen.places(state), values)
+        self.projected.estimate(observation as usize, self.seen.classes(state), values)
     }
 
+    /// At all nodes of a block, of which the first is of this observation; `None` if that is more than a little work. What they
+    /// are beyond the last observation is of no interest.
     #[inline]
-    fn of_all(&self, state: SeenIdx, first: u32) -> Option<[Estimate; BLOCK_LEN]> {
-        let places = self.seen.places(state);
-        self.projected.are_all_in_columns().then(|| self.projected.estimate_chunk(first as usize, places))
+    pub(super) fn of_all(&self, state: SeenIdx, first: u32) -> Option<[Estimate; BLOCK_LEN]> {
+        let classes = self.seen.classes(state);
+        self.projected.are_all_in_columns().then(|| self.projected.estimate_chunk(first as usize, classes))
     }
 }

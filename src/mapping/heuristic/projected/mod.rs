@@ -5,7 +5,7 @@ mod shares;
 mod table;
 
 use std::collections::BinaryHeap;
-use std::ops::{Add, AddAssign};
+use std::ops::AddAssign;
 
 pub(in crate::mapping) use deepening::Deepened;
 pub(in crate::mapping) use table::CHUNK_LEN;
@@ -35,16 +35,6 @@ impl AddAssign for Estimate {
     fn add_assign(&mut self, other: Self) {
         self.distance += other.distance;
         self.cost_to_go += other.cost_to_go;
-    }
-}
-
-impl Add for Estimate {
-    type Output = Self;
-
-    #[inline]
-    fn add(mut self, other: Self) -> Self {
-        self += other;
-        self
     }
 }
 
@@ -176,9 +166,10 @@ impl<'p> Projected<'p> {
         &self.changing
     }
 
-    /// Where the entries of the state with this row are in the table, in each of the [changing columns](Self::changing_columns).
+    /// The classes of the state with this row, by their numbers in the table: one of each of the
+    /// [changing columns](Self::changing_columns).
     #[inline]
-    pub(in crate::mapping) fn places(&self, values: &[u32]) -> impl Iterator<Item = u32> {
+    pub(in crate::mapping) fn classes(&self, values: &[u32]) -> impl Iterator<Item = u32> {
         self.changing.iter().map(|column| column.offset + values[column.position as usize])
     }
 
@@ -188,42 +179,34 @@ impl<'p> Projected<'p> {
         self.joint.is_empty() && self.untabled.is_empty()
     }
 
-    /// What the node of a state costs that the start leads to, whose entries are at [these places](Self::places). `values` gives its
-    /// row.
+    /// What the node of a state costs that the start leads to and that is of [these classes](Self::classes). `values` gives its row.
     #[inline]
     pub(in crate::mapping) fn estimate<'v>(
         &self,
         observation: usize,
-        places: &[u32],
+        classes: &[u32],
         values: impl FnOnce() -> &'v [u32],
     ) -> Estimate {
         let mut sum = self.unchanged[observation];
-        for place in places {
-            sum += self.table.at(*place as usize, observation);
+        for class in classes {
+            sum += self.table.at(*class as usize, observation);
         }
-        if self.are_all_in_columns() { sum } else { sum + self.others(observation, values()) }
+        if !self.are_all_in_columns() {
+            sum += self.others(observation, values());
+        }
+        sum
     }
 
     /// The same for as many observations from `first` on, if they are [all in columns](Self::are_all_in_columns). After the last
     /// observation it is nothing.
     #[inline]
-    pub(in crate::mapping) fn estimate_chunk(&self, first: usize, places: &[u32]) -> [Estimate; CHUNK_LEN] {
+    pub(in crate::mapping) fn estimate_chunk(&self, first: usize, classes: &[u32]) -> [Estimate; CHUNK_LEN] {
         let mut sums = self.unchanged[first..].first_chunk().copied().unwrap_or_default();
-        for place in places {
-            let Some(entries) = self.table.chunk(*place as usize, first) else { continue };
+        for class in classes {
+            let Some(entries) = self.table.chunk(*class as usize, first) else { continue };
             sums.iter_mut().zip(entries).for_each(|(sum, entry)| *sum += *entry);
         }
         sums
-    }
-
-    /// What the node of a state with this row costs.
-    #[cfg(test)]
-    pub(in crate::mapping) fn of(&self, observation: usize, values: &[u32]) -> Estimate {
-        let mut sum = self.others(observation, values);
-        for Column { position, offset, .. } in &self.columns {
-            sum += self.table.at(offset + values[*position] as usize, observation);
-        }
-        sum
     }
 
     /// What is not in the columns.

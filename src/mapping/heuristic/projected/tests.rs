@@ -84,6 +84,16 @@ fn least_costs(problem: &Problem<'_>) -> [Vec<Vec<f64>>; 2] {
     }
 }
 
+/// What a search takes a node to cost, alone and among its neighbours.
+fn estimate_of(projected: &Projected<'_>, i: usize, row: &[u32]) -> Estimate {
+    let classes: Vec<u32> = projected.classes(row).collect();
+    let estimate = projected.estimate(i, &classes, || row);
+    if projected.are_all_in_columns() {
+        assert_eq!(projected.estimate_chunk(i - i % CHUNK_LEN, &classes)[i % CHUNK_LEN], estimate);
+    }
+    estimate
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
 
@@ -127,7 +137,7 @@ proptest! {
                 prop_assert_eq!(projected.deepen(limit, 0, &mut meter), Ok(Deepened::Yes));
             }
             for (number, (i, state)) in reached.iter().copied().enumerate() {
-                let estimate = projected.of(i, problem.model.states().row(state));
+                let estimate = estimate_of(&projected, i, problem.model.states().row(state));
                 prop_assert!((estimate.distance - distance(&problem, i, state)).abs() <= close);
                 let h = estimate.cost_to_go;
                 let through = from_start[i][state as usize] + to_end[i][state as usize];
@@ -135,7 +145,7 @@ proptest! {
                     prop_assert!(h <= to_end[i][state as usize] + close, "admissible at ({i}, {state})");
                 }
                 for (next, to, cost) in moves(&problem, i, state) {
-                    let next_h = projected.of(next, problem.model.states().row(to)).cost_to_go;
+                    let next_h = estimate_of(&projected, next, problem.model.states().row(to)).cost_to_go;
                     prop_assert!(h == f64::INFINITY || h <= cost + next_h + close, "consistent at ({i}, {state})");
                 }
                 if is_deep {
