@@ -6,7 +6,7 @@ mod service;
 
 use reqwest::Method;
 use serde_json::{Value, json};
-use service::{Service, answer, example};
+use service::{Service, answer, example, long_way, to_and_fro};
 
 const BATCH: &str = "/v1/policies:batch";
 
@@ -227,27 +227,8 @@ async fn a_batch_that_is_too_large_is_refused_before_it_is_searched() {
 #[tokio::test]
 async fn a_policy_of_more_steps_than_can_be_stored_is_a_fault_of_its_demonstration() {
     let service = figure_4(&[]).await;
-    // A long way from end to end, of which nothing is observed but the ends.
-    let n = 60;
-    let attribute = |n: usize| json!({"name": format!("{n:0>64}"), "kind": "number", "weight": 1e6});
-    let end = |state: usize| if state == 0 { 1 } else { u32::from(state == n - 1) * 2 };
-    let way = (1..n).flat_map(|state| [json!([state - 1, "on", state]), json!([state, "back", state - 1])]);
-    let wide = json!({
-        "attributes": (0..256).map(attribute).collect::<Vec<_>>(),
-        "actions": [{"name": "on", "cost": 0.3}, {"name": "back", "cost": 0.3}],
-        "dynamics": {
-            "kind": "table",
-            "states": (0..n).map(|state| vec![end(state); 256]).collect::<Vec<_>>(),
-            "transitions": way.collect::<Vec<_>>(),
-            "start": 0,
-        },
-    });
-    assert_eq!(service.put("/v1/models/wide", &wide).await.0, 201);
-    let name = format!("{:0>64}", 0);
-    let item = |n_observations| {
-        let seen = [json!({name.clone(): 1}), json!({}), json!({name.clone(): 2}), json!({})];
-        json!({"demonstration": seen.iter().cycle().take(n_observations).collect::<Vec<_>>()})
-    };
+    assert_eq!(service.put("/v1/models/wide", &long_way()).await.0, 201);
+    let item = |n_observations| json!({"demonstration": to_and_fro(n_observations)});
     let mut request = item(200);
     request["model"] = json!("wide");
     let (status, problem) = service.post("/v1/policies", &request).await;

@@ -16,7 +16,7 @@ use jiff::Timestamp;
 use process::Process;
 use reqwest::{Body, Method};
 use serde_json::{Value, json};
-use service::{Service, example};
+use service::{Service, example, long_way, to_and_fro};
 use tempfile::TempDir;
 use tokio::net::TcpStream;
 use tokio::sync::mpsc;
@@ -988,30 +988,14 @@ impl Wire {
 #[tokio::test]
 async fn a_session_whose_policy_is_too_large_says_so_and_can_still_be_read() {
     let service = Service::start(&[]).await;
-    // A long way from end to end, of which nothing is observed but the ends.
-    let n = 60;
-    let attribute = |n: usize| json!({"name": format!("{n:0>64}"), "kind": "number", "weight": 1e6});
-    let end = |state: usize| if state == 0 { 1 } else { u32::from(state == n - 1) * 2 };
-    let way = (1..n).flat_map(|state| [json!([state - 1, "on", state]), json!([state, "back", state - 1])]);
-    let wide = json!({
-        "attributes": (0..256).map(attribute).collect::<Vec<_>>(),
-        "actions": [{"name": "on", "cost": 0.3}, {"name": "back", "cost": 0.3}],
-        "dynamics": {
-            "kind": "table", "states": (0..n).map(|state| vec![end(state); 256]).collect::<Vec<_>>(),
-            "transitions": way.collect::<Vec<_>>(), "start": 0,
-        },
-    });
-    assert_eq!(service.put("/v1/models/wide", &wide).await.0, 201);
+    assert_eq!(service.put("/v1/models/wide", &long_way()).await.0, 201);
     let stopping = CancellationToken::new();
     let (etude, _directory) = without_service(service, &stopping).await;
     let etude = Arc::new(etude);
     let mut wire = Wire::connect(&etude, &stopping);
     wire.send(json!({"type": "open", "model": "wide", "lookahead": null})).await;
     let session = wire.receive_until("opened").await["session"].take();
-    let name = format!("{:0>64}", 0);
-    let seen = [json!({name.clone(): 1}), json!({}), json!({name.clone(): 2}), json!({})];
-    let states: Vec<&Value> = seen.iter().cycle().take(200).collect();
-    wire.send(json!({"type": "observe", "seq": 0, "states": states})).await;
+    wire.send(json!({"type": "observe", "seq": 0, "states": to_and_fro(200)})).await;
     wire.send(json!({"type": "end", "seq": 200})).await;
     let problem = wire.receive_until("error").await["problem"].take();
     assert_eq!(problem["type"], "/problems/policy-too-large", "{problem}");

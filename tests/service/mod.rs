@@ -9,7 +9,7 @@ use clap::Parser;
 use etude::config::ServeConfig;
 use etude::server::Server;
 use reqwest::{Client, Method, Response};
-use serde_json::Value;
+use serde_json::{Value, json};
 use tempfile::TempDir;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
@@ -117,6 +117,31 @@ pub(crate) async fn answer(response: Response) -> (u16, Value) {
     let status = response.status().as_u16();
     let text = response.text().await.unwrap();
     (status, serde_json::from_str(&text).unwrap_or(Value::String(text)))
+}
+
+/// A model of a long way from end to end, of which nothing is observed but the ends: policies of many large steps.
+pub(crate) fn long_way() -> Value {
+    let n = 60;
+    let attribute = |n: usize| json!({"name": format!("{n:0>64}"), "kind": "number", "weight": 1e6});
+    let end = |state: usize| if state == 0 { 1 } else { u32::from(state == n - 1) * 2 };
+    let way = (1..n).flat_map(|state| [json!([state - 1, "on", state]), json!([state, "back", state - 1])]);
+    json!({
+        "attributes": (0..256).map(attribute).collect::<Vec<_>>(),
+        "actions": [{"name": "on", "cost": 0.3}, {"name": "back", "cost": 0.3}],
+        "dynamics": {
+            "kind": "table",
+            "states": (0..n).map(|state| vec![end(state); 256]).collect::<Vec<_>>(),
+            "transitions": way.collect::<Vec<_>>(),
+            "start": 0,
+        },
+    })
+}
+
+/// So many observations of somebody who goes the [long way](long_way) to and fro, two each.
+pub(crate) fn to_and_fro(n_observations: usize) -> Vec<Value> {
+    let name = format!("{:0>64}", 0);
+    let seen = [json!({&name: 1}), json!({}), json!({&name: 2}), json!({})];
+    seen.into_iter().cycle().take(n_observations).collect()
 }
 
 /// A document of the examples.
