@@ -192,7 +192,7 @@ impl<S: Space> Search<'_, '_, S> {
             }
         }
         let mut bucketed_limit = self.fill_buckets(&mut open.buckets);
-        let mut help_at = self.deepening_at().min(probe_at(probe_width));
+        let mut help_at = self.projected.deepening_due().min(probe_at(probe_width));
         while let Some(Reached { id, g, f }) = open.buckets.pop() {
             // Of a node that was put in more than once, the cheapest way comes out first.
             if self.nodes.is_closed(id) || f >= self.limit {
@@ -204,10 +204,12 @@ impl<S: Space> Search<'_, '_, S> {
             if self.n_expanded < help_at && self.limit >= bucketed_limit / 4.0 {
                 continue;
             }
-            if self.is_deepening_due() && self.deepen(open)? == End::CutShort {
+            let is_deepening_due = self.is_deepening_due();
+            if is_deepening_due && self.deepen(open)? == End::CutShort {
                 return Ok(End::CutShort);
             }
-            if self.n_expanded >= probe_at(probe_width) {
+            let is_probe_due = self.n_expanded >= probe_at(probe_width);
+            if is_probe_due {
                 probe_width *= PROBE_WIDENING;
                 if self.probe(probe_width / PROBE_WIDENING, open)? == End::CutShort {
                     return Ok(End::CutShort);
@@ -215,20 +217,18 @@ impl<S: Space> Search<'_, '_, S> {
             }
             // What a probe found is not in the buckets, and better estimates are for others; and those for a much higher limit
             // are too wide.
-            bucketed_limit = self.fill_buckets(&mut open.buckets);
-            help_at = self.deepening_at().min(probe_at(probe_width));
+            if is_deepening_due || is_probe_due || self.limit < bucketed_limit / 4.0 {
+                bucketed_limit = self.fill_buckets(&mut open.buckets);
+                help_at = self.projected.deepening_due().min(probe_at(probe_width));
+            }
         }
         Ok(End::Done)
     }
 
-    /// After how many expansions better estimates are worth a try. They are for what is cheaper than a known mapping; until there is
-    /// one, a completion may need the estimates of all nodes.
-    fn deepening_at(&self) -> u64 {
-        if self.incumbent.is_some() { self.projected.deepening_due() } else { u64::MAX }
-    }
-
+    /// Whether better estimates are worth a try. They are for what is cheaper than a known mapping; until there is one, a
+    /// completion may need the estimates of all nodes.
     fn is_deepening_due(&self) -> bool {
-        self.n_expanded >= self.deepening_at()
+        self.n_expanded >= self.projected.deepening_due() && self.incumbent.is_some()
     }
 
     /// Has better estimates made, if there are any, and gives them to all nodes.
