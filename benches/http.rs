@@ -1,18 +1,23 @@
-//! Policies through HTTP, beside a bare handler that parses the same body and answers as many bytes, and beside what SQLite can
-//! store of them on the same disk, in one run.
+//! Policies through HTTP, beside a bare handler that parses the same body and answers as many bytes, beside the same handler with
+//! nothing but the search, and the search and the store, in between, and beside what SQLite can store of policies on the same disk,
+//! in one run.
 //!
 //! Every round measures each contender once, so that a machine that slows down slows all of them down; ratios are taken within
 //! a round. Figures are medians over the rounds, and in brackets the least and the most. The service is the program itself, in a
-//! process of its own; the bare handler has a runtime of its own in this one. Clients share the two's cores with them, on one
+//! process of its own; the other handlers have a runtime of their own in this one. Clients share the two's cores with them, on one
 //! thread, and do no more than they must: they send bytes that were prepared before, and count those of the answer.
 
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
+
+#[path = "worlds/mod.rs"]
+mod worlds;
 
 use std::fmt::Write as _;
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use axum::body::Bytes;
@@ -20,11 +25,19 @@ use axum::http::header::CONTENT_TYPE;
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::IntoResponse;
 use axum::routing::post;
+use etude::document::{Faults, Place};
+use etude::interrupt::Uninterrupted;
+use etude::mapping::{Mapper, Problem, Request, Settings};
+use etude::model::{Definition, Limits, Model};
+use etude::store::{NewPolicy, Store};
+use jiff::Timestamp;
 use serde_json::{Value, json};
 use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection, Row};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
+use tokio_util::task::TaskTracker;
+use worlds::World;
 
 type Failure = Box<dyn std::error::Error + Send + Sync>;
 
@@ -43,8 +56,7 @@ const CLIENTS: [usize; 3] = [1, 16, 64];
 const N_BATCH: usize = 1000;
 
 fn main() -> Result<(), Failure> {
-    let model: Value = serde_json::from_str(include_str!("../examples/figure-4/model.json"))?;
-    let demonstration: Value = serde_json::from_str(include_str!("../examples/figure-4/demonstration.json"))?;
+    let World { model, demonstration, .. } = worlds::example("figure-4");
     let request = json!({"model": "figure-4", "demonstration": demonstration}).to_string();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     // The first answer tells how large answers are.
@@ -55,19 +67,31 @@ fn main() -> Result<(), Failure> {
     let n_bytes = policy.len();
     let n_stored = stored.summary.len() + stored.steps.len();
     println!("requests of {} bytes, answers of {n_bytes}, of which {n_stored} are stored", request.len());
-    let bare = bare(n_bytes)?;
+    let bare = handler(n_bytes, async || Ok(Between::Nothing))?;
+    let searching = handler(n_bytes, async || Ok(Between::Search(Searched::read(&model, &request)?)))?;
+    let directory = tempfile::tempdir()?;
+    let storing = handler(n_bytes, async || {
+        let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await?;
+        Ok(Between::SearchAndStore(Searched::read(&model, &request)?, store, stored.clone()))
+    })?;
 
     let mut table = Table::default();
     for _ in 0..N_ROUNDS {
         let service = Service::start(&model, &runtime, 0)?;
         for n_clients in CLIENTS {
             let (bare, _) = runtime.block_on(throughput(bare, &request, n_clients))?;
+            let (searching, _) = runtime.block_on(throughput(searching, &request, n_clients))?;
+            let (storing, _) = runtime.block_on(throughput(storing, &request, n_clients))?;
             let before = service.processor_time()?;
             let (etude, n_answered) = runtime.block_on(throughput(service.address, &request, n_clients))?;
             let processor_time = service.processor_time()?.saturating_sub(before);
             table.note(format!("bare handler, {n_clients} clients"), bare);
             table.note(format!("policies, {n_clients} clients"), etude);
             table.note(format!("  as a part of the bare handler, {n_clients} clients"), etude / bare);
+            table.note(format!("  of the bare handler that searches, {n_clients} clients"), etude / searching);
+            table.note(format!("  of the bare handler that searches and stores, {n_clients} clients"), etude / storing);
+            table.note(format!("  the bare handler that searches, of the bare, {n_clients} clients"), searching / bare);
+            table.note(format!("  and that searches and stores, of the bare, {n_clients} clients"), storing / bare);
             table.note(
                 format!("  processor time of each, us, {n_clients} clients"),
                 1e6 / rate(n_answered, processor_time),
@@ -118,14 +142,69 @@ fn rate(count: usize, elapsed: Duration) -> f64 {
     count as f64 / elapsed.as_secs_f64()
 }
 
-/// A handler that parses its body and answers `n_bytes`, on a runtime that lasts as long as the process.
-fn bare(n_bytes: usize) -> Result<SocketAddr, Failure> {
+/// What a handler does between parsing its body and answering.
+enum Between {
+    /// Nothing.
+    Nothing,
+    /// It searches for the policy.
+    Search(Searched),
+    /// It searches for the policy, and has as many bytes of it stored as the service has, durably.
+    SearchAndStore(Searched, Store, StoredPolicy),
+}
+
+/// A problem that is read already, and what searches it.
+struct Searched {
+    mapper: &'static Mapper,
+    problem: Problem<'static>,
+}
+
+impl Searched {
+    /// The problem of a request, of which the body is given.
+    fn read(model: &Value, request: &str) -> Result<Self, Failure> {
+        let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).map_err(|_| "no model")?;
+        let model =
+            Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).map_err(|_| "too large a model")?;
+        let mapper = Mapper::new(model, &mut Uninterrupted).map_err(|_| "interrupted")?;
+        // Lasts as long as the handler, which lasts as long as the process.
+        let mapper: &'static Mapper = Box::leak(Box::new(mapper));
+        let request = serde_json::from_str(request)?;
+        let mut faults = Faults::default();
+        let object = Place::root(&request).object(&Request::FIELDS, &mut faults);
+        let read = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
+        Ok(Self { mapper, problem: read.ok_or("no request")?.problem })
+    }
+
+    fn search(&self) -> bool {
+        self.mapper.map(&self.problem, Settings::default(), &mut Uninterrupted).is_ok()
+    }
+}
+
+impl Between {
+    /// Whether it was done.
+    async fn run(&self) -> bool {
+        match self {
+            Self::Nothing => true,
+            Self::Search(searched) => searched.search(),
+            Self::SearchAndStore(searched, store, StoredPolicy { summary, steps }) => {
+                let (id, created_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
+                let policy = NewPolicy { id, summary: summary.clone(), steps: steps.clone(), created_at };
+                searched.search() && store.add_policies(vec![policy], Vec::new()).await.is_ok()
+            }
+        }
+    }
+}
+
+/// A handler that parses its body, does what is to be done `between`, and answers `n_bytes`, on a runtime that lasts as long as the
+/// process.
+fn handler(n_bytes: usize, between: impl AsyncFnOnce() -> Result<Between, Failure>) -> Result<SocketAddr, Failure> {
+    let runtime = tokio::runtime::Runtime::new()?;
+    let between = Arc::new(runtime.block_on(between())?);
     let answer = Bytes::from("x".repeat(n_bytes));
     let handler = move |body: Bytes| {
-        let answer = answer.clone();
+        let (answer, between) = (answer.clone(), Arc::clone(&between));
         async move {
             let parsed = serde_json::from_slice::<Value>(&body);
-            if parsed.is_ok_and(|parsed| parsed["demonstration"].is_array()) {
+            if parsed.is_ok_and(|parsed| parsed["demonstration"].is_array()) && between.run().await {
                 let content_type = HeaderValue::from_static("application/json");
                 (StatusCode::CREATED, [(CONTENT_TYPE, content_type)], answer).into_response()
             } else {
@@ -133,7 +212,6 @@ fn bare(n_bytes: usize) -> Result<SocketAddr, Failure> {
             }
         }
     };
-    let runtime = tokio::runtime::Runtime::new()?;
     let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0"))?;
     let address = listener.local_addr()?;
     runtime.spawn(async move {
@@ -221,7 +299,7 @@ fn http_to(path: &str, body: &str) -> Vec<u8> {
 
 /// Answers a second to `n_clients`, and how many there were, those before and after what was measured included.
 async fn throughput(address: SocketAddr, body: &str, n_clients: usize) -> Result<(f64, usize), Failure> {
-    let request: std::sync::Arc<[u8]> = http(body).into();
+    let request: Arc<[u8]> = http(body).into();
     let mut clients = Vec::with_capacity(n_clients);
     for _ in 0..n_clients {
         clients.push(Client::connect(address).await?);
@@ -229,7 +307,7 @@ async fn throughput(address: SocketAddr, body: &str, n_clients: usize) -> Result
     let from = Instant::now() + WARM_UP;
     let until = from + WINDOW;
     let tasks = clients.into_iter().map(|mut client| {
-        let request = std::sync::Arc::clone(&request);
+        let request = Arc::clone(&request);
         tokio::spawn(async move {
             let (mut n_measured, mut n_answered) = (0, 0);
             loop {
@@ -255,14 +333,14 @@ async fn throughput(address: SocketAddr, body: &str, n_clients: usize) -> Result
 /// Policies a second, asked for one by one by as many clients as keep the service busy.
 async fn singles(address: SocketAddr, body: &str) -> Result<f64, Failure> {
     const N_CLIENTS: usize = 16;
-    let request: std::sync::Arc<[u8]> = http(body).into();
+    let request: Arc<[u8]> = http(body).into();
     let mut clients = Vec::with_capacity(N_CLIENTS);
     for _ in 0..N_CLIENTS {
         clients.push(Client::connect(address).await?);
     }
     let started = Instant::now();
     let tasks = clients.into_iter().enumerate().map(|(n, mut client)| {
-        let request = std::sync::Arc::clone(&request);
+        let request = Arc::clone(&request);
         tokio::spawn(async move {
             for _ in (n..N_BATCH).step_by(N_CLIENTS) {
                 client.round_trip(&request).await?;
@@ -319,6 +397,7 @@ async fn inserts(stored: &StoredPolicy, n_rows: usize) -> Result<f64, Failure> {
 }
 
 /// What the service stores of a policy.
+#[derive(Clone)]
 struct StoredPolicy {
     summary: String,
     steps: Vec<u8>,
