@@ -9,7 +9,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
-use super::Context;
+use super::SharedContext;
 use super::body::{json, read_json};
 use super::paging::{List, Paging};
 use super::path::PathName;
@@ -114,7 +114,7 @@ impl From<WeightsAnswer> for WeightsBody {
     ),
 )]
 pub(super) async fn put_learner(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathName(name): PathName,
     request: Request,
 ) -> Result<Response, Problem> {
@@ -137,7 +137,10 @@ pub(super) async fn put_learner(
         (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn get_learner(State(context): State<Context>, PathName(name): PathName) -> Result<Response, Problem> {
+pub(super) async fn get_learner(
+    State(context): State<SharedContext>,
+    PathName(name): PathName,
+) -> Result<Response, Problem> {
     Ok(json(StatusCode::OK, &LearnerBody::from(context.etude.learner(&name).await?)))
 }
 
@@ -150,7 +153,7 @@ pub(super) async fn get_learner(State(context): State<Context>, PathName(name): 
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn list_learners(State(context): State<Context>, paging: Paging) -> Result<Response, Problem> {
+pub(super) async fn list_learners(State(context): State<SharedContext>, paging: Paging) -> Result<Response, Problem> {
     let page = context.etude.learners(paging.after.as_deref(), paging.limit).await?;
     Ok(json(StatusCode::OK, &List::of(page, LearnerBody::from)))
 }
@@ -167,7 +170,7 @@ pub(super) async fn list_learners(State(context): State<Context>, paging: Paging
     ),
 )]
 pub(super) async fn delete_learner(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathName(name): PathName,
 ) -> Result<StatusCode, Problem> {
     context.etude.delete_learner(&name).await?;
@@ -219,7 +222,7 @@ impl<S: Send + Sync> FromRequestParts<S> for WhichWeights {
     ),
 )]
 pub(super) async fn get_weights(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathName(name): PathName,
     which: WhichWeights,
     headers: HeaderMap,
@@ -257,7 +260,7 @@ fn with_tag(mut response: Response, tag: &str) -> Response {
     ),
 )]
 pub(super) async fn list_weights(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathName(name): PathName,
     paging: Paging,
 ) -> Result<Response, Problem> {
@@ -277,7 +280,7 @@ pub(super) async fn list_weights(
         (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn learn(State(context): State<Context>, PathName(name): PathName) -> Result<Response, Problem> {
+pub(super) async fn learn(State(context): State<SharedContext>, PathName(name): PathName) -> Result<Response, Problem> {
     let answer = context.etude.learn(name.as_str(), Timestamp::now()).await?;
     let tag = format!("\"{}\"", answer.version);
     Ok(with_tag(json(StatusCode::OK, &WeightsBody::from(answer)), &tag))

@@ -41,7 +41,6 @@ pub use connections::serve;
 use problem::{Problem, ProblemKind};
 
 /// What handlers work with.
-#[derive(Clone)]
 pub struct Context {
     /// The application.
     pub etude: Arc<Etude>,
@@ -64,6 +63,9 @@ pub struct Context {
     /// Whatever else runs.
     pub tasks: TaskTracker,
 }
+
+/// The context, which handlers are given each their own of: one count, not one for each part.
+type SharedContext = Arc<Context>;
 
 impl Context {
     /// A place for one more stream, until it is dropped.
@@ -98,7 +100,7 @@ impl Context {
 )]
 struct Description;
 
-fn routes() -> OpenApiRouter<Context> {
+fn routes() -> OpenApiRouter<SharedContext> {
     let mut description = Description::openapi();
     // Taken from Cargo.toml, which names none.
     description.info.license = None;
@@ -163,5 +165,5 @@ pub fn router(context: Context) -> Router {
             )
         })
         .layer(middleware::from_fn(observe::observe))
-        .with_state(context)
+        .with_state(Arc::new(context))
 }

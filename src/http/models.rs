@@ -13,7 +13,7 @@ use serde::Serialize;
 use serde_json::value::RawValue;
 use utoipa::ToSchema;
 
-use super::Context;
+use super::SharedContext;
 use super::body::{Pump, SentLimit, SentModel, json, json_stream, read_model};
 use super::encoding::DecodedLimit;
 use super::paging::{List, Paging};
@@ -121,7 +121,7 @@ struct WholeModelBody {
     ),
 )]
 pub(super) async fn put_model(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathName(name): PathName,
     request: Request,
 ) -> Result<Response, Problem> {
@@ -151,12 +151,15 @@ pub(super) async fn put_model(
         (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn get_model(State(context): State<Context>, PathName(name): PathName) -> Result<Response, Problem> {
+pub(super) async fn get_model(
+    State(context): State<SharedContext>,
+    PathName(name): PathName,
+) -> Result<Response, Problem> {
     let ModelAnswer { summary, definition } = context.etude.model(&name).await?;
     let summary = summary.into();
     match definition {
         ModelDefinition::Text(definition) => Ok(json(StatusCode::OK, &WholeModelBody { summary, definition })),
-        ModelDefinition::Pieces(id) => Ok(json_stream(whole_model(context.etude, &summary, id)?)),
+        ModelDefinition::Pieces(id) => Ok(json_stream(whole_model(Arc::clone(&context.etude), &summary, id)?)),
     }
 }
 
@@ -186,7 +189,7 @@ fn whole_model(
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn list_models(State(context): State<Context>, paging: Paging) -> Result<Response, Problem> {
+pub(super) async fn list_models(State(context): State<SharedContext>, paging: Paging) -> Result<Response, Problem> {
     let page = context.etude.models(paging.after.as_deref(), paging.limit).await?;
     Ok(json(StatusCode::OK, &List::of(page, ModelBody::from)))
 }
@@ -203,7 +206,7 @@ pub(super) async fn list_models(State(context): State<Context>, paging: Paging) 
     ),
 )]
 pub(super) async fn delete_model(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathName(name): PathName,
 ) -> Result<StatusCode, Problem> {
     context.etude.delete_model(&name).await?;

@@ -8,7 +8,7 @@ use axum::http::header::CONTENT_TYPE;
 use axum::response::IntoResponse;
 use utoipa_swagger_ui::{Config, SwaggerUi};
 
-use super::Context;
+use super::SharedContext;
 use super::problem::{Problem, ProblemKind};
 
 /// Whether the process is alive.
@@ -28,7 +28,7 @@ pub(super) async fn livez() -> &'static str {
         (status = 503, description = "`not-ready`: the database does not answer, or nothing can be written to it; `stopping`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn readyz(State(context): State<Context>) -> Result<&'static str, Problem> {
+pub(super) async fn readyz(State(context): State<SharedContext>) -> Result<&'static str, Problem> {
     if context.stopping.is_cancelled() {
         return Err(Problem::new(ProblemKind::Stopping, "the service is shutting down"));
     }
@@ -44,7 +44,7 @@ pub(super) async fn readyz(State(context): State<Context>) -> Result<&'static st
     get, path = "/metrics", tag = "operation",
     responses((status = 200, description = "The measurements", body = String, content_type = "text/plain")),
 )]
-pub(super) async fn metrics(State(context): State<Context>) -> impl IntoResponse {
+pub(super) async fn metrics(State(context): State<SharedContext>) -> impl IntoResponse {
     #[expect(clippy::cast_precision_loss, reason = "there are few jobs")]
     metrics::gauge!("etude_search_jobs").set(context.etude.pool().n_jobs() as f64);
     ([(CONTENT_TYPE, "text/plain; version=0.0.4")], context.metrics.render())
@@ -61,7 +61,7 @@ pub(super) async fn openapi_yaml() -> impl IntoResponse {
 }
 
 /// The description as a page to read and to try things in, from files that are part of the program.
-pub(super) fn docs() -> Router<Context> {
+pub(super) fn docs() -> Router<SharedContext> {
     // The validator would send the description to a service outside.
     let config = Config::from("/openapi.yaml").validator_url("none").try_it_out_enabled(true);
     SwaggerUi::new("/docs").config(config).into()

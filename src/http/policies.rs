@@ -11,7 +11,7 @@ use jiff::Timestamp;
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::Context;
+use super::SharedContext;
 use super::body::{json, json_text, read_json};
 use super::observe::RequestId;
 use super::paging::{List, Paging, after_sequence};
@@ -36,7 +36,7 @@ use crate::service::{BatchRequest, ServiceError};
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn make_policy(State(context): State<Context>, request: Request) -> Result<Response, Problem> {
+pub(super) async fn make_policy(State(context): State<SharedContext>, request: Request) -> Result<Response, Problem> {
     let arrived = Instant::now();
     let body = read_json(request, &context).await?;
     let made = context.etude.make_policy(body, arrived, Timestamp::now()).await?;
@@ -68,7 +68,7 @@ pub(super) async fn make_policy(State(context): State<Context>, request: Request
     ),
 )]
 pub(super) async fn make_policies(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     Extension(id): Extension<RequestId>,
     request: Request,
 ) -> Result<Response, Problem> {
@@ -101,7 +101,7 @@ pub(super) async fn make_policies(
         (status = 404, description = "`unknown-policy`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn get_policy(State(context): State<Context>, PathId(id): PathId) -> Result<Response, Problem> {
+pub(super) async fn get_policy(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
     Ok(json_text(StatusCode::OK, context.etude.policy(&id).await?))
 }
 
@@ -114,7 +114,7 @@ pub(super) async fn get_policy(State(context): State<Context>, PathId(id): PathI
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn list_policies(State(context): State<Context>, paging: Paging) -> Result<Response, Problem> {
+pub(super) async fn list_policies(State(context): State<SharedContext>, paging: Paging) -> Result<Response, Problem> {
     let page = context.etude.policies(after_sequence(&paging)?, paging.limit).await?;
     Ok(json(StatusCode::OK, &List::of(page, |policy| policy)))
 }

@@ -20,7 +20,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::Instrument;
 use utoipa::ToSchema;
 
-use super::Context;
+use super::SharedContext;
 use super::body::json;
 use super::encoding::Encoding;
 use super::paging::{List, Paging, after_sequence};
@@ -55,7 +55,7 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
     ),
 )]
 pub(super) async fn websocket(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
     let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::UpgradeRequired, rejection.body_text()))?;
@@ -76,7 +76,7 @@ pub(super) async fn websocket(
     }))
 }
 
-async fn serve_websocket(context: Context, socket: WebSocket, place: OwnedSemaphorePermit) {
+async fn serve_websocket(context: SharedContext, socket: WebSocket, place: OwnedSemaphorePermit) {
     let (sink, source) = socket.split();
     let (came, mut incoming) = mpsc::channel(MAX_WAITING);
     let (outgoing, goes) = mpsc::channel(MAX_WAITING);
@@ -193,7 +193,7 @@ async fn write_frames(sink: &mut SplitSink<WebSocket, Message>, goes: &mut mpsc:
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn ndjson(State(context): State<Context>, request: Request) -> Result<Response, Problem> {
+pub(super) async fn ndjson(State(context): State<SharedContext>, request: Request) -> Result<Response, Problem> {
     // A decoder gives what it has when it likes, and each would keep a window of megabytes for as long as its stream runs.
     if Encoding::declared(request.headers()) != Ok(Encoding::Identity) {
         let detail = "the frames of a stream are sent as they are, without `Content-Encoding`";
@@ -354,7 +354,7 @@ impl From<SessionRow> for SessionBody {
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn list_sessions(State(context): State<Context>, paging: Paging) -> Result<Response, Problem> {
+pub(super) async fn list_sessions(State(context): State<SharedContext>, paging: Paging) -> Result<Response, Problem> {
     let page = context.etude.sessions(after_sequence(&paging)?, paging.limit).await?;
     Ok(json(StatusCode::OK, &List::of(page, SessionBody::from)))
 }
@@ -368,6 +368,6 @@ pub(super) async fn list_sessions(State(context): State<Context>, paging: Paging
         (status = 404, description = "`unknown-session`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn get_session(State(context): State<Context>, PathId(id): PathId) -> Result<Response, Problem> {
+pub(super) async fn get_session(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
     Ok(json(StatusCode::OK, &SessionBody::from(context.etude.session(&id).await?)))
 }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::value::RawValue;
 use utoipa::{IntoParams, ToSchema};
 
-use super::Context;
+use super::SharedContext;
 use super::body::{json, read_json, read_small_json};
 use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
@@ -137,7 +137,7 @@ pub(super) struct FailureBody {
     ),
 )]
 pub(super) async fn make_trial(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathName(name): PathName,
     request: Request,
 ) -> Result<Response, Problem> {
@@ -192,7 +192,7 @@ impl<S: Send + Sync> FromRequestParts<S> for TrialsQuery {
     ),
 )]
 pub(super) async fn list_trials(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathName(name): PathName,
     TrialsQuery(which, paging): TrialsQuery,
 ) -> Result<Response, Problem> {
@@ -210,7 +210,7 @@ pub(super) async fn list_trials(
         (status = 404, description = "`unknown-trial`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn get_trial(State(context): State<Context>, PathId(id): PathId) -> Result<Response, Problem> {
+pub(super) async fn get_trial(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
     let trial = context.etude.trial(&id, Timestamp::now()).await?;
     Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
 }
@@ -233,7 +233,7 @@ pub(super) async fn get_trial(State(context): State<Context>, PathId(id): PathId
     ),
 )]
 pub(super) async fn put_reward(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathId(id): PathId,
     request: Request,
 ) -> Result<Response, Problem> {
@@ -260,7 +260,7 @@ pub(super) async fn put_reward(
     ),
 )]
 pub(super) async fn fail_trial(
-    State(context): State<Context>,
+    State(context): State<SharedContext>,
     PathId(id): PathId,
     request: Request,
 ) -> Result<Response, Problem> {
