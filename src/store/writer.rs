@@ -1,15 +1,15 @@
 //! The one writer, which groups commits.
 //!
-//! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies
-//! it in one transaction, and answers all of it after the commit. Under load the groups grow by themselves. Observations,
-//! which are most of it, only arrive with a commit, and are settled in their table later (`arrivals`). A group of nothing but
-//! observations, or nothing but policies, takes a single statement, as each costs the driver a change of threads.
+//! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies it in one
+//! transaction, and answers all of it after the commit. Before it takes it, it lets everybody go on who is ready to and may bring it
+//! more: so groups grow with the load, and nobody waits for a clock. Observations, which are most of it, only arrive with a commit,
+//! and are settled in their table later (`arrivals`). A group of nothing but observations, or nothing but policies, takes a single
+//! statement, as each costs the driver a change of threads.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use sqlx::{Connection, SqliteConnection};
-use tokio::runtime::Handle;
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -121,9 +121,7 @@ impl Writer {
         let closing = CancellationToken::new();
         let models_generation = Arc::new(AtomicU64::new(0));
         let running = run(connection, jobs, closing.clone(), Arc::clone(&models_generation));
-        // A thread of its own: whatever keeps the others busy, no commit waits for it between two statements.
-        let runtime = Handle::current();
-        tasks.spawn_blocking(move || runtime.block_on(running));
+        tasks.spawn(running);
         Self { queue, closing, models_generation }
     }
 
@@ -168,6 +166,8 @@ async fn run(
     let mut group = Vec::with_capacity(MAX_GROUP);
     let mut arrivals = Arrivals::default();
     loop {
+        // Whoever is ready to go on may have something for this group too.
+        tokio::task::yield_now().await;
         tokio::select! {
             n_jobs = jobs.recv_many(&mut group, MAX_GROUP) => if n_jobs == 0 { break },
             () = closing.cancelled(), if !jobs.is_closed() => {
