@@ -223,7 +223,7 @@ impl Policy {
     /// [`TooManySteps`] if it would be too large to be written and stored.
     pub fn check_steps(model: &Model, mapping: &Mapping) -> Result<(), TooManySteps> {
         let n_steps = mapping.moves.len();
-        let n_bytes = n_steps.saturating_mul(STEP_BYTES.saturating_add(state_bytes(model)));
+        let n_bytes = n_steps.saturating_mul(STEP_BYTES.saturating_add(model.state_bytes()));
         if n_bytes > MAX_STEPS_BYTES { Err(TooManySteps { n_steps, n_bytes }) } else { Ok(()) }
     }
 
@@ -231,7 +231,7 @@ impl Policy {
     /// whether it would not.
     /// What is estimated is what a step says of the imitator's state.
     pub(crate) fn check_size(model: &Model, n_observations: usize, place: &Place<'_, '_>, faults: &mut Faults) -> bool {
-        let n_bytes = n_observations.saturating_mul(state_bytes(model));
+        let n_bytes = n_observations.saturating_mul(model.state_bytes());
         if n_bytes > MAX_STATES_BYTES {
             let detail = format!(
                 "the states of a policy of {n_observations} observations would take about {} MB, and {} MB is the most: \
@@ -275,11 +275,6 @@ impl Policy {
             refined_by: None,
         }
     }
-}
-
-/// About how many bytes of JSON a state is.
-fn state_bytes(model: &Model) -> usize {
-    serde_json::to_string(&model.describe(0)).map_or(0, |text| text.len())
 }
 
 fn steps(problem: &Problem<'_>, mapping: &Mapping) -> Vec<Step> {

@@ -24,7 +24,7 @@ mod states;
 mod table;
 mod wumpus;
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 pub use action::{Action, ActionDocument, ActionIdx};
 pub(crate) use definition::hex;
@@ -115,6 +115,8 @@ pub struct Model {
     n_unsafe: usize,
     /// The world, if its states are not known.
     unexplored: Option<Cave>,
+    /// See [`Self::state_bytes`].
+    state_bytes: OnceLock<usize>,
 }
 
 impl Model {
@@ -203,6 +205,12 @@ impl Model {
         let written =
             self.schema.attributes().iter().zip(values).map(|(attribute, value)| attribute.write_value(value));
         self.schema.by_attribute(written)
+    }
+
+    /// About how many bytes of JSON the values of a state are: as many as those of the first one. `O(1)`, once it is known.
+    pub(crate) fn state_bytes(&self) -> usize {
+        let first = || serde_json::to_string(&self.describe(0)).map_or(usize::MAX, |text| text.len());
+        *self.state_bytes.get_or_init(first)
     }
 
     /// Approximate size in memory, in bytes.

@@ -295,12 +295,11 @@ const MAX_INLINE_WORK: usize = 16_384;
 /// searched lazily, nobody knows the size.
 fn is_quick(model: &Model, document: &Value, n_observations: usize) -> bool {
     let size = model.graph().n_states() + model.graph().n_transitions();
-    let step_bytes = || serde_json::to_string(&model.describe(0)).map_or(usize::MAX, |text| text.len());
     !model.is_lazy()
         && document["lookahead"].is_null()
         && document["heuristic"] != "paper"
         && n_observations.saturating_mul(size) <= MAX_INLINE_WORK
-        && n_observations.saturating_mul(step_bytes()) <= MAX_INLINE_BYTES
+        && n_observations.saturating_mul(model.state_bytes()) <= MAX_INLINE_BYTES
 }
 
 /// Where a request's demonstration is.

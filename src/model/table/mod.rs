@@ -3,7 +3,7 @@
 mod document;
 mod reading;
 
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 pub use document::{ActionReference, StartDocument, TableDocument, TransitionDocument};
 pub(super) use reading::read;
@@ -71,6 +71,7 @@ impl Table {
             n_unsafe: self.unsafe_states.len(),
             is_unsafe,
             unexplored: None,
+            state_bytes: OnceLock::new(),
         }
     }
 

@@ -10,7 +10,7 @@
 mod reading;
 
 use std::ops::Range;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -324,6 +324,7 @@ impl Cave {
             is_unsafe: Vec::new(),
             n_unsafe: 0,
             unexplored,
+            state_bytes: OnceLock::new(),
         }
     }
 
