@@ -3,9 +3,8 @@
 use std::fmt;
 
 use serde::de::{DeserializeSeed, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
-use serde_json::Value as Json;
 
-use crate::attribute::{Schema, Value};
+use crate::attribute::{Observed, Schema, Value};
 use crate::document::{Faults, Place};
 
 /// The observed states `o_0 .. o_n` of a demonstration, at least one. Nothing is known of the demonstrator's actions.
@@ -41,7 +40,7 @@ impl Demonstration {
     #[must_use]
     pub fn read_well_formed(schema: &Schema, text: &str) -> Option<Self> {
         let mut deserializer = serde_json::Deserializer::from_str(text);
-        let values = Observations(schema).deserialize(&mut deserializer).ok()?;
+        let values = Observations { schema, n_bytes: text.len() }.deserialize(&mut deserializer).ok()?;
         deserializer.end().ok()?;
         let n_observations = values.len() / schema.len();
         (1..=Self::MAX_OBSERVATIONS).contains(&n_observations).then_some(Self { values, n_attributes: schema.len() })
@@ -74,8 +73,11 @@ impl Demonstration {
     }
 }
 
-/// Reads observations, one after the other.
-struct Observations<'s>(&'s Schema);
+/// Reads observations, one after the other, from a text of `n_bytes`.
+struct Observations<'s> {
+    schema: &'s Schema,
+    n_bytes: usize,
+}
 
 impl<'de> DeserializeSeed<'de> for Observations<'_> {
     type Value = Vec<Option<Value>>;
@@ -93,8 +95,10 @@ impl<'de> Visitor<'de> for Observations<'_> {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Self::Value, A::Error> {
-        let mut values = Vec::new();
-        while items.next_element_seed(OneObservation { schema: self.0, values: &mut values })?.is_some() {}
+        /// About what a value takes, with the name of its attribute.
+        const VALUE_BYTES: usize = 12;
+        let mut values = Vec::with_capacity(self.n_bytes / VALUE_BYTES);
+        while items.next_element_seed(OneObservation { schema: self.schema, values: &mut values })?.is_some() {}
         Ok(values)
     }
 }
@@ -103,17 +107,6 @@ impl<'de> Visitor<'de> for Observations<'_> {
 struct OneObservation<'s, 'v> {
     schema: &'s Schema,
     values: &'v mut Vec<Option<Value>>,
-}
-
-impl OneObservation<'_, '_> {
-    /// The value of the attribute at `position`; nothing if it was not observed.
-    fn value<E: serde::de::Error>(&self, position: usize, value: &Json) -> Result<Option<Value>, E> {
-        if value.is_null() {
-            return Ok(None);
-        }
-        let read = self.schema.attributes()[position].read_value(&Place::root(value), &mut Faults::default());
-        read.map(Some).ok_or_else(|| E::custom("not a value of the attribute"))
-    }
 }
 
 impl<'de> DeserializeSeed<'de> for OneObservation<'_, '_> {
@@ -132,10 +125,9 @@ impl<'de> Visitor<'de> for OneObservation<'_, '_> {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
-        for position in 0..self.schema.len() {
-            let value: Json = items.next_element()?.ok_or_else(|| A::Error::custom("too few values"))?;
-            let value = self.value(position, &value)?;
-            self.values.push(value);
+        for attribute in self.schema.attributes() {
+            let value = items.next_element_seed(Observed(attribute))?;
+            self.values.push(value.ok_or_else(|| A::Error::custom("too few values"))?);
         }
         // One too many is an error of the deserializer.
         Ok(())
@@ -147,8 +139,8 @@ impl<'de> Visitor<'de> for OneObservation<'_, '_> {
         // Most name the attributes in their order.
         let mut expected = 0;
         while let Some(position) = members.next_key_seed(Name { schema: self.schema, expected })? {
-            let value: Json = members.next_value()?;
-            self.values[first + position] = self.value(position, &value)?;
+            let attribute = &self.schema.attributes()[position];
+            self.values[first + position] = members.next_value_seed(Observed(attribute))?;
             expected = position + 1;
         }
         Ok(())
@@ -188,39 +180,97 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
-    use crate::attribute::{Attribute, Kind};
+    use crate::attribute::{Attribute, Cycle, Kind, Labels};
     use crate::document;
 
     fn schema() -> Schema {
         let attribute = |name: &str, kind| Attribute { name: name.to_owned(), kind, weight: 1.0 };
-        let number = || Kind::Number { scale: 1.0 };
-        Schema::new(vec![attribute("x", number()), attribute("y", number()), attribute("door", Kind::Category)])
+        let cyclic = |cycle| Kind::Cyclic { scale: 1.0, cycle };
+        Schema::new(vec![
+            attribute("x", Kind::Number { scale: 1.0 }),
+            attribute("angle", cyclic(Cycle::Period(360.0))),
+            attribute("heading", cyclic(Cycle::Labels(Labels::of(["east", "north", "tr\u{e4}ge"])))),
+            attribute("door", Kind::Category),
+        ])
+    }
+
+    /// A value that some attribute may have, and others may not.
+    fn value() -> impl Strategy<Value = String> {
+        const NUMBERS: [&str; 22] = [
+            "0",
+            "-0",
+            "-0.0",
+            "7",
+            "-7",
+            "7.0",
+            "2.5e-3",
+            "1e2",
+            "1e-999",
+            "4.9e-324",
+            "1.7976931348623157e308",
+            "0.1",
+            "9007199254740993",
+            "-9007199254740993",
+            "9223372036854775807",
+            "9223372036854775808",
+            "-9223372036854775808",
+            "-9223372036854775809",
+            "18446744073709551615",
+            "18446744073709551616",
+            "123456789012345678901234567890",
+            "0.30000000000000004440892098500626",
+        ];
+        const TEXTS: [&str; 8] =
+            ["east", "\\u0065ast", "tr\u{e4}ge", "tr\\u00e4ge", "North", "", "\\ud83d\\ude00", "a\\nb"];
+        const WRONG: [&str; 8] = ["1e999", "01", "[1]", "{}", "[[]]", "\"\\ud800\"", "tru", "\"\n\""];
+        prop_oneof![
+            20 => proptest::sample::select(&NUMBERS[..]).prop_map(str::to_owned),
+            10 => any::<f64>().prop_map(|number| serde_json::Value::from(number).to_string()),
+            10 => any::<i64>().prop_map(|number| number.to_string()),
+            20 => proptest::sample::select(&TEXTS[..]).prop_map(|text| format!("\"{text}\"")),
+            10 => any::<bool>().prop_map(|flag| flag.to_string()),
+            10 => Just("null".to_owned()),
+            2 => (1023_usize..1027).prop_map(|n| format!("\"{}\"", "x".repeat(n))),
+            1 => proptest::sample::select(&WRONG[..]).prop_map(str::to_owned),
+        ]
+    }
+
+    /// Values that the attributes of [`schema`] may have, in their order.
+    fn fitting() -> impl Strategy<Value = Vec<String>> {
+        let number =
+            || proptest::sample::select(vec!["1", "-0.0", "-0", "2.5", "9007199254740993", "18446744073709551615"]);
+        let heading = proptest::sample::select(vec!["\"east\"", "\"\\u006eorth\"", "null"]);
+        let door = proptest::sample::select(vec!["\"open\"", "true", "7", "-9223372036854775808", "null"]);
+        (number(), number(), heading, door)
+            .prop_map(|(x, angle, heading, door)| [x, angle, heading, door].map(str::to_owned).into())
     }
 
     /// An observation, which names no attribute twice; now and then with something wrong.
     fn observation() -> impl Strategy<Value = String> {
-        let member = |fine: &'static [&'static str], wrong: &'static [&'static str]| {
+        const NAMES: [&str; 4] = [r#""x":"#, r#""\u0061ngle" : "#, r#""heading": "#, r#""door" :"#];
+        let values = || {
             prop_oneof![
-                20 => proptest::sample::select(fine).prop_map(Some),
-                20 => Just(None),
-                1 => proptest::sample::select(wrong).prop_map(Some),
+                12 => fitting(),
+                1 => (fitting(), 0_usize..4, value()).prop_map(|(mut values, at, other)| {
+                    values[at] = other;
+                    values
+                }),
             ]
         };
-        let x = member(&[r#""x":1"#, r#""x":null"#, r#""\u0078" : 3"#], &[r#""x":"a""#, r#""z":1"#, r#""x":1e999"#]);
-        let y = member(&[r#""y":-0.0"#, r#""y":2.5e-3"#], &[r#""y":[[]]"#, r#""y""#, r#""y":01"#]);
-        let door =
-            member(&[r#""door":"open""#, r#""door":true"#, r#""door":7"#], &[r#""door":1.5"#, r#""door":"\ud800""#]);
-        let members = (x, y, door, any::<bool>()).prop_map(|(x, y, door, is_reversed)| {
-            let mut members: Vec<_> = [x, y, door].into_iter().flatten().collect();
+        let members = (values(), any::<[bool; 4]>(), any::<bool>()).prop_map(|(values, is_there, is_reversed)| {
+            let members = NAMES.iter().zip(values).zip(is_there).filter(|(_, is_there)| *is_there);
+            let mut members: Vec<_> = members.map(|((name, value), _)| format!("{name}{value}")).collect();
             if is_reversed {
                 members.reverse();
             }
             format!("{{{}}}", members.join(", "))
         });
+        let wrong =
+            ["[1,2]", "[1,2,null,4,5]", "[1,2,3,4]", "7", "{},", r#"{"z":1}"#, r#"{"x"}"#, r#"{"x":1,}"#, "[1,,1]"];
         prop_oneof![
             10 => members,
-            4 => proptest::sample::select(vec!["[1,2.5,null]", "[null, 18446744073709551615,\"a\"]"]).prop_map(str::to_owned),
-            1 => proptest::sample::select(vec!["[1,2]", "[1,2,3,4]", "[1,\"a\",3]", "7", "{},"]).prop_map(str::to_owned),
+            10 => values().prop_map(|values| format!("[{}]", values.join(", "))),
+            1 => proptest::sample::select(wrong.to_vec()).prop_map(str::to_owned),
         ]
     }
 
@@ -240,13 +290,29 @@ mod tests {
                 let read = Demonstration::read(&schema, &Place::root(document), &mut faults);
                 read.filter(|_| faults.is_empty())
             });
-            prop_assert_eq!(Demonstration::read_well_formed(&schema, &text), read, "{}", text);
+            let well_formed = Demonstration::read_well_formed(&schema, &text);
+            // Written out, 0 and -0 differ.
+            prop_assert_eq!(format!("{well_formed:?}"), format!("{read:?}"), "{}", text);
+        }
+
+        #[test]
+        fn a_value_is_read_alike_whichever_attribute_it_is_of(value in value(), position in 0_usize..4) {
+            let mut values = ["null"; 4];
+            values[position] = &value;
+            let text = format!("[[{}]]", values.join(","));
+            let document = document::parse(text.as_bytes());
+            let mut faults = Faults::default();
+            let read = document.as_ref().ok().and_then(|document| {
+                Demonstration::read(&schema(), &Place::root(document), &mut faults)
+            });
+            let well_formed = Demonstration::read_well_formed(&schema(), &text);
+            prop_assert_eq!(format!("{well_formed:?}"), format!("{read:?}"), "{}", text);
         }
     }
 
     #[test]
     fn of_a_member_that_stands_twice_the_last_counts() {
-        let text = r#"[{"x":1,"y":2,"x":3,"y":null}]"#;
+        let text = r#"[{"x":1,"angle":2,"x":3,"angle":null}]"#;
         let document = document::parse(text.as_bytes()).unwrap();
         let read = Demonstration::read(&schema(), &Place::root(&document), &mut Faults::default());
         assert!(read.is_some());

@@ -1,0 +1,81 @@
+//! Reading observed values from JSON as it comes, without a document in between.
+
+use std::fmt;
+
+use serde::de::{DeserializeSeed, Deserializer, Error, Visitor};
+
+use super::{Attribute, Cycle, Kind, Value};
+
+/// Reads a value of this attribute, or `null`: not observed. What is a value is what [`Attribute::read_value`] takes for one; an error
+/// does not tell what is wrong, as faults do.
+pub(crate) struct Observed<'a>(pub(crate) &'a Attribute);
+
+impl<'de> DeserializeSeed<'de> for Observed<'_> {
+    type Value = Option<Value>;
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl Visitor<'_> for Observed<'_> {
+    type Value = Option<Value>;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a value of the attribute")
+    }
+
+    fn visit_unit<E: Error>(self) -> Result<Self::Value, E> {
+        Ok(None)
+    }
+
+    fn visit_bool<E: Error>(self, flag: bool) -> Result<Self::Value, E> {
+        let read = matches!(self.0.kind, Kind::Category).then_some(Value::Boolean(flag));
+        checked(read)
+    }
+
+    fn visit_i64<E: Error>(self, integer: i64) -> Result<Self::Value, E> {
+        #[expect(clippy::cast_precision_loss, reason = "numbers are floats")]
+        let read = match self.0.kind {
+            Kind::Category => Some(Value::Integer(integer)),
+            _ => self.number(integer as f64),
+        };
+        checked(read)
+    }
+
+    fn visit_u64<E: Error>(self, integer: u64) -> Result<Self::Value, E> {
+        #[expect(clippy::cast_precision_loss, reason = "numbers are floats")]
+        let read = match self.0.kind {
+            Kind::Category => i64::try_from(integer).ok().map(Value::Integer),
+            _ => self.number(integer as f64),
+        };
+        checked(read)
+    }
+
+    fn visit_f64<E: Error>(self, number: f64) -> Result<Self::Value, E> {
+        checked(self.number(number))
+    }
+
+    fn visit_str<E: Error>(self, text: &str) -> Result<Self::Value, E> {
+        let read = match &self.0.kind {
+            Kind::Category => (text.len() <= Attribute::MAX_TEXT_BYTES).then(|| Value::Text(text.into())),
+            Kind::Cyclic { cycle: Cycle::Labels(labels), .. } => labels.position(text).map(Value::Label),
+            Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. } => None,
+        };
+        checked(read)
+    }
+}
+
+impl Observed<'_> {
+    /// A number, if the attribute's values are some.
+    fn number(&self, number: f64) -> Option<Value> {
+        // Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bits.
+        let is_number = matches!(self.0.kind, Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. });
+        (is_number && number.is_finite()).then_some(Value::Number(number + 0.0))
+    }
+}
+
+/// What was `read`, which must be a value.
+fn checked<E: Error>(read: Option<Value>) -> Result<Option<Value>, E> {
+    if read.is_some() { Ok(read) } else { Err(E::custom("not a value of the attribute")) }
+}
