@@ -10,6 +10,7 @@ use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::FutureExt;
+use metrics::SharedString;
 use tracing::{Instrument, Span};
 use uuid::Uuid;
 
@@ -28,8 +29,8 @@ pub(super) struct RequestId(pub(super) Arc<str>);
 pub(super) async fn observe(mut request: Request, next: Next) -> Response {
     let id: Arc<str> = request_id(request.headers()).into();
     request.extensions_mut().insert(RequestId(Arc::clone(&id)));
-    let route = request.extensions().get::<MatchedPath>().map_or("(none)", MatchedPath::as_str).to_owned();
-    let is_probe = matches!(route.as_str(), "/livez" | "/readyz" | "/metrics");
+    let route: Arc<str> = request.extensions().get::<MatchedPath>().map_or("(none)", MatchedPath::as_str).into();
+    let is_probe = matches!(&*route, "/livez" | "/readyz" | "/metrics");
     let method = request.method().clone();
     let span = tracing::info_span!("request", request_id = %id, %method, path = request.uri().path());
     let mut unanswered = Unanswered { span: span.clone(), started: Instant::now(), is_answered: false };
@@ -59,7 +60,11 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
     unanswered.is_answered = true;
     let elapsed = unanswered.started.elapsed();
     let status = response.status().as_u16();
-    let labels = [("method", method_label(&method).to_owned()), ("route", route), ("status", status.to_string())];
+    let labels = [
+        ("method", SharedString::const_str(method_label(&method))),
+        ("route", SharedString::from_shared(route)),
+        ("status", SharedString::from_shared(response.status().as_str().into())),
+    ];
     metrics::counter!("etude_http_requests_total", &labels).increment(1);
     metrics::histogram!("etude_http_request_duration_seconds", &labels).record(elapsed.as_secs_f64());
     let elapsed_us = u64::try_from(elapsed.as_micros()).unwrap_or(u64::MAX);
@@ -75,11 +80,9 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
 }
 
 /// The method, if it is a standard one: labels are kept for as long as the service runs, so that clients must not make them up.
-fn method_label(method: &Method) -> &str {
-    match method.as_str() {
-        known @ ("GET" | "HEAD" | "POST" | "PUT" | "DELETE" | "CONNECT" | "OPTIONS" | "TRACE" | "PATCH") => known,
-        _ => "other",
-    }
+fn method_label(method: &Method) -> &'static str {
+    const KNOWN: [&str; 9] = ["GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH"];
+    KNOWN.into_iter().find(|known| *known == method.as_str()).unwrap_or("other")
 }
 
 /// Takes the client's id if it is short and plain, else makes one.
