@@ -168,6 +168,57 @@ async fn the_same_request_gives_the_same_bytes_before_and_after_a_restart() {
 }
 
 #[tokio::test]
+async fn a_request_is_answered_alike_in_whatever_order_its_members_stand() {
+    const DEMONSTRATION: &str = r#"[{"x": 0, "heading": "east", "door": "open"}, [1, "east", null]]"#;
+    let service = Service::start(&[]).await;
+    let mut wide = corridor();
+    wide["attributes"][0]["weight"] = json!(7);
+    let mut other = corridor();
+    other["attributes"][2]["name"] = json!("gate");
+    for (name, model) in [("corridor", &corridor()), ("wide", &wide), ("other", &other)] {
+        assert_eq!(service.put(&format!("/v1/models/{name}"), model).await.0, 201);
+        // From now on it is at hand.
+        service.post("/v1/policies", &json!({"model": name, "demonstration": [[0, "east", "open"]]})).await;
+    }
+    let post = async |body: String| {
+        let request = service.client.post(service.url("/v1/policies")).header(CONTENT_TYPE, "application/json");
+        answer(request.body(body).send().await.unwrap()).await
+    };
+    let (status, policy) = post(format!(r#"{{"demonstration":{DEMONSTRATION},"model":"corridor"}}"#)).await;
+    assert_eq!(status, 201, "{policy}");
+    let expected = comparable(policy);
+    for body in [
+        format!(r#"{{"model":"corridor","demonstration":{DEMONSTRATION}}}"#),
+        format!(" {{ \"m\\u006fdel\" : \"corridor\" ,\n \"demonstration\" : {DEMONSTRATION} , \"start\" : null }}\n"),
+        // Of what stands twice, the last counts.
+        format!(r#"{{"model":"wide","demonstration":{DEMONSTRATION},"model":"corridor"}}"#),
+        format!(r#"{{"model":"other","demonstration":{DEMONSTRATION},"model":"corridor"}}"#),
+        format!(r#"{{"model":"corridor","demonstration":[[7, "east", "open"]],"demonstration":{DEMONSTRATION}}}"#),
+        format!(r#"{{"model":"corridor","demonstration":[7],"demonstration":{DEMONSTRATION}}}"#),
+        format!(r#"{{"model":"no-such","demonstration":{DEMONSTRATION},"model":"corridor"}}"#),
+    ] {
+        let (status, policy) = post(body.clone()).await;
+        assert_eq!((status, comparable(policy)), (201, expected.clone()), "{body}");
+    }
+    let problem = async |body: String| {
+        let (status, problem) = post(body).await;
+        (status, problem["type"].clone(), problem["errors"].clone(), problem["detail"].clone())
+    };
+    let wrong = r#"[{"x": "a", "z": 1}, [0], 7]"#;
+    for (model, demonstration) in
+        [("corridor", wrong), ("other", DEMONSTRATION), ("corridor", "[]"), ("corridor", "null")]
+    {
+        let before = problem(format!(r#"{{"model":"{model}","demonstration":{demonstration}}}"#)).await;
+        let after = problem(format!(r#"{{"demonstration":{demonstration},"model":"{model}"}}"#)).await;
+        assert_eq!((before.0, &before), (422, &after), "{demonstration}");
+    }
+    for rest in ["", "}", "]", " }]", "}x"] {
+        let before = problem(format!(r#"{{"model":"corridor","demonstration":{DEMONSTRATION}{rest}"#)).await;
+        assert_eq!(before.0, if rest == "}" { 201 } else { 400 }, "{rest:?}: {before:?}");
+    }
+}
+
+#[tokio::test]
 async fn all_faults_of_a_model_are_told_at_once() {
     let service = Service::start(&[]).await;
     let model = json!({

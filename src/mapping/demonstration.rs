@@ -35,15 +35,13 @@ impl Demonstration {
         (faults.count() == n_before).then_some(Self { values, n_attributes: schema.len() })
     }
 
-    /// Reads a demonstration that is well-formed from its JSON text, in a fraction of the time. `None` if anything is wrong with it,
-    /// which [`Self::read`] can tell.
+    /// Reads a demonstration that is well-formed from its JSON text, as [`WellFormed`] does. `None` if anything is wrong with it.
     #[must_use]
     pub fn read_well_formed(schema: &Schema, text: &str) -> Option<Self> {
         let mut deserializer = serde_json::Deserializer::from_str(text);
-        let values = Observations { schema, n_bytes: text.len() }.deserialize(&mut deserializer).ok()?;
+        let read = WellFormed { schema, n_bytes: text.len() }.deserialize(&mut deserializer).ok()?;
         deserializer.end().ok()?;
-        let n_observations = values.len() / schema.len();
-        (1..=Self::MAX_OBSERVATIONS).contains(&n_observations).then_some(Self { values, n_attributes: schema.len() })
+        Some(read)
     }
 
     /// How many observations there are: n + 1.
@@ -73,33 +71,37 @@ impl Demonstration {
     }
 }
 
-/// Reads observations, one after the other, from a text of `n_bytes`.
-struct Observations<'s> {
-    schema: &'s Schema,
-    n_bytes: usize,
+/// Reads a demonstration that is well-formed from JSON as it comes, in a fraction of the time that a document takes. It is in a text
+/// of `n_bytes`. An error does not tell what is wrong with it, as [`Demonstration::read`] can.
+pub(crate) struct WellFormed<'s> {
+    pub(crate) schema: &'s Schema,
+    pub(crate) n_bytes: usize,
 }
 
-impl<'de> DeserializeSeed<'de> for Observations<'_> {
-    type Value = Vec<Option<Value>>;
+impl<'de> DeserializeSeed<'de> for WellFormed<'_> {
+    type Value = Demonstration;
 
-    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Demonstration, D::Error> {
         deserializer.deserialize_seq(self)
     }
 }
 
-impl<'de> Visitor<'de> for Observations<'_> {
-    type Value = Vec<Option<Value>>;
+impl<'de> Visitor<'de> for WellFormed<'_> {
+    type Value = Demonstration;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("an array of observations")
     }
 
-    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Self::Value, A::Error> {
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Demonstration, A::Error> {
         /// About what a value takes, with the name of its attribute.
         const VALUE_BYTES: usize = 12;
-        let mut values = Vec::with_capacity(self.n_bytes / VALUE_BYTES);
-        while items.next_element_seed(OneObservation { schema: self.schema, values: &mut values })?.is_some() {}
-        Ok(values)
+        let Self { schema, n_bytes } = self;
+        let mut values = Vec::with_capacity(n_bytes / VALUE_BYTES);
+        while items.next_element_seed(OneObservation { schema, values: &mut values })?.is_some() {}
+        let read = Demonstration { values, n_attributes: schema.len() };
+        let is_within = (1..=Demonstration::MAX_OBSERVATIONS).contains(&read.len());
+        if is_within { Ok(read) } else { Err(A::Error::custom("too few observations, or too many")) }
     }
 }
 

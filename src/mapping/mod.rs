@@ -47,6 +47,7 @@ mod written;
 
 pub use cost::Cost;
 pub use demonstration::Demonstration;
+pub(crate) use demonstration::WellFormed;
 pub use heuristic::{Grouping, HeuristicName};
 pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
 pub(crate) use online::longest_lookahead;

@@ -169,15 +169,20 @@ impl Etude {
     ) -> Result<(String, Arc<Mapper>), ServiceError> {
         // Before anything is read: what changes meanwhile makes what was read outdated.
         let generation = self.store.models_generation();
-        if let Some((known, key)) = self.model_names.keys.get(name)
-            && known == generation
-            && let Some(mapper) = self.mappers.get(&key)
-        {
-            return Ok((key.hash, mapper));
+        if let Some(known) = self.mapper_at_hand(name) {
+            return Ok(known);
         }
         let (hash, mapper) = self.mapper(name, pointer, Some(place)).await?;
         let key = ModelKey { hash: hash.clone(), is_lazy: mapper.model().is_lazy() };
         self.model_names.keys.insert(name.to_owned(), (generation, key));
         Ok((hash, mapper))
+    }
+
+    /// The mapper of the model called `name`, and the hash of that, if both are known without waiting for anything.
+    pub(super) fn mapper_at_hand(&self, name: &str) -> Option<(String, Arc<Mapper>)> {
+        let generation = self.store.models_generation();
+        let (_, key) = self.model_names.keys.get(name).filter(|(known, _)| *known == generation)?;
+        let mapper = self.mappers.get(&key)?;
+        Some((key.hash, mapper))
     }
 }
