@@ -172,7 +172,8 @@ impl Etude {
         if let Some(known) = self.mapper_at_hand(name) {
             return Ok(known);
         }
-        let (hash, mapper) = self.mapper(name, pointer, Some(place)).await?;
+        // On the heap, as every request would carry along what only the first one for a model needs.
+        let (hash, mapper) = Box::pin(self.mapper(name, pointer, Some(place))).await?;
         let key = ModelKey { hash: hash.clone(), is_lazy: mapper.model().is_lazy() };
         self.model_names.keys.insert(name.to_owned(), (generation, key));
         Ok((hash, mapper))
