@@ -27,7 +27,7 @@ pub(super) struct RequestId(pub(super) Arc<str>);
 
 /// Gives the request an id, logs and measures it, turns panics into problems and problems into documents.
 pub(super) async fn observe(mut request: Request, next: Next) -> Response {
-    let id: Arc<str> = request_id(request.headers()).into();
+    let id = request_id(request.headers());
     request.extensions_mut().insert(RequestId(Arc::clone(&id)));
     let route: Arc<str> = request.extensions().get::<MatchedPath>().map_or("(none)", MatchedPath::as_str).into();
     let is_probe = matches!(&*route, "/livez" | "/readyz" | "/metrics");
@@ -86,13 +86,16 @@ fn method_label(method: &Method) -> &'static str {
 }
 
 /// Takes the client's id if it is short and plain, else makes one.
-fn request_id(headers: &HeaderMap) -> String {
+fn request_id(headers: &HeaderMap) -> Arc<str> {
     let is_plain = |id: &&str| {
         (1..=MAX_REQUEST_ID_BYTES).contains(&id.len())
             && id.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._-".contains(&byte))
     };
     let given = headers.get(REQUEST_ID).and_then(|id| id.to_str().ok()).filter(is_plain);
-    given.map_or_else(|| Uuid::now_v7().to_string(), str::to_owned)
+    match given {
+        Some(given) => given.into(),
+        None => Arc::from(&*Uuid::now_v7().hyphenated().encode_lower(&mut Uuid::encode_buffer())),
+    }
 }
 
 fn panic_message(panic: &(dyn Any + Send)) -> &str {

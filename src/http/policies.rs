@@ -41,7 +41,7 @@ pub(super) async fn make_policy(State(context): State<SharedContext>, request: R
     let body = read_json(request, &context).await?;
     let made = context.etude.make_policy(body, arrived, Timestamp::now()).await?;
     let mut response = json_text(StatusCode::CREATED, made.policy);
-    if let Ok(location) = HeaderValue::from_str(&format!("/v1/policies/{}", made.id)) {
+    if let Ok(location) = HeaderValue::try_from(format!("/v1/policies/{}", made.id)) {
         response.headers_mut().insert(LOCATION, location);
     }
     Ok(response)
