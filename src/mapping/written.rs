@@ -10,6 +10,7 @@
 //!              store     store --> read_answer: the same bytes
 //! ```
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use serde::de::{Error as _, IgnoredAny};
@@ -68,7 +69,7 @@ impl WrittenPolicy {
         };
         let summary = serde_json::to_string(&summary)?;
         let answer = answer(&summary, weights.iter().map(|(name, _)| name), &short)?;
-        Ok(Self { answer, steps: postcard::to_allocvec(&short)?, summary })
+        Ok(Self { answer, steps: short.pack()?, summary })
     }
 }
 
@@ -101,7 +102,7 @@ pub(crate) fn read_answer(summary: &str, steps: &[u8]) -> Result<String, WriteEr
 }
 
 /// The steps of a policy, in short. What some steps have more of than others stands together, in the order of the steps.
-#[derive(Default, Serialize, Deserialize)]
+#[derive(Serialize, Deserialize)]
 struct ShortSteps {
     /// Names and costs of the actions that are taken.
     actions: Vec<(Arc<str>, f64)>,
@@ -134,8 +135,17 @@ impl ShortSteps {
         let model = problem.model;
         let attributes = model.schema().attributes();
         let states = mapping.states.as_ref().unwrap_or(model.states());
-        let mut short = Self { steps: Vec::with_capacity(mapping.moves.len()), ..Self::default() };
-        let mut values = Vec::new();
+        let n_steps = mapping.moves.len();
+        // Most steps change a value or two, and differ from what was observed in one.
+        let n_changed = attributes.len() + 2 * n_steps;
+        let mut short = Self {
+            actions: Vec::with_capacity(model.actions().len().min(n_steps)),
+            steps: Vec::with_capacity(n_steps),
+            changed: Vec::with_capacity(n_changed),
+            values: String::new(),
+            terms: Vec::with_capacity(n_steps),
+        };
+        let mut values = Vec::with_capacity(n_changed * VALUE_BYTES);
         let mut sum = CostSum::default();
         // Of the step before: its row, and where its terms stand.
         let (mut row, mut terms): (&[u32], _) = (&[], 0..0);
@@ -179,6 +189,20 @@ impl ShortSteps {
         Ok(short)
     }
 
+    /// As it is stored.
+    fn pack(&self) -> postcard::Result<Vec<u8>> {
+        /// About what each of them takes: most numbers a byte, costs eight.
+        const STEP_BYTES: usize = 16;
+        const ACTION_BYTES: usize = 24;
+        let n_bytes = self.actions.len() * ACTION_BYTES
+            + self.steps.len() * STEP_BYTES
+            + self.changed.len() * 2
+            + self.values.len()
+            + self.terms.len() * 9
+            + STEP_BYTES;
+        postcard::to_extend(self, Vec::with_capacity(n_bytes))
+    }
+
     /// The place of the action called `name`.
     fn place_of(&mut self, name: &Arc<str>, cost: f64) -> u32 {
         let known = self.actions.iter().position(|(known, _)| known == name);
@@ -206,16 +230,13 @@ fn answer<'n>(summary: &str, names: impl Iterator<Item = &'n str>, short: &Short
     /// What comes after the steps. No string in JSON has a quote that is not escaped, and no weight is an object.
     const AFTER: &str = r#""coverage":{"#;
     let (before, after) = summary.split_at(summary.rfind(AFTER).ok_or(WriteError::Missing("a coverage"))?);
-    let actions = short.actions.iter().map(|(name, cost)| Ok((serde_json::to_string(name)?, *cost)));
-    let actions = actions.collect::<Result<Vec<_>, WriteError>>()?;
-    let action_at = |place: u32| actions.get(place as usize).ok_or(WriteError::Missing("an action"));
-
-    let mut writer = AnswerWriter::new(names, summary.len(), short.steps.len())?;
+    let pieces = Pieces::of(names, &short.actions)?;
+    let mut writer = AnswerWriter::new(&pieces, summary.len(), short.steps.len())?;
     writer.raw(before);
     writer.raw(r#""actions":["#);
     for (n, place) in short.steps.iter().filter_map(|step| step.action).enumerate() {
         writer.raw(if n == 0 { "" } else { "," });
-        writer.raw(&action_at(place)?.0);
+        writer.raw(pieces.action(place)?.0);
     }
     writer.raw(r#"],"steps":["#);
     let (mut changed, mut values) = (short.changed.iter(), short.values.as_str());
@@ -239,41 +260,110 @@ fn answer<'n>(summary: &str, names: impl Iterator<Item = &'n str>, short: &Short
             (Some(before), Some(_)) if before == step.observation => MoveKind::Extra,
             (Some(_), Some(_)) => MoveKind::Match,
         };
-        writer.step(step, kind, step.action.map(action_at).transpose()?)?;
+        writer.step(step, kind)?;
     }
     writer.raw("],");
     writer.raw(after);
     Ok(String::from_utf8(writer.text).map_err(serde_json::Error::custom)?)
 }
 
-/// Writes the steps of a policy as they are answered. What a step has in common with the one before is kept as text.
-struct AnswerWriter {
+/// About how many bytes a value of a state takes.
+const VALUE_BYTES: usize = 6;
+
+/// JSON that an answer has more than once.
+struct Pieces {
+    /// One after the other.
     text: Vec<u8>,
-    /// By attribute, its name as that of a member of an object.
-    names: Vec<String>,
-    /// By attribute, the member of the state, with the comma before it.
-    state: Vec<String>,
-    /// The members of the distance by attribute.
-    terms: Vec<u8>,
-    distance: f64,
+    /// By attribute, where its name is, as that of a member of an object.
+    names: Vec<Range<usize>>,
+    /// By action, where its name and its cost are.
+    actions: Vec<(Range<usize>, Range<usize>)>,
+}
+
+impl Pieces {
+    fn of<'n>(names: impl Iterator<Item = &'n str>, actions: &[(Arc<str>, f64)]) -> serde_json::Result<Self> {
+        /// About what a name takes, or a cost.
+        const PIECE_BYTES: usize = 16;
+        let n_names = names.size_hint().0;
+        let mut pieces = Self {
+            text: Vec::with_capacity((n_names + 2 * actions.len()) * PIECE_BYTES),
+            names: Vec::with_capacity(n_names),
+            actions: Vec::with_capacity(actions.len()),
+        };
+        for name in names {
+            let name = pieces.add(name)?;
+            pieces.text.push(b':');
+            pieces.names.push(name.start..name.end + 1);
+        }
+        for (name, cost) in actions {
+            let action = (pieces.add(name)?, pieces.add(cost)?);
+            pieces.actions.push(action);
+        }
+        Ok(pieces)
+    }
+
+    fn add(&mut self, piece: &(impl Serialize + ?Sized)) -> serde_json::Result<Range<usize>> {
+        let from = self.text.len();
+        serde_json::to_writer(&mut self.text, piece)?;
+        Ok(from..self.text.len())
+    }
+
+    /// The name of the attribute at `position`.
+    fn name(&self, position: usize) -> Result<&[u8], WriteError> {
+        let name = self.names.get(position).ok_or(WriteError::Missing("an attribute"))?;
+        Ok(&self.text[name.clone()])
+    }
+
+    /// The name and the cost of the action at `place`.
+    fn action(&self, place: u32) -> Result<(&[u8], &[u8]), WriteError> {
+        let (name, cost) = self.actions.get(place as usize).ok_or(WriteError::Missing("an action"))?;
+        Ok((&self.text[name.clone()], &self.text[cost.clone()]))
+    }
+}
+
+/// Writes the steps of a policy as they are answered. What a step has in common with the one before is kept as text.
+struct AnswerWriter<'p> {
+    text: Vec<u8>,
+    pieces: &'p Pieces,
+    /// By attribute.
+    values: Vec<StateValue<'p>>,
+    /// The members of the state; empty where they are to be written anew.
+    state: Vec<u8>,
+    /// The members that tell the distance.
+    distance: Vec<u8>,
     n_steps: u32,
 }
 
-impl AnswerWriter {
-    fn new<'n>(names: impl Iterator<Item = &'n str>, n_bytes: usize, n_steps: usize) -> serde_json::Result<Self> {
-        /// About what a step takes, beside its state, and what each value of that takes, beside its name.
+/// A value of the state.
+#[derive(Clone, Default)]
+struct StateValue<'p> {
+    /// JSON.
+    text: &'p str,
+    /// Where it begins among the members of the state.
+    at: usize,
+}
+
+impl<'p> AnswerWriter<'p> {
+    /// A writer of so many steps, with `n_bytes` around them.
+    fn new(pieces: &'p Pieces, n_bytes: usize, n_steps: usize) -> Result<Self, WriteError> {
+        /// About what a step takes, beside its state.
         const STEP_BYTES: usize = 192;
-        const VALUE_BYTES: usize = 6;
-        let names = names.map(|name| Ok(serde_json::to_string(name)? + ":"));
-        let names = names.collect::<serde_json::Result<Vec<_>>>()?;
-        let state_bytes: usize = names.iter().map(|name| name.len() + VALUE_BYTES).sum();
-        let text = Vec::with_capacity(n_bytes + n_steps * (STEP_BYTES + state_bytes));
-        Ok(Self { text, state: vec![String::new(); names.len()], names, terms: Vec::new(), distance: 0.0, n_steps: 0 })
+        let state_bytes = pieces.names.iter().map(|name| name.len() + VALUE_BYTES).sum();
+        let mut writer = Self {
+            text: Vec::with_capacity(n_bytes + n_steps * (STEP_BYTES + state_bytes)),
+            pieces,
+            values: vec![StateValue::default(); pieces.names.len()],
+            state: Vec::with_capacity(state_bytes),
+            distance: Vec::with_capacity(STEP_BYTES),
+            n_steps: 0,
+        };
+        writer.set_terms(&[])?;
+        Ok(writer)
     }
 
     /// Writes what is JSON already, or a part of it.
-    fn raw(&mut self, text: &str) {
-        self.text.extend_from_slice(text.as_bytes());
+    fn raw(&mut self, text: impl AsRef<[u8]>) {
+        self.text.extend_from_slice(text.as_ref());
     }
 
     /// Writes a member of an object, whose name is given with what stands around it.
@@ -283,50 +373,66 @@ impl AnswerWriter {
     }
 
     /// From the next step on, the attribute at `position` has this value: JSON.
-    fn set_value(&mut self, position: u32, value: &str) -> Result<(), WriteError> {
-        let position = position as usize;
-        let member = self.state.get_mut(position).ok_or(WriteError::Missing("an attribute"))?;
-        member.clear();
-        if position > 0 {
-            member.push(',');
+    fn set_value(&mut self, position: u32, text: &'p str) -> Result<(), WriteError> {
+        let value = self.values.get_mut(position as usize).ok_or(WriteError::Missing("an attribute"))?;
+        match self.state.get_mut(value.at..value.at + text.len()) {
+            Some(before) if value.text.len() == text.len() => before.copy_from_slice(text.as_bytes()),
+            _ => self.state.clear(),
         }
-        member.push_str(&self.names[position]);
-        member.push_str(value);
+        value.text = text;
+        Ok(())
+    }
+
+    /// Writes the members of the state anew.
+    fn write_state(&mut self) -> Result<(), WriteError> {
+        for (position, value) in self.values.iter_mut().enumerate() {
+            if position > 0 {
+                self.state.push(b',');
+            }
+            self.state.extend_from_slice(self.pieces.name(position)?);
+            value.at = self.state.len();
+            self.state.extend_from_slice(value.text.as_bytes());
+        }
         Ok(())
     }
 
     /// From the next step on, these are the terms of the distance.
     fn set_terms(&mut self, terms: &[(u32, f64)]) -> Result<(), WriteError> {
-        self.distance = distance(terms);
-        self.terms.clear();
-        for (position, term) in terms {
-            if !self.terms.is_empty() {
-                self.terms.push(b',');
+        self.distance.clear();
+        self.distance.extend_from_slice(br#""distance":"#);
+        serde_json::to_writer(&mut self.distance, &distance(terms))?;
+        self.distance.extend_from_slice(br#","distance_by_attribute":{"#);
+        for (n, (position, term)) in terms.iter().enumerate() {
+            if n > 0 {
+                self.distance.push(b',');
             }
-            let name = self.names.get(*position as usize).ok_or(WriteError::Missing("an attribute"))?;
-            self.terms.extend_from_slice(name.as_bytes());
-            serde_json::to_writer(&mut self.terms, term)?;
+            self.distance.extend_from_slice(self.pieces.name(*position as usize)?);
+            serde_json::to_writer(&mut self.distance, term)?;
         }
+        self.distance.push(b'}');
         Ok(())
     }
 
-    /// Writes the next step. Its `action` is the name, as JSON, and the cost.
-    fn step(&mut self, step: &ShortStep, kind: MoveKind, action: Option<&(String, f64)>) -> serde_json::Result<()> {
+    /// Writes the next step.
+    fn step(&mut self, step: &ShortStep, kind: MoveKind) -> Result<(), WriteError> {
+        let action = step.action.map(|place| self.pieces.action(place)).transpose()?;
+        let (action, action_cost) = action.unwrap_or((b"null", b"0.0"));
+        if self.state.is_empty() {
+            self.write_state()?;
+        }
         self.member(r#"{"step":"#, self.n_steps)?;
         self.member(r#","observation":"#, step.observation)?;
         self.member(r#","move":"#, kind)?;
         self.raw(r#","action":"#);
-        self.raw(action.map_or("null", |(name, _)| name));
+        self.raw(action);
         self.raw(r#","state":{"#);
-        for member in &self.state {
-            self.text.extend_from_slice(member.as_bytes());
-        }
+        self.text.extend_from_slice(&self.state);
         self.member(r#"},"state_index":"#, step.state_index)?;
-        self.member(r#","action_cost":"#, action.map_or(0.0, |(_, cost)| *cost))?;
-        self.member(r#","distance":"#, self.distance)?;
-        self.raw(r#","distance_by_attribute":{"#);
-        self.text.extend_from_slice(&self.terms);
-        self.member(r#"},"cost":"#, step.cost)?;
+        self.raw(r#","action_cost":"#);
+        self.raw(action_cost);
+        self.raw(",");
+        self.text.extend_from_slice(&self.distance);
+        self.member(r#","cost":"#, step.cost)?;
         self.raw("}");
         self.n_steps += 1;
         Ok(())
