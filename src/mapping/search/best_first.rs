@@ -14,6 +14,7 @@
 //! divided into [`Buckets`]. The order within a bucket is not that of `f`, so a node may be expanded before the cheapest way to it is
 //! known; it is then expanded again.
 
+use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::ops::Range;
 
@@ -46,16 +47,24 @@ pub(in crate::mapping) struct Buffers {
 #[derive(Debug, Default)]
 struct Open {
     buckets: Buckets,
-    /// Those of the observation that a probe is at.
+    /// Those of the observation that a probe is at,
     probed: BinaryHeap<CheapestFirst>,
+    /// and those that it has found of the next.
+    ahead: Vec<CheapestFirst>,
 }
 
 impl Buffers {
     /// Whether they are small enough to be kept.
     pub(in crate::mapping) fn are_small(&self) -> bool {
         const MAX_BYTES: usize = 16 << 20;
-        let open_bytes = self.open.buckets.kept_bytes() + self.open.probed.capacity() * size_of::<CheapestFirst>();
-        self.seen.kept_bytes() + self.nodes.kept_bytes() + open_bytes <= MAX_BYTES
+        self.seen.kept_bytes() + self.nodes.kept_bytes() + self.open.kept_bytes() <= MAX_BYTES
+    }
+}
+
+impl Open {
+    /// How much memory is kept for them, in bytes.
+    fn kept_bytes(&self) -> usize {
+        self.buckets.kept_bytes() + (self.probed.capacity() + self.ahead.capacity()) * size_of::<CheapestFirst>()
     }
 }
 
@@ -144,18 +153,19 @@ struct Search<'s, 'p, S> {
 impl<S: Space> Search<'_, '_, S> {
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
-    fn probe(&mut self, width: u64, Open { probed, buckets }: &mut Open) -> Result<End, Cancelled> {
-        let mut layers = vec![Vec::new(); self.problem.last()];
-        for Reached { id, f, .. } in self.open() {
-            if let Some(layer) = layers.get_mut(self.nodes.step(id).observation as usize) {
-                layer.push(CheapestFirst { cost: f, id });
-            }
-        }
-        let mut ahead = Vec::new();
-        for (observation, mut layer) in (0..).zip(layers) {
-            layer.append(&mut ahead);
+    fn probe(&mut self, width: u64, Open { buckets, probed, ahead }: &mut Open) -> Result<End, Cancelled> {
+        let observation_of = |id| self.nodes.step(id).observation;
+        let known = self.open().map(|Reached { id, f, .. }| (observation_of(id), CheapestFirst { cost: f, id }));
+        let mut known: Vec<(u32, CheapestFirst)> = known.collect();
+        // Taken from the end.
+        known.sort_unstable_by_key(|(observation, _)| Reverse(*observation));
+        ahead.clear();
+        for observation in 0..self.last {
             probed.clear();
-            probed.extend(layer);
+            probed.extend(ahead.drain(..));
+            while let Some((_, node)) = known.pop_if(|(of, _)| *of == observation) {
+                probed.push(node);
+            }
             let mut n_left = width;
             while let Some(CheapestFirst { id, .. }) = probed.pop() {
                 let Reached { g, f, .. } = self.nodes.get(id);
@@ -247,11 +257,8 @@ impl<S: Space> Search<'_, '_, S> {
 
     /// Puts all open nodes into the buckets, and gives the limit that these are for.
     fn fill_buckets(&mut self, buckets: &mut Buckets) -> f64 {
-        let open: Vec<Reached> = self.open().collect();
-        buckets.reset(open.iter().map(|node| node.f).fold(self.limit, f64::min), self.limit);
-        for node in open {
-            buckets.push(node);
-        }
+        buckets.reset(self.open().map(|node| node.f).fold(self.limit, f64::min), self.limit);
+        self.open().for_each(|node| buckets.push(node));
         self.limit
     }
 
