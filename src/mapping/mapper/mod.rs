@@ -2,7 +2,7 @@
 
 mod escalation;
 
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
@@ -12,11 +12,10 @@ use super::Problem;
 use super::completion::{Allowance, Extras, complete};
 use super::cost::{Cost, ROUNDING, SLACK, cost_of};
 use super::heuristic::paper::Paper;
-use super::heuristic::projected::{MAX_ENTRIES, Projected};
+use super::heuristic::projected::{self, MAX_ENTRIES, Projected};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
-use super::search::best_first::Buffers;
-use super::search::{Found, Move, astar};
+use super::search::{Found, Move, astar, best_first};
 use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
 use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
 use escalation::Patience;
@@ -118,6 +117,21 @@ pub struct Mapper {
     patience: Patience,
 }
 
+/// Buffers of a search, kept to be used again.
+#[derive(Debug, Default)]
+struct Buffers {
+    solving: projected::Buffers,
+    searching: best_first::Buffers,
+}
+
+impl Buffers {
+    /// Whether they are small enough to be kept.
+    fn are_small(&self) -> bool {
+        const MAX_BYTES: usize = 16 << 20;
+        self.solving.kept_bytes() + self.searching.kept_bytes() <= MAX_BYTES
+    }
+}
+
 impl Mapper {
     /// Prepares `model`. Takes time and memory proportional to its states and transitions times attributes.
     ///
@@ -155,10 +169,8 @@ impl Mapper {
     /// model, as all but the start of one that is searched lazily.
     pub fn lower_bounds<'p>(&'p self, problem: &'p Problem<'p>) -> impl Fn(u32, StateIdx) -> f64 + 'p {
         self.check(problem);
-        let projected =
-            Projected::solve(&self.projections, problem, Grouping::WhenItPays, MAX_ENTRIES, &mut Uninterrupted)
-                .ok()
-                .flatten();
+        let solved = self.solve(problem, Grouping::WhenItPays, MAX_ENTRIES, &mut Uninterrupted);
+        let projected = solved.ok().flatten();
         let projected = projected.expect("nothing interrupts");
         move |observation, state| projected.cost_to_go(observation as usize, self.model.states().row(state))
     }
@@ -209,7 +221,7 @@ impl Mapper {
                 let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, space.row(problem.start));
-                match Projected::solve(&self.projections, problem, settings.grouping, MAX_ENTRIES, interrupt)? {
+                match self.solve(problem, settings.grouping, MAX_ENTRIES, interrupt)? {
                     Some(projected) => {
                         let least_f = first + projected.cost_to_go(0, space.row(problem.start));
                         conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
@@ -218,6 +230,30 @@ impl Mapper {
                 }
             }
         }
+    }
+
+    /// The tables of [`Projected::solve`].
+    fn solve<'p>(
+        &'p self,
+        problem: &'p Problem<'p>,
+        grouping: Grouping,
+        max_entries: usize,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<Projected<'p>>, Cancelled> {
+        self.with_buffers(|Buffers { solving, .. }| {
+            Projected::solve(&self.projections, problem, grouping, max_entries, solving, interrupt)
+        })
+    }
+
+    /// Does `work` with buffers of work that was done before, if there are any.
+    fn with_buffers<T>(&self, work: impl FnOnce(&mut Buffers) -> Result<T, Cancelled>) -> Result<T, Cancelled> {
+        let kept = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let mut buffers = kept.unwrap_or_default();
+        let done = work(&mut buffers)?;
+        if buffers.are_small() {
+            self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
+        }
+        Ok(done)
     }
 
     fn check(&self, problem: &Problem<'_>) {

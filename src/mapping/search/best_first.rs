@@ -54,10 +54,9 @@ struct Open {
 }
 
 impl Buffers {
-    /// Whether they are small enough to be kept.
-    pub(in crate::mapping) fn are_small(&self) -> bool {
-        const MAX_BYTES: usize = 16 << 20;
-        self.seen.kept_bytes() + self.nodes.kept_bytes() + self.open.kept_bytes() <= MAX_BYTES
+    /// How much memory is kept, in bytes.
+    pub(in crate::mapping) fn kept_bytes(&self) -> usize {
+        self.seen.kept_bytes() + self.nodes.kept_bytes() + self.open.kept_bytes()
     }
 }
 

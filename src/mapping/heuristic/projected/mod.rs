@@ -85,12 +85,48 @@ pub(in crate::mapping) struct ChangingColumn {
     offset: u32,
 }
 
+/// What solving takes besides its result, kept to be used again.
+#[derive(Debug, Default)]
+pub(in crate::mapping) struct Buffers {
+    /// By column, the ways into each class, if they are few,
+    ways: Vec<Ways>,
+    /// where these groups have tables: nothing else that they depend on differs from problem to problem of a model.
+    used: Vec<bool>,
+    layer: Layer,
+}
+
+/// The entries of a column in the making.
+#[derive(Debug, Default)]
+struct Layer {
+    /// By observation, the least term.
+    least: Vec<f64>,
+    /// By class, at an observation and at the next.
+    here: Vec<Estimate>,
+    next: Vec<Estimate>,
+    open: BinaryHeap<CheapestFirst>,
+}
+
+/// Most edges of all groups with tables whose ways are kept: 1.5 MB. To gather more takes little of the time that their tables take.
+const MAX_KEPT_EDGES: usize = 1 << 16;
+
+impl Buffers {
+    /// How much memory is kept, in bytes.
+    pub(in crate::mapping) fn kept_bytes(&self) -> usize {
+        let Layer { least, here, next, open } = &self.layer;
+        self.ways.iter().map(Ways::size_bytes).sum::<usize>()
+            + least.capacity() * size_of::<f64>()
+            + (here.capacity() + next.capacity()) * size_of::<Estimate>()
+            + open.capacity() * size_of::<CheapestFirst>()
+    }
+}
+
 /// Most entries of all tables together: 256 MB. Groups that do not fit, the largest, are left out, which keeps the bound a
 /// bound.
 pub(in crate::mapping) const MAX_ENTRIES: usize = 1 << 24;
 
 impl<'p> Projected<'p> {
-    /// Solves the projected problems, backwards over the demonstration. `None` if `interrupt` said to finish first.
+    /// Solves the projected problems, backwards over the demonstration. `None` if `interrupt` said to finish first. `buffers` are of
+    /// the same model.
     ///
     /// # Errors
     ///
@@ -100,6 +136,7 @@ impl<'p> Projected<'p> {
         problem: &'p Problem<'p>,
         grouping: Grouping,
         max_entries: usize,
+        buffers: &mut Buffers,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
         /// How many classes are looked at between two looks at the interrupt: about a millisecond.
@@ -118,16 +155,26 @@ impl<'p> Projected<'p> {
         projected.least_distances = vec![0.0; n_observations];
         let mut meter = Meter::new(interrupt, POLL_EVERY);
         for number in 0..projected.columns.len() {
-            match projected.write_terms(number, &mut meter) {
+            match projected.write_terms(number, &mut buffers.layer.least, &mut meter) {
                 Signal::Continue => {}
                 Signal::Finish => return Ok(None),
                 Signal::Cancel => return Err(Cancelled),
             }
         }
         projected.add_constants();
+        let ways_of = |Column { group, position, .. }: &Column<'_>| {
+            Ways::into_classes(group, &Parts::new(projections, problem, &used, &[*position]))
+        };
+        let n_edges: usize = projected.columns.iter().map(|column| column.group.n_edges()).sum();
+        let are_kept = n_edges <= MAX_KEPT_EDGES;
+        if are_kept && buffers.used != used {
+            buffers.ways = projected.columns.iter().map(ways_of).collect();
+            buffers.used.clone_from(&used);
+        }
         for number in 0..projected.columns.len() {
-            let parts = Parts::new(projections, problem, &used, &[projected.columns[number].position]);
-            match projected.solve_column(number, &parts, &mut meter) {
+            let made = (!are_kept).then(|| ways_of(&projected.columns[number]));
+            let ways = made.as_ref().unwrap_or_else(|| &buffers.ways[number]);
+            match projected.solve_column(number, ways, &mut buffers.layer, &mut meter) {
                 Signal::Continue => {}
                 Signal::Finish => return Ok(None),
                 Signal::Cancel => return Err(Cancelled),
@@ -223,13 +270,14 @@ impl<'p> Projected<'p> {
     }
 
     /// Writes the terms of a column, and the least of them at each observation. What no action changes stays as it was at the start.
-    fn write_terms(&mut self, number: usize, meter: &mut Meter<'_>) -> Signal {
+    fn write_terms(&mut self, number: usize, least: &mut Vec<f64>, meter: &mut Meter<'_>) -> Signal {
         let (n_observations, n_columns) = (self.problem.demonstration.len(), self.columns.len());
         let Column { group, position, offset } = self.columns[number];
         let start = self.problem.start_row[position];
         let is_unchanged = group.n_edges() == 0;
         let Some(terms) = self.problem.distances.of(position) else { return Signal::Continue };
-        let mut least = vec![f64::INFINITY; n_observations];
+        least.clear();
+        least.resize(n_observations, f64::INFINITY);
         for value in (0..).take(group.n_classes()) {
             match meter.spend(n_observations as u64) {
                 Signal::Continue => {}
@@ -243,8 +291,8 @@ impl<'p> Projected<'p> {
                 }
             }
         }
-        for (i, least) in least.into_iter().enumerate() {
-            self.least_terms[i * n_columns + number] = least;
+        for (i, least) in least.iter().enumerate() {
+            self.least_terms[i * n_columns + number] = *least;
             self.least_distances[i] += least;
         }
         Signal::Continue
@@ -287,35 +335,39 @@ impl<'p> Projected<'p> {
     ///
     /// The last line refers to the same observation, so each observation is a pass of Dijkstra's algorithm from those
     /// classes that an extra action improves.
-    fn solve_column(&mut self, number: usize, parts: &Parts<'_>, meter: &mut Meter<'_>) -> Signal {
+    fn solve_column(&mut self, number: usize, predecessors: &Ways, layer: &mut Layer, meter: &mut Meter<'_>) -> Signal {
         let Column { group, offset, .. } = self.columns[number];
         let n_classes = group.n_classes();
-        let predecessors = Ways::into_classes(group, parts);
-        let mut open = BinaryHeap::new();
-        let mut next: Vec<Estimate> =
-            (0..n_classes).map(|class| self.table.at(offset + class, self.problem.last())).collect();
-        let mut here = next.clone();
+        let Layer { here, next, open, .. } = layer;
+        next.clear();
+        next.extend((0..n_classes).map(|class| self.table.at(offset + class, self.problem.last())));
+        here.clone_from(next);
+        open.clear();
+        let (mut here, mut next) = (here.as_mut_slice(), next.as_mut_slice());
         for i in (0..self.problem.last()).rev() {
             match meter.spend(n_classes as u64) {
                 Signal::Continue => {}
                 signal => return signal,
             }
-            for (class, (here, next)) in here.iter_mut().zip(&next).enumerate() {
+            for (class, (here, next)) in here.iter_mut().zip(&*next).enumerate() {
                 here.distance = self.table.at(offset + class, i).distance;
                 here.cost_to_go = next.distance + next.cost_to_go;
             }
             for (class, next) in next.iter().enumerate() {
                 let cost = next.distance + next.cost_to_go;
                 for way in predecessors.of(class) {
-                    let from = &mut here[way.class as usize].cost_to_go;
-                    *from = from.min(way.share + cost);
+                    let matched = way.share + cost;
+                    let known = &mut here[way.class as usize].cost_to_go;
+                    if matched < *known {
+                        *known = matched;
+                    }
                 }
             }
             let least = self.least_terms[i * self.columns.len() + number];
             let least_distance = self.least_distances[i];
             for class in 0..n_classes {
                 let cost = here[class].distance - least + here[class].cost_to_go;
-                relax(&predecessors, class, cost, least_distance, &mut here, &mut open);
+                relax(predecessors, class, cost, least_distance, here, open);
             }
             while let Some(CheapestFirst { cost, id: class }) = open.pop() {
                 match meter.spend(1) {
@@ -325,7 +377,7 @@ impl<'p> Projected<'p> {
                 let entry = here[class as usize];
                 if cost <= entry.cost_to_go {
                     let cost = entry.distance - least + cost;
-                    relax(&predecessors, class as usize, cost, least_distance, &mut here, &mut open);
+                    relax(predecessors, class as usize, cost, least_distance, here, open);
                 }
             }
             for (class, entry) in here.iter().enumerate() {

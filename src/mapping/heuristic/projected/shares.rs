@@ -41,6 +41,7 @@ impl<'p> Parts<'p> {
 }
 
 /// The ways between classes, by where they lead or where they come from, the cheapest of each pair.
+#[derive(Debug)]
 pub(super) struct Ways(Rows<Way>);
 
 /// The way to or from a class: the least share of those that there are, and the least part, which may be of different ones.
@@ -76,6 +77,7 @@ impl Ways {
             }
             is_same
         });
+        ways.shrink_to_fit();
         Self(ways)
     }
 
@@ -97,5 +99,10 @@ impl Ways {
     /// How many there are.
     pub(super) fn len(&self) -> usize {
         self.0.n_items()
+    }
+
+    /// Size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        self.0.size_bytes()
     }
 }

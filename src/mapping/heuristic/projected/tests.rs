@@ -124,7 +124,7 @@ proptest! {
         let limit = optimum * (1.0 + room) + 1e-6;
         let close = 1e-9 * (1.0 + optimum);
 
-        let solved = Projected::solve(&projections, &problem, Grouping::Widest, MAX_ENTRIES, &mut Uninterrupted).unwrap();
+        let solved = Projected::solve(&projections, &problem, Grouping::Widest, MAX_ENTRIES, &mut Buffers::default(), &mut Uninterrupted).unwrap();
         let mut projected = solved.unwrap();
         // What no action changes is taken to be as it is at the start, so nothing is said of states that it does not lead to.
         let is_reached = |(i, state): &(usize, StateIdx)| from_start[*i][*state as usize].is_finite();
@@ -169,6 +169,7 @@ fn tables_have_no_more_entries_than_allowed_however_short_the_demonstration() {
     let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
     let projections = Projections::new(&model, &mut Uninterrupted).unwrap();
+    let mut buffers = Buffers::default();
     for n_observations in [1, 2, 8, 9] {
         let request = json!({"model": "m", "demonstration": vec![json!({"a": 50, "b": 3}); n_observations]});
         let mut faults = Faults::default();
@@ -176,9 +177,39 @@ fn tables_have_no_more_entries_than_allowed_however_short_the_demonstration() {
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         for max_entries in [0, 7, 107, 856, 1_000, 1_712] {
             let grouping = Grouping::WhenItPays;
-            let solved = Projected::solve(&projections, &problem, grouping, max_entries, &mut Uninterrupted).unwrap();
+            let solved =
+                Projected::solve(&projections, &problem, grouping, max_entries, &mut buffers, &mut Uninterrupted)
+                    .unwrap();
             let n_entries = solved.unwrap().table.n_entries();
             assert!(n_entries <= max_entries, "{n_entries}, not {max_entries}, of {n_observations} observations");
         }
+    }
+}
+
+#[test]
+fn buffers_of_other_problems_change_no_table() {
+    let states: Value = (0..12).map(|n| json!([n % 4, n / 4])).collect();
+    let ways: Value = (0..11).map(|n| json!([n, n % 2, n + 1])).collect();
+    let model = json!({
+        "attributes": [{"name": "a", "kind": "number"}, {"name": "b", "kind": "number"}],
+        "actions": [{"name": "on", "cost": 1}, {"name": "far", "cost": 3}],
+        "dynamics": {"kind": "table", "states": states, "transitions": ways, "start": 0},
+    });
+    let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    let projections = Projections::new(&model, &mut Uninterrupted).unwrap();
+    let mut buffers = Buffers::default();
+    for (a, b, n_observations) in [(1, 1, 5), (1, 0, 5), (0, 1, 9), (1, 1, 2), (2, 1, 2), (0, 0, 1), (1, 1, 5)] {
+        let demonstration: Value = (0..n_observations).map(|i| json!({"a": i % 4, "b": 2})).collect();
+        let request = json!({"model": "m", "demonstration": demonstration, "weights": {"a": a, "b": b}});
+        let mut faults = Faults::default();
+        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
+        let table = |buffers| {
+            let grouping = Grouping::WhenItPays;
+            let solved = Projected::solve(&projections, &problem, grouping, MAX_ENTRIES, buffers, &mut Uninterrupted);
+            format!("{:?}", solved.unwrap().unwrap().table)
+        };
+        assert_eq!(table(&mut buffers), table(&mut Buffers::default()), "weights {a} and {b}");
     }
 }

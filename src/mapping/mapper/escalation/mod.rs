@@ -1,8 +1,6 @@
 //! Searches that get more help the longer they take.
 
-use std::sync::PoisonError;
-
-use super::{Budget, Mapper, Mapping, Settings, conclude, within};
+use super::{Budget, Buffers, Mapper, Mapping, Settings, conclude, within};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::mapping::heuristic::GroupingPatience;
 use crate::mapping::heuristic::projected::{MAX_ENTRIES, Projected};
@@ -35,7 +33,7 @@ impl Mapper {
         let few_entries = few_entries.min(MAX_ENTRIES);
         let mut before: Option<(Projected<'_>, Found)> = None;
         for max_entries in [if is_small_budget { MAX_ENTRIES } else { few_entries }, MAX_ENTRIES] {
-            let solved = Projected::solve(&self.projections, problem, grouping, max_entries, interrupt)?;
+            let solved = self.solve(problem, grouping, max_entries, interrupt)?;
             // No time for estimates, so none for a search with them.
             let Some(mut projected) = solved else { break };
             projected.set_patience(patience.grouping);
@@ -98,13 +96,9 @@ impl Mapper {
         most_f: f64,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Found, Cancelled> {
-        let kept = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        let mut buffers = kept.unwrap_or_default();
-        let found = best_first::search(problem, space, projected, budget, most_f, &mut buffers, interrupt)?;
-        if buffers.are_small() {
-            self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
-        }
-        Ok(found)
+        self.with_buffers(|Buffers { searching, .. }| {
+            best_first::search(problem, space, projected, budget, most_f, searching, interrupt)
+        })
     }
 
     /// The cheapest mapping, from the cheapest ways to all states at each observation after the other.

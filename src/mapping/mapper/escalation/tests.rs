@@ -219,13 +219,8 @@ fn tables_left_out_at_first_and_sweeps_come_to_the_same_cost_as_a_search_without
     // The places' table is too large for a first attempt, which is not enough.
     let (mapper, request) = belt(3_000, 30);
     let request = read(&mapper, &request);
-    let few = Projected::solve(
-        &mapper.projections,
-        &request.problem,
-        Grouping::WhenItPays,
-        Patience::DEFAULT.few_entries,
-        &mut Uninterrupted,
-    );
+    let few_entries = Patience::DEFAULT.few_entries;
+    let few = mapper.solve(&request.problem, Grouping::WhenItPays, few_entries, &mut Uninterrupted);
     assert!(few.unwrap().unwrap().n_left_out() >= 90_000);
     let map = |heuristic| {
         let settings = Settings { heuristic, ..Settings::default() };
