@@ -23,13 +23,14 @@ pub(crate) struct ActiveAttribute<'m> {
     position: usize,
     attribute: &'m Attribute,
     weight: f64,
-    /// By observation: which of `observed` it saw, plus 1; 0 if it did not see the attribute. Shape `[n_observations]`.
+    /// By observation: the number of the value that it saw, from 1 on; 0 if it did not see the attribute. Shape
+    /// `[n_observations]`.
     rows: Vec<u32>,
-    /// Distinct observed values.
-    observed: Vec<Value>,
     domain: &'m [Value],
-    /// Shape `[1 + observed.len(), domain.len()]`, the first row zero; empty if that would be too large.
+    /// By number and domain index. Shape `[1 + n_observed, domain.len()]`, the first row zero; empty if that would be too large,
     table: Vec<f64>,
+    /// where these are the observed values, in the order of their numbers.
+    untabled: Vec<Value>,
 }
 
 /// Most entries of all tables together: 2 MB, which take a millisecond to fill. Values of larger domains are compared one by one.
@@ -44,19 +45,30 @@ impl<'m> Distances<'m> {
     ) -> Self {
         let mut n_entries_left = MAX_TABLE_ENTRIES;
         let weighted = schema.attributes().iter().zip(weights.as_slice()).enumerate();
-        let active = weighted.filter(|(_, (_, weight))| **weight > 0.0).map(|(position, (attribute, weight))| {
+        let mut observed = Observed::default();
+        let mut active = Vec::new();
+        for (position, (attribute, weight)) in weighted.filter(|(_, (_, weight))| **weight > 0.0) {
             let domain = states.domain(position);
-            let (rows, observed) = number_observed(demonstration, position);
-            let n_entries = (1 + observed.len()).saturating_mul(domain.len());
-            let mut active =
-                ActiveAttribute { position, attribute, weight: *weight, rows, observed, domain, table: Vec::new() };
+            let rows = observed.number(demonstration, position);
+            let values = &observed.values;
+            if values.is_empty() {
+                continue;
+            }
+            let n_entries = (1 + values.len()).saturating_mul(domain.len());
+            let (mut table, mut untabled) = (Vec::new(), Vec::new());
             if n_entries <= n_entries_left {
                 n_entries_left -= n_entries;
-                active.fill_table();
+                table.reserve_exact(n_entries);
+                table.resize(domain.len(), 0.0);
+                table.extend(
+                    values.iter().flat_map(|value| domain.iter().map(|own| attribute.term(*weight, value, own))),
+                );
+            } else {
+                untabled.extend(values.iter().copied().cloned());
             }
-            active
-        });
-        Self { active: active.filter(|active| !active.observed.is_empty()).collect() }
+            active.push(ActiveAttribute { position, attribute, weight: *weight, rows, domain, table, untabled });
+        }
+        Self { active }
     }
 
     /// `D(o_i, s)`, given the row of `s`. Finite, at least 0.
@@ -96,16 +108,7 @@ impl ActiveAttribute<'_> {
         match self.table.get(row * self.domain.len() + value) {
             Some(term) => *term,
             None if row == 0 => 0.0,
-            None => self.attribute.term(self.weight, &self.observed[row - 1], &self.domain[value]),
-        }
-    }
-
-    fn fill_table(&mut self) {
-        self.table.reserve_exact((1 + self.observed.len()) * self.domain.len());
-        self.table.extend(std::iter::repeat_n(0.0, self.domain.len()));
-        for observed in &self.observed {
-            let terms = self.domain.iter().map(|own| self.attribute.term(self.weight, observed, own));
-            self.table.extend(terms);
+            None => self.attribute.term(self.weight, &self.untabled[row - 1], &self.domain[value]),
         }
     }
 }
@@ -199,19 +202,72 @@ impl ObservedAttribute {
     }
 }
 
-/// Numbers the distinct values that a demonstration shows of the attribute at `position`: per observation its
-/// number plus 1, or 0 if it was not seen; and the values.
-fn number_observed(demonstration: &Demonstration, position: usize) -> (Vec<u32>, Vec<Value>) {
-    let mut numbers: FxHashMap<&Value, u32> = FxHashMap::default();
-    let mut observed = Vec::new();
-    let rows = (0..demonstration.len()).map(|i| {
-        let Some(value) = &demonstration.observation(i)[position] else { return 0 };
-        *numbers.entry(value).or_insert_with(|| {
-            observed.push(value.clone());
-            #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
-            let number = observed.len() as u32;
-            number
+/// The distinct values that a demonstration shows of an attribute.
+#[derive(Default)]
+struct Observed<'d> {
+    /// In the order in which they come.
+    values: Vec<&'d Value>,
+    /// Their numbers, from 1 on, once they are more than [`FEW`](Self::FEW).
+    numbers: FxHashMap<&'d Value, u32>,
+}
+
+impl<'d> Observed<'d> {
+    /// So many values are compared one by one in less time than hashing takes.
+    const FEW: usize = 16;
+
+    /// Forgets the values, and numbers those of the attribute at `position`. Gives the number of each observation's, or 0 if it
+    /// did not see the attribute.
+    fn number(&mut self, demonstration: &'d Demonstration, position: usize) -> Vec<u32> {
+        self.values.clear();
+        self.numbers.clear();
+        let seen = demonstration.iter().map(|observation| observation[position].as_ref());
+        seen.map(|value| value.map_or(0, |value| self.number_of(value))).collect()
+    }
+
+    #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
+    fn number_of(&mut self, value: &'d Value) -> u32 {
+        let known = if self.values.len() <= Self::FEW {
+            self.values.iter().position(|known| *known == value).map(|n| n as u32 + 1)
+        } else {
+            self.numbers.get(value).copied()
+        };
+        known.unwrap_or_else(|| {
+            self.values.push(value);
+            if self.values.len() > Self::FEW {
+                let first = self.numbers.len();
+                self.numbers.extend(self.values[first..].iter().copied().zip(first as u32 + 1..));
+            }
+            self.values.len() as u32
         })
-    });
-    (rows.collect(), observed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn observed_values_are_numbered_as_they_come_be_they_few_or_many() {
+        let few = i64::try_from(Observed::FEW).unwrap();
+        let demonstrations = [3, few, few + 1, 1, 40].map(|n_distinct| {
+            let values = (0..100).map(|i| (i % 9 != 8).then_some(Value::Integer(i * 7 % n_distinct)));
+            Demonstration::of(values.map(|value| vec![None, value])).unwrap()
+        });
+        let mut observed = Observed::default();
+        for demonstration in &demonstrations {
+            let rows = observed.number(demonstration, 1);
+            let mut known = Vec::new();
+            for (observation, row) in demonstration.iter().zip(rows) {
+                let Some(value) = &observation[1] else {
+                    assert_eq!(row, 0);
+                    continue;
+                };
+                if !known.contains(&value) {
+                    known.push(value);
+                }
+                assert_eq!(known[row as usize - 1], value);
+            }
+            assert_eq!(observed.values, known);
+        }
+    }
 }
