@@ -60,7 +60,8 @@ pub(super) fn complete<S: Space, H: Heuristic>(
     mut path: Vec<Move>,
     allowance: &mut Allowance<'_>,
 ) -> Result<Vec<Move>, Cancelled> {
-    let Some(end) = path.last().copied() else { return Ok(path) };
+    let end = path.last().copied().filter(|end| (end.observation as usize) < problem.last());
+    let Some(end) = end else { return Ok(path) };
     let (mut i, mut state) = (end.observation as usize, end.state);
     let mut seen = vec![state];
     while i < problem.last() {

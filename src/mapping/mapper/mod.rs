@@ -2,6 +2,7 @@
 
 mod escalation;
 
+use std::iter::repeat_n;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rustc_hash::FxHashMap;
@@ -316,14 +317,14 @@ fn conclude<S: Space, H: Heuristic>(
     let Found { paths, is_complete, least_f: lower_bound, n_expanded, n_generated } = found;
     let mut allowance = Allowance::new(interrupt);
     let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };
-    let mut costed = Vec::new();
-    for path in paths {
-        for extras in ways {
-            let moves = complete(problem, space, heuristic, *extras, path.clone(), &mut allowance)?;
-            costed.push((cost_of(problem, space, &moves), moves));
+    let mut best: Option<(Cost, Vec<Move>)> = None;
+    for (path, extras) in paths.into_iter().flat_map(|path| repeat_n(path, ways.len()).zip(ways)) {
+        let moves = complete(problem, space, heuristic, *extras, path, &mut allowance)?;
+        let cost = cost_of(problem, space, &moves);
+        if best.as_ref().is_none_or(|(least, _)| cost.total < least.total) {
+            best = Some((cost, moves));
         }
     }
-    let best = costed.into_iter().min_by(|(cost, _), (other, _)| cost.total.total_cmp(&other.total));
     let (cost, moves) = best.expect("a search gives at least one path");
     let is_optimal = cost.total * (1.0 - ROUNDING) <= lower_bound;
     Ok(Mapping {

@@ -367,17 +367,17 @@ impl<S: Space> Search<'_, '_, S> {
         let is_complete = end == End::Done;
         let least_f =
             if is_complete { f64::INFINITY } else { self.open().map(|node| node.f).fold(self.limit, f64::min) };
-        let ends = if let Some(incumbent) = self.incumbent {
-            vec![incumbent]
+        let path = |id| nodes.path(id, self.seen);
+        let paths = if let Some(incumbent) = self.incumbent {
+            vec![path(incumbent)]
         } else {
             // The farthest nodes, and among those the most promising: where it is best to go on greedily.
             let observation = |node: &Reached| nodes.step(node.id).observation;
             let farthest = self
                 .open()
                 .max_by(|node, other| observation(node).cmp(&observation(other)).then(other.f.total_cmp(&node.f)));
-            farthest.map(|node| node.id).into_iter().chain([first]).collect()
+            farthest.map(|node| node.id).into_iter().chain([first]).map(path).collect()
         };
-        let paths = ends.into_iter().map(|id| nodes.path(id, self.seen)).collect();
         Found { paths, is_complete, least_f, n_expanded: self.n_expanded, n_generated: self.n_generated }
     }
 }

@@ -315,6 +315,8 @@ impl Nodes {
             let Step { state, observation, kind } = self.step(id);
             let kind = if parent == NO_NODE { MoveKind::Start } else { kind };
             let action = (action != NO_ACTION).then_some(action);
+            // There is one for each observation up to here at least.
+            moves.reserve(observation as usize + 1);
             moves.push(Move { kind, action, observation, state: seen.state(state) });
             id = parent;
         }
