@@ -14,7 +14,6 @@
 //! divided into [`Buckets`]. The order within a bucket is not that of `f`, so a node may be expanded before the cheapest way to it is
 //! known; it is then expanded again.
 
-use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::ops::Range;
 
@@ -153,17 +152,28 @@ impl<S: Space> Search<'_, '_, S> {
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
     fn probe(&mut self, width: u64, Open { buckets, probed, ahead }: &mut Open) -> Result<End, Cancelled> {
-        let observation_of = |id| self.nodes.step(id).observation;
-        let known = self.open().map(|Reached { id, f, .. }| (observation_of(id), CheapestFirst { cost: f, id }));
-        let mut known: Vec<(u32, CheapestFirst)> = known.collect();
-        // Taken from the end.
-        known.sort_unstable_by_key(|(observation, _)| Reverse(*observation));
+        // Of each observation, the last of those that are open, and where the one before it is.
+        let mut last_of: Vec<Option<u32>> = vec![None; self.problem.last()];
+        let mut known = Vec::new();
+        for Reached { id, f, .. } in self.open() {
+            if let Some(last) = last_of.get_mut(self.nodes.step(id).observation as usize) {
+                #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
+                let before = last.replace(known.len() as u32);
+                known.push((CheapestFirst { cost: f, id }, before));
+            }
+        }
+        match self.meter.spend(known.len() as u64) {
+            Signal::Continue => {}
+            Signal::Finish => return Ok(End::CutShort),
+            Signal::Cancel => return Err(Cancelled),
+        }
         ahead.clear();
-        for observation in 0..self.last {
+        for (observation, mut last) in (0..).zip(last_of) {
             probed.clear();
             probed.extend(ahead.drain(..));
-            while let Some((_, node)) = known.pop_if(|(of, _)| *of == observation) {
+            while let Some((node, before)) = last.map(|at| known[at as usize]) {
                 probed.push(node);
+                last = before;
             }
             let mut n_left = width;
             while let Some(CheapestFirst { id, .. }) = probed.pop() {
