@@ -12,7 +12,7 @@
 
 mod by_attribute;
 mod labels;
-mod observed;
+mod reading;
 mod schema;
 mod value;
 mod weights;
@@ -21,7 +21,7 @@ use serde::Serialize;
 
 pub use by_attribute::ByAttribute;
 pub use labels::Labels;
-pub(crate) use observed::Observed;
+pub(crate) use reading::ValueSeed;
 pub use schema::{AttributeDocument, KindName, Schema};
 pub use value::{Scalar, Value};
 pub use weights::Weights;

@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::de::{DeserializeSeed, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 
-use crate::attribute::{Observed, Schema, Value};
+use crate::attribute::{Schema, Value, ValueSeed};
 use crate::document::{Faults, Place};
 
 /// The observed states `o_0 .. o_n` of a demonstration, at least one. Nothing is known of the demonstrator's actions.
@@ -129,7 +129,7 @@ impl<'de> Visitor<'de> for OneObservation<'_, '_> {
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
         for attribute in self.schema.attributes() {
-            let value = items.next_element_seed(Observed(attribute))?;
+            let value = items.next_element_seed(ValueSeed(attribute))?;
             self.values.push(value.ok_or_else(|| A::Error::custom("too few values"))?);
         }
         // One too many is an error of the deserializer.
@@ -143,7 +143,7 @@ impl<'de> Visitor<'de> for OneObservation<'_, '_> {
         let mut expected = 0;
         while let Some(position) = members.next_key_seed(Name { schema: self.schema, expected })? {
             let attribute = &self.schema.attributes()[position];
-            self.values[first + position] = members.next_value_seed(Observed(attribute))?;
+            self.values[first + position] = members.next_value_seed(ValueSeed(attribute))?;
             expected = position + 1;
         }
         Ok(())

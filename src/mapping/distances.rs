@@ -45,7 +45,7 @@ impl<'m> Distances<'m> {
     ) -> Self {
         let mut n_entries_left = MAX_TABLE_ENTRIES;
         let weighted = schema.attributes().iter().zip(weights.as_slice()).enumerate();
-        let mut observed = Observed::default();
+        let mut observed = DistinctValues::default();
         let mut active = Vec::new();
         for (position, (attribute, weight)) in weighted.filter(|(_, (_, weight))| **weight > 0.0) {
             let domain = states.domain(position);
@@ -204,14 +204,14 @@ impl ObservedAttribute {
 
 /// The distinct values that a demonstration shows of an attribute.
 #[derive(Default)]
-struct Observed<'d> {
+struct DistinctValues<'d> {
     /// In the order in which they come.
     values: Vec<&'d Value>,
     /// Their numbers, from 1 on, once they are more than [`FEW`](Self::FEW).
     numbers: FxHashMap<&'d Value, u32>,
 }
 
-impl<'d> Observed<'d> {
+impl<'d> DistinctValues<'d> {
     /// So many values are compared one by one in less time than hashing takes.
     const FEW: usize = 16;
 
@@ -248,12 +248,12 @@ mod tests {
 
     #[test]
     fn observed_values_are_numbered_as_they_come_be_they_few_or_many() {
-        let few = i64::try_from(Observed::FEW).unwrap();
+        let few = i64::try_from(DistinctValues::FEW).unwrap();
         let demonstrations = [3, few, few + 1, 1, 40].map(|n_distinct| {
             let values = (0..100).map(|i| (i % 9 != 8).then_some(Value::Integer(i * 7 % n_distinct)));
             Demonstration::of(values.map(|value| vec![None, value])).unwrap()
         });
-        let mut observed = Observed::default();
+        let mut observed = DistinctValues::default();
         for demonstration in &demonstrations {
             let rows = observed.number(demonstration, 1);
             let mut known = Vec::new();

@@ -1,4 +1,4 @@
-//! Reading observed values from JSON as it comes, without a document in between.
+//! Reading values from JSON as it comes, without a document in between.
 
 use std::fmt;
 
@@ -6,11 +6,11 @@ use serde::de::{DeserializeSeed, Deserializer, Error, Visitor};
 
 use super::{Attribute, Cycle, Kind, Value};
 
-/// Reads a value of this attribute, or `null`: not observed. What is a value is what [`Attribute::read_value`] takes for one; an error
-/// does not tell what is wrong, as faults do.
-pub(crate) struct Observed<'a>(pub(crate) &'a Attribute);
+/// Reads a value of this attribute, or `null`: not observed. What is a value is what [`Attribute::read_value`] takes for one, and a
+/// property of demonstrations holds the two together; an error does not tell what is wrong, as faults do.
+pub(crate) struct ValueSeed<'a>(pub(crate) &'a Attribute);
 
-impl<'de> DeserializeSeed<'de> for Observed<'_> {
+impl<'de> DeserializeSeed<'de> for ValueSeed<'_> {
     type Value = Option<Value>;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
@@ -18,7 +18,7 @@ impl<'de> DeserializeSeed<'de> for Observed<'_> {
     }
 }
 
-impl Visitor<'_> for Observed<'_> {
+impl Visitor<'_> for ValueSeed<'_> {
     type Value = Option<Value>;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -66,7 +66,7 @@ impl Visitor<'_> for Observed<'_> {
     }
 }
 
-impl Observed<'_> {
+impl ValueSeed<'_> {
     /// A number, if the attribute's values are some.
     fn number(&self, number: f64) -> Option<Value> {
         // Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bits.
