@@ -16,7 +16,7 @@
 //! Problem (model, demonstration, weights, start)
 //!    |                     Projections (per model) --> Projected (per problem: distances, costs-to-go)
 //!    v                                                     |
-//! Mapper::map ---- search (best first) <-------------------+
+//! Mapper::map ---- search (layer by layer, best first) <---+
 //!    |                |  budget over: the incumbent, or completion (greedy)
 //!    v                v
 //! Mapping (moves, status, lower bound, counts) --> Policy (what a client gets), WrittenPolicy (the same, as it is answered and stored)
@@ -25,9 +25,10 @@
 //! [`OnlineMapping`] does the same while the demonstration is still running.
 //!
 //! **Ties.** Among mappings of equal cost the search returns the one that it comes to first, which is determined: what was
-//! found is given up only for what costs less. Nodes are expanded in the order of `f` to a thousandth, the most recently found of
-//! equals first; the first way found to a node at its least cost is kept; successors are found in the order `skip`, then
-//! by action `match` before `extra`. Costs are compared as the sums of floats along the path. A search that takes long may be
+//! found is given up only for what costs less. Of a node's successors `skip` is found first, then, by action, `match` before `extra`;
+//! the first way found to a node at its least cost is kept; costs are compared as the sums of floats along the path. Small problems
+//! are searched layer by layer, those nodes first that beams keep, and in the order in which they were found. In others nodes are
+//! expanded in the order of `f` to a thousandth, the most recently found of equals first. A search that takes long may be
 //! replaced by a sweep over all nodes, which tells them apart as [`OnlineMapping`] does; when it is depends on the problem and the budget
 //! alone.
 

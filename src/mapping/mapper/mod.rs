@@ -16,7 +16,7 @@ use super::heuristic::paper::Paper;
 use super::heuristic::projected::{self, MAX_ENTRIES, Projected};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
-use super::search::{Found, Move, astar, best_first};
+use super::search::{Found, Move, astar, best_first, layered};
 use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
 use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
 use escalation::Patience;
@@ -123,13 +123,14 @@ pub struct Mapper {
 struct Buffers {
     solving: projected::Buffers,
     searching: best_first::Buffers,
+    layered: layered::Buffers,
 }
 
 impl Buffers {
     /// Whether they are small enough to be kept.
     fn are_small(&self) -> bool {
         const MAX_BYTES: usize = 16 << 20;
-        self.solving.kept_bytes() + self.searching.kept_bytes() <= MAX_BYTES
+        self.solving.kept_bytes() + self.searching.kept_bytes() + self.layered.kept_bytes() <= MAX_BYTES
     }
 }
 
@@ -213,7 +214,10 @@ impl Mapper {
         // Sums in another order may be a little larger; a little room costs nothing.
         let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
         match settings.heuristic {
-            HeuristicName::Default => self.best_first(space, problem, settings, most_f, interrupt),
+            HeuristicName::Default => match self.layered(space, problem, settings, most_f, interrupt)? {
+                Some(mapping) => Ok(mapping),
+                None => self.best_first(space, problem, settings, most_f, interrupt),
+            },
             HeuristicName::None => {
                 let found = astar::search(problem, space, &Blind, budget, most_f, interrupt)?;
                 conclude(problem, space, &Blind, within(most_f, found, problem), interrupt)
@@ -231,6 +235,29 @@ impl Mapper {
                 }
             }
         }
+    }
+
+    /// What a search layer by layer finds; `None` if the problem is too large for it, or its budget too small.
+    fn layered<S: Space>(
+        &self,
+        space: &mut S,
+        problem: &Problem<'_>,
+        settings: Settings,
+        most_f: f64,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<Mapping>, Cancelled> {
+        let Settings { budget, grouping, .. } = settings;
+        let n_states = if grouping == Grouping::Widest { None } else { space.n_states() };
+        let n_nodes = n_states.map_or(usize::MAX, |n_states| n_states.saturating_mul(problem.demonstration.len()));
+        if n_nodes > self.patience.max_layered_nodes || !layered::is_within(budget, n_nodes) {
+            return Ok(None);
+        }
+        let solved = self.solve(problem, grouping, MAX_ENTRIES, interrupt)?;
+        let Some(projected) = solved.filter(Projected::are_all_in_columns) else { return Ok(None) };
+        let found = self.with_buffers(|Buffers { layered, .. }| {
+            layered::search(problem, &projected, budget, most_f, layered, interrupt)
+        })?;
+        conclude(problem, space, &projected, within(most_f, found, problem), interrupt).map(Some)
     }
 
     /// The tables of [`Projected::solve`].

@@ -2,7 +2,8 @@
 //!
 //! | module | is | used with |
 //! |---|---|---|
-//! | [`best_first`] | A* for consistent estimates, with an incumbent and buckets | the default heuristic |
+//! | [`layered`] | beams, and what they leave, layer by layer | the default heuristic, in small problems |
+//! | [`best_first`] | A* for consistent estimates, with an incumbent and buckets | the default heuristic, in larger ones |
 //! | [`astar`] | A* as in the textbook | the paper's heuristic, which is not consistent, and none |
 //! | [`seen`], [`nodes`] with [`index`], [`buckets`] | the states, the closed and the open list of [`best_first`] | |
 
@@ -10,6 +11,7 @@ pub(super) mod astar;
 pub(super) mod best_first;
 mod buckets;
 mod index;
+pub(super) mod layered;
 mod nodes;
 mod seen;
 

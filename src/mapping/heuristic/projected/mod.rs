@@ -85,6 +85,14 @@ pub(in crate::mapping) struct ChangingColumn {
     offset: u32,
 }
 
+impl ChangingColumn {
+    /// The attribute's position.
+    #[inline]
+    pub(in crate::mapping) fn position(self) -> usize {
+        self.position as usize
+    }
+}
+
 /// What solving takes besides its result, kept to be used again.
 #[derive(Debug, Default)]
 pub(in crate::mapping) struct Buffers {
@@ -248,7 +256,17 @@ impl<'p> Projected<'p> {
     /// observation it is nothing.
     #[inline]
     pub(in crate::mapping) fn estimate_chunk(&self, first: usize, classes: &[u32]) -> [Estimate; CHUNK_LEN] {
-        let mut sums = self.unchanged[first..].first_chunk().copied().unwrap_or_default();
+        self.sum_chunk(self.unchanged[first..].first_chunk().copied().unwrap_or_default(), first, classes)
+    }
+
+    /// The same, but of these classes alone, to be added to `sums`.
+    #[inline]
+    pub(in crate::mapping) fn sum_chunk(
+        &self,
+        mut sums: [Estimate; CHUNK_LEN],
+        first: usize,
+        classes: &[u32],
+    ) -> [Estimate; CHUNK_LEN] {
         for class in classes {
             let Some(entries) = self.table.chunk(*class as usize, first) else { continue };
             sums.iter_mut().zip(entries).for_each(|(sum, entry)| *sum += *entry);

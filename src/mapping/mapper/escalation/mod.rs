@@ -158,6 +158,8 @@ fn joined(before: Found, found: Found) -> Found {
 /// When a search that takes long gets more help.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Patience {
+    /// Most nodes, observations times states, of a problem that is searched layer by layer.
+    pub(super) max_layered_nodes: usize,
     /// Most entries of the tables of a search's first attempt,
     few_entries: usize,
     /// or so many per observation, if that is more.
@@ -174,6 +176,8 @@ pub(super) struct Patience {
 
 impl Patience {
     pub(super) const DEFAULT: Self = Self {
+        // To make room for as many takes ten microseconds.
+        max_layered_nodes: 1 << 16,
         // They take half a millisecond.
         few_entries: 1 << 16,
         // Two microseconds, which is no more than the search is bound to take.

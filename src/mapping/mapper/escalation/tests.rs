@@ -100,6 +100,7 @@ fn hall() -> impl Strategy<Value = (Value, Value)> {
 
 /// Whatever takes long is done as soon as may be.
 const IMPATIENT: Patience = Patience {
+    max_layered_nodes: 0,
     few_entries: 0,
     few_entries_per_observation: 8,
     entries_per_expansion: 16,
@@ -115,6 +116,8 @@ proptest! {
     fn whatever_helps_a_long_search_leads_to_the_optimum_and_to_true_bounds(
         (model, request) in prop_oneof![wander(), hall()],
         helps in prop_oneof![
+            Just(Patience::DEFAULT),
+            Just(Patience { max_layered_nodes: 0, ..Patience::DEFAULT }),
             Just(IMPATIENT),
             Just(Patience { min_expansions_before_sweep: u64::MAX, ..IMPATIENT }),
             Just(Patience { grouping: GroupingPatience::DEFAULT, ..IMPATIENT }),
@@ -170,7 +173,7 @@ proptest! {
     fn what_a_mapper_searched_before_makes_no_difference(
         (model, request) in prop_oneof![wander(), hall()],
         variations in variations(),
-        patience in prop::sample::select(vec![Patience::DEFAULT, IMPATIENT]),
+        patience in prop::sample::select(vec![Patience::DEFAULT, Patience { max_layered_nodes: 0, ..Patience::DEFAULT }, IMPATIENT]),
     ) {
         let fresh = || Mapper { patience, ..prepared(&model) };
         let reused = fresh();
