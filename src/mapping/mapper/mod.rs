@@ -249,7 +249,7 @@ impl Mapper {
         let Settings { budget, grouping, .. } = settings;
         let n_states = if grouping == Grouping::Widest { None } else { space.n_states() };
         let n_nodes = n_states.map_or(usize::MAX, |n_states| n_states.saturating_mul(problem.demonstration.len()));
-        if n_nodes > self.patience.max_layered_nodes || !layered::is_within(budget, n_nodes) {
+        if n_nodes > self.patience.max_layered_nodes || !layered::is_within(budget, &self.model, n_nodes) {
             return Ok(None);
         }
         let solved = self.solve(problem, grouping, MAX_ENTRIES, interrupt)?;

@@ -14,7 +14,7 @@
 
 use rustc_hash::FxHashMap;
 
-use super::{Found, Move, MoveKind, NO_ACTION, POLL_EVERY};
+use super::{Found, Move, MoveKind, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{CHUNK_LEN, ChangingColumn, Estimate, Projected};
@@ -46,6 +46,7 @@ struct Body {
 #[derive(Clone, Copy, Debug)]
 struct Way {
     cost: f64,
+    from: StateIdx,
     to: StateIdx,
     action: ActionIdx,
 }
@@ -64,15 +65,42 @@ struct Nodes {
     open: Vec<Vec<StateIdx>>,
 }
 
-/// How the way to a node ends.
-#[derive(Clone, Copy, Debug)]
-struct Link {
-    from: StateIdx,
-    action: ActionIdx,
-    kind: MoveKind,
-}
+/// How the way to a node ends: with an action, numbered as the way out of a state that it goes, or without one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Link(u32);
 
-const START: Link = Link { from: StateIdx::MAX, action: NO_ACTION, kind: MoveKind::Start };
+impl Link {
+    const START: Self = Self(u32::MAX);
+    const SKIP: Self = Self(u32::MAX - 1);
+
+    /// With an action that advances.
+    #[inline]
+    fn matched(way: usize) -> Self {
+        #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_WAYS")]
+        let way = way as u32;
+        Self(way << 1)
+    }
+
+    /// With an action that does not.
+    #[inline]
+    fn extra(way: usize) -> Self {
+        Self(Self::matched(way).0 | 1)
+    }
+
+    #[inline]
+    fn kind(self) -> MoveKind {
+        match self {
+            Self::START => MoveKind::Start,
+            Self::SKIP => MoveKind::Skip,
+            Self(way) if way & 1 == 0 => MoveKind::Match,
+            Self(_) => MoveKind::Extra,
+        }
+    }
+
+    fn way(self) -> Option<usize> {
+        (self.0 < Self::SKIP.0).then_some(self.0 as usize >> 1)
+    }
+}
 
 impl Buffers {
     /// How much memory is kept, in bytes.
@@ -87,10 +115,15 @@ impl Buffers {
 /// How much memory a node takes, in bytes.
 const NODE_BYTES: usize = size_of::<f64>() + size_of::<Link>() + size_of::<bool>() + size_of::<StateIdx>();
 
-/// Whether `n_nodes`, the observations times the states, may be searched: there is memory for all of them, and each may be
-/// expanded and expanded again.
-pub(in crate::mapping) fn is_within(budget: Budget, n_nodes: usize) -> bool {
-    n_nodes.saturating_mul(NODE_BYTES) <= budget.max_bytes && 2 * n_nodes as u64 <= budget.max_expansions
+/// Most transitions of a model: their copies take 6 MB.
+const MAX_WAYS: usize = 1 << 18;
+
+/// Whether `n_nodes` of `model`, its states at so many observations, may be searched: there is memory for all of them, and
+/// each may be expanded and expanded again.
+pub(in crate::mapping) fn is_within(budget: Budget, model: &Model, n_nodes: usize) -> bool {
+    model.graph().n_transitions() <= MAX_WAYS
+        && n_nodes.saturating_mul(NODE_BYTES) <= budget.max_bytes
+        && 2 * n_nodes as u64 <= budget.max_expansions
 }
 
 /// Finds the cheapest mapping, if `interrupt` allows, among those of at most `most`, of which there must be one. All that
@@ -131,7 +164,10 @@ pub(in crate::mapping) fn search(
     let Search { cheapest, n_expanded, n_generated, .. } = search;
     let start = parts.estimate(parts.at(0), problem.start);
     Ok(Found {
-        paths: vec![cheapest.map_or_else(|| nodes.path(0, problem.start), |state| nodes.path(problem.last(), state))],
+        paths: vec![
+            cheapest
+                .map_or_else(|| nodes.path(body, 0, problem.start), |state| nodes.path(body, problem.last(), state)),
+        ],
         is_complete,
         least_f: if is_complete { f64::INFINITY } else { start.distance + start.cost_to_go },
         n_expanded,
@@ -221,7 +257,7 @@ impl Search<'_> {
                 n_kept += usize::from(is_kept);
                 continue;
             }
-            let ways = self.body.ways(state);
+            let (first_way, ways) = self.body.ways(state);
             match self.meter.spend(1 + 2 * ways.len() as u64) {
                 Signal::Continue if self.n_expanded < self.budget.max_expansions => {}
                 Signal::Continue | Signal::Finish => return Ok(End::CutShort),
@@ -229,29 +265,29 @@ impl Search<'_> {
             }
             n_left -= 1;
             are_open[state as usize] = false;
-            let kind = links[state as usize].kind;
+            let kind = links[state as usize].kind();
             let (may_skip, may_linger) = (kind != MoveKind::Extra, kind != MoveKind::Skip);
             self.n_expanded += 1;
             self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
-            let mut advance = |to: StateIdx, cost: f64, action: ActionIdx, kind: MoveKind| {
+            let mut advance = |to: StateIdx, cost: f64, link: Link| {
                 let known = &mut next_costs[to as usize];
                 if cost < *known {
                     *known = cost;
-                    next_links[to as usize] = Link { from: state, action, kind };
+                    next_links[to as usize] = link;
                     if !std::mem::replace(&mut are_next_open[to as usize], true) {
                         next_open.push(to);
                     }
                 }
             };
             if may_skip {
-                advance(state, before, NO_ACTION, MoveKind::Skip);
+                advance(state, before, Link::SKIP);
             }
-            for &Way { cost, to, action } in ways {
+            for (number, &Way { cost, to, .. }) in (first_way..).zip(ways) {
                 let cost = before + cost;
-                advance(to, cost, action, MoveKind::Match);
+                advance(to, cost, Link::matched(number));
                 if may_linger && cost < costs[to as usize] {
                     costs[to as usize] = cost;
-                    links[to as usize] = Link { from: state, action, kind: MoveKind::Extra };
+                    links[to as usize] = Link::extra(number);
                     if !std::mem::replace(&mut are_open[to as usize], true) {
                         open.push(to);
                     }
@@ -300,30 +336,31 @@ impl Nodes {
         self.costs.resize(n_nodes, f64::INFINITY);
         self.are_open.clear();
         self.are_open.resize(n_nodes, false);
-        self.links.resize(n_nodes.max(self.links.len()), START);
+        self.links.resize(n_nodes.max(self.links.len()), Link::START);
         self.open.iter_mut().for_each(Vec::clear);
         self.open.resize_with(n_observations.max(self.open.len()), Vec::new);
 
         self.costs[problem.start as usize] = 0.0;
-        self.links[problem.start as usize] = START;
+        self.links[problem.start as usize] = Link::START;
         self.are_open[problem.start as usize] = true;
         self.open[0].push(problem.start);
     }
 
-    /// The way from the start to a node.
-    fn path(&self, mut observation: usize, mut state: StateIdx) -> Vec<Move> {
+    /// The way of `body` from the start to a node.
+    fn path(&self, body: &Body, mut observation: usize, mut state: StateIdx) -> Vec<Move> {
         let mut moves = Vec::with_capacity(2 * observation + 1);
         loop {
-            let Link { from, action, kind } = self.links[observation * self.n_states + state as usize];
-            let action = (action != NO_ACTION).then_some(action);
+            let link = self.links[observation * self.n_states + state as usize];
+            let kind = link.kind();
+            let way = link.way().map(|way| body.ways[way]);
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
-            moves.push(Move { kind, action, observation: observation as u32, state });
+            moves.push(Move { kind, action: way.map(|way| way.action), observation: observation as u32, state });
             match kind {
                 MoveKind::Start => break,
                 MoveKind::Extra => {}
                 MoveKind::Match | MoveKind::Skip => observation -= 1,
             }
-            state = from;
+            state = way.map_or(state, |way| way.from);
         }
         moves.reverse();
         moves
@@ -340,6 +377,7 @@ impl Body {
             let ways = model.graph().successors(state).iter();
             self.ways.extend(ways.map(|way| Way {
                 cost: model.action(way.action).cost,
+                from: state,
                 to: way.to,
                 action: way.action,
             }));
@@ -347,11 +385,11 @@ impl Body {
         }
     }
 
-    /// The ways out of a state.
+    /// The ways out of a state, and the number of the first.
     #[inline]
-    fn ways(&self, state: StateIdx) -> &[Way] {
+    fn ways(&self, state: StateIdx) -> (usize, &[Way]) {
         let begin = (state as usize).checked_sub(1).map_or(0, |before| self.ends[before]);
-        &self.ways[begin..self.ends[state as usize]]
+        (begin, &self.ways[begin..self.ends[state as usize]])
     }
 }
 
