@@ -89,6 +89,7 @@ pub(in crate::mapping) fn search<S: Space>(
     // The start is kept whatever it costs: it is what is left to complete if there is no budget at all.
     let estimates = &Estimates { seen, projected, space };
     let first = nodes.take(&mut nodes.find(state, 0), start, estimates, f64::INFINITY);
+    let least_f = first.map_or(0.0, |first| first.f);
     let first = first.map_or(NO_NODE, |first| first.id);
     let mut search = Search {
         problem,
@@ -98,6 +99,7 @@ pub(in crate::mapping) fn search<S: Space>(
         seen,
         nodes,
         limit: most.next_up(),
+        least_f,
         incumbent: (problem.last() == 0).then_some(first),
         n_expanded: 0,
         n_generated: 0,
@@ -135,6 +137,8 @@ struct Search<'s, 'p, S> {
     nodes: &'s mut Nodes,
     /// Mappings of this cost or more are of no interest.
     limit: f64,
+    /// No node's `f` is less.
+    least_f: f64,
     /// The end of the cheapest mapping that was found.
     incumbent: Option<NodeId>,
     n_expanded: u64,
@@ -155,17 +159,17 @@ impl<S: Space> Search<'_, '_, S> {
         // Of each observation, the last of those that are open, and where the one before it is.
         let mut last_of: Vec<Option<u32>> = vec![None; self.problem.last()];
         let mut known = Vec::new();
-        for Reached { id, f, .. } in self.open() {
+        for Reached { id, f, .. } in self.nodes.open().filter(|node| node.f < self.limit) {
+            match self.meter.spend(1) {
+                Signal::Continue => {}
+                Signal::Finish => return Ok(End::CutShort),
+                Signal::Cancel => return Err(Cancelled),
+            }
             if let Some(last) = last_of.get_mut(self.nodes.step(id).observation as usize) {
                 #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
                 let before = last.replace(known.len() as u32);
                 known.push((CheapestFirst { cost: f, id }, before));
             }
-        }
-        match self.meter.spend(known.len() as u64) {
-            Signal::Continue => {}
-            Signal::Finish => return Ok(End::CutShort),
-            Signal::Cancel => return Err(Cancelled),
         }
         ahead.clear();
         for (observation, mut last) in (0..).zip(last_of) {
@@ -210,7 +214,7 @@ impl<S: Space> Search<'_, '_, S> {
                 return Ok(End::CutShort);
             }
         }
-        let mut bucketed_limit = self.fill_buckets(&mut open.buckets);
+        let Some(mut bucketed_limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(End::CutShort) };
         let mut help_at = self.projected.deepening_due().min(probe_at(probe_width));
         while let Some(Reached { id, g, f }) = open.buckets.pop() {
             // Of a node that was put in more than once, the cheapest way comes out first.
@@ -237,7 +241,8 @@ impl<S: Space> Search<'_, '_, S> {
             // What a probe found is not in the buckets, and better estimates are for others; and those for a much higher limit
             // are too wide.
             if is_deepening_due || is_probe_due || self.limit < bucketed_limit / 4.0 {
-                bucketed_limit = self.fill_buckets(&mut open.buckets);
+                let Some(limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(End::CutShort) };
+                bucketed_limit = limit;
                 help_at = self.projected.deepening_due().min(probe_at(probe_width));
             }
         }
@@ -264,11 +269,17 @@ impl<S: Space> Search<'_, '_, S> {
         self.probe(1, open)
     }
 
-    /// Puts all open nodes into the buckets, and gives the limit that these are for.
-    fn fill_buckets(&mut self, buckets: &mut Buckets) -> f64 {
-        buckets.reset(self.open().map(|node| node.f).fold(self.limit, f64::min), self.limit);
-        self.open().for_each(|node| buckets.push(node));
-        self.limit
+    /// Puts all open nodes into the buckets, and gives the limit that these are for; `None` if there is no time for it.
+    fn fill_buckets(&mut self, buckets: &mut Buckets) -> Result<Option<f64>, Cancelled> {
+        buckets.reset(self.least_f.min(self.limit), self.limit);
+        for node in self.nodes.open().filter(|node| node.f < self.limit) {
+            match self.meter.spend(1) {
+                Signal::Continue => buckets.push(node),
+                Signal::Finish => return Ok(None),
+                Signal::Cancel => return Err(Cancelled),
+            }
+        }
+        Ok(Some(self.limit))
     }
 
     /// The nodes that are to be expanded.
