@@ -92,7 +92,7 @@ fn the_builder_is_sent_and_copies_whatever_the_program_includes() {
         assert!(root().join(copy).exists(), "{}", copy.display());
         assert!(is_sent(copy), "{}", copy.display());
     }
-    for path in ["src/lib.rs", "Cargo.toml", "Cargo.lock"].map(Path::new) {
+    for path in [".cargo/config.toml", "src/lib.rs", "Cargo.toml", "Cargo.lock"].map(Path::new) {
         assert!(is_copied(path) && is_sent(path), "{}", path.display());
     }
 }
