@@ -456,12 +456,12 @@ pub(super) fn read_weighted_request<'m>(model: &'m Model, document: &Value) -> R
     read_request(model, document, &Request::FIELDS, |_| Some(model.schema().weights()))
 }
 
-/// Logs what a search gave.
+/// Measures and logs what a search gave: in detail, as the policy says as much, and each request has a line of its own.
 pub(super) fn report(stamp: &Stamp, mapping: &Mapping) {
     metrics::counter!("etude_searches_total", "status" => mapping.status.name()).increment(1);
     #[expect(clippy::cast_precision_loss, reason = "searches take less than centuries")]
     metrics::histogram!("etude_search_duration_seconds").record(stamp.elapsed_us as f64 / 1e6);
-    tracing::info!(
+    tracing::debug!(
         model = stamp.model,
         status = mapping.status.name(),
         cost = mapping.cost.total,
