@@ -8,6 +8,7 @@
 //! that has to be answered by some time runs beside the pool if it has waited until then: to finish at once is all that it can do.
 //! What nobody waits for runs where there is a thread to spare, and is stopped as soon as somebody needs that.
 
+use std::borrow::Borrow;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
@@ -46,7 +47,11 @@ pub enum PoolError {
 
 /// The pool.
 #[derive(Clone, Debug)]
-pub struct SearchPool {
+pub struct SearchPool(Arc<Shared>);
+
+/// What all jobs share, which is counted as a whole, not part by part: every request has a place of its own.
+#[derive(Debug)]
+struct Shared {
     settings: PoolSettings,
     admitted: Arc<Semaphore>,
     threads: Arc<Semaphore>,
@@ -63,7 +68,7 @@ impl SearchPool {
     #[must_use]
     pub fn new(settings: PoolSettings, tasks: TaskTracker, abort: CancellationToken) -> Self {
         let n_threads = settings.n_threads.max(1);
-        Self {
+        Self(Arc::new(Shared {
             settings,
             admitted: Arc::new(Semaphore::new(n_threads + settings.max_waiting)),
             threads: Arc::new(Semaphore::new(n_threads)),
@@ -71,19 +76,19 @@ impl SearchPool {
             readers: Arc::new(Semaphore::new(n_threads)),
             tasks,
             abort,
-        }
+        }))
     }
 
     /// How many jobs run at the same time, at most.
     #[must_use]
     pub fn n_threads(&self) -> usize {
-        self.settings.n_threads.max(1)
+        self.0.settings.n_threads.max(1)
     }
 
     /// How many jobs are in the pool, waiting or running.
     #[must_use]
     pub fn n_jobs(&self) -> usize {
-        self.n_threads() + self.settings.max_waiting - self.admitted.available_permits()
+        self.n_threads() + self.0.settings.max_waiting - self.0.admitted.available_permits()
     }
 
     /// A place in the pool, for all that a request needs.
@@ -92,7 +97,7 @@ impl SearchPool {
     ///
     /// [`PoolError::Busy`] at once if the queue is full.
     pub fn admit(&self) -> Result<Admission, PoolError> {
-        let admitted = Arc::clone(&self.admitted).try_acquire_owned().map_err(|_| PoolError::Busy)?;
+        let admitted = Arc::clone(&self.0.admitted).try_acquire_owned().map_err(|_| PoolError::Busy)?;
         Ok(Admission { pool: self.clone(), admitted: Arc::new(admitted), patience: None })
     }
 
@@ -106,7 +111,7 @@ impl SearchPool {
         T: Send + 'static,
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
-        let cancel = self.abort.child_token();
+        let cancel = self.0.abort.child_token();
         let thread = self.thread().await?;
         self.run_holding(thread, None, cancel, job).await
     }
@@ -123,9 +128,9 @@ impl SearchPool {
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
         let has_others = self.n_threads() > 1;
-        let free = Arc::clone(&self.threads).try_acquire_many_owned(if has_others { 2 } else { 1 });
+        let free = Arc::clone(&self.0.threads).try_acquire_many_owned(if has_others { 2 } else { 1 });
         let thread = free.ok().and_then(|mut free| free.split(1)).ok_or(PoolError::Busy)?;
-        let (threads, n_waiting) = (Arc::clone(&self.threads), Arc::clone(&self.n_waiting));
+        let (threads, n_waiting) = (Arc::clone(&self.0.threads), Arc::clone(&self.0.n_waiting));
         let yielding = move |watch: &mut dyn Interrupt| {
             let mut last_since: Option<Instant> = None;
             let mut is_needed = || {
@@ -136,8 +141,8 @@ impl SearchPool {
             };
             job(&mut || if is_needed() { Signal::Cancel } else { watch.poll() })
         };
-        match self.run_holding(thread, None, self.abort.child_token(), yielding).await {
-            Err(PoolError::Stopped) if !self.abort.is_cancelled() => Err(PoolError::Busy),
+        match self.run_holding(thread, None, self.0.abort.child_token(), yielding).await {
+            Err(PoolError::Stopped) if !self.0.abort.is_cancelled() => Err(PoolError::Busy),
             answer => answer,
         }
     }
@@ -153,25 +158,25 @@ impl SearchPool {
         T: Send + 'static,
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
-        self.run_holding((), None, self.abort.child_token(), job).await
+        self.run_holding((), None, self.0.abort.child_token(), job).await
     }
 
     /// Waits for a thread.
     async fn thread(&self) -> Result<OwnedSemaphorePermit, PoolError> {
-        if !self.abort.is_cancelled()
-            && let Ok(thread) = Arc::clone(&self.threads).try_acquire_owned()
+        if !self.0.abort.is_cancelled()
+            && let Ok(thread) = Arc::clone(&self.0.threads).try_acquire_owned()
         {
             return Ok(thread);
         }
-        let _counted = Waiting::new(&self.n_waiting);
-        self.turn(&self.threads).await
+        let _counted = Waiting::new(&self.0.n_waiting);
+        self.turn(&self.0.threads).await
     }
 
     /// Waits for one of `threads`.
     async fn turn(&self, threads: &Arc<Semaphore>) -> Result<OwnedSemaphorePermit, PoolError> {
         tokio::select! {
             biased;
-            () = self.abort.cancelled() => Err(PoolError::Stopped),
+            () = self.0.abort.cancelled() => Err(PoolError::Stopped),
             thread = Arc::clone(threads).acquire_owned() => thread.map_err(|_| PoolError::Stopped),
         }
     }
@@ -191,7 +196,7 @@ impl SearchPool {
         // Dropped with this future: whoever waited is gone.
         let _gone: DropGuard = cancel.clone().drop_guard();
         let span = tracing::Span::current();
-        let running = self.tasks.spawn_blocking(move || {
+        let running = self.0.tasks.spawn_blocking(move || {
             let _held = held;
             let mut interrupt = Watch { cancel, deadline };
             span.in_scope(|| job(&mut interrupt))
@@ -239,8 +244,8 @@ impl Admission {
         T: Send + 'static,
         F: FnOnce() -> T + Send + 'static,
     {
-        let cancel = self.pool.abort.child_token();
-        let reader = self.pool.turn(&self.pool.readers).await?;
+        let cancel = self.pool.0.abort.child_token();
+        let reader = self.pool.turn(&self.pool.0.readers).await?;
         self.pool.run_holding((Arc::clone(&self.admitted), reader), None, cancel, |_| Ok(job())).await
     }
 
@@ -255,7 +260,7 @@ impl Admission {
         T: Send + 'static,
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
-        let cancel = self.pool.abort.child_token();
+        let cancel = self.pool.0.abort.child_token();
         let thread = self.turn().await?;
         self.pool.run_holding((Arc::clone(&self.admitted), thread), deadline, cancel, job).await
     }
@@ -272,7 +277,7 @@ impl Admission {
         job: impl FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled>,
     ) -> Result<T, PoolError> {
         let _thread = self.turn().await?;
-        let mut interrupt = Watch { cancel: self.pool.abort.clone(), deadline };
+        let mut interrupt = Watch { cancel: &self.pool.0.abort, deadline };
         job(&mut interrupt).map_err(|Cancelled| PoolError::Stopped)
     }
 }
@@ -294,14 +299,14 @@ impl Drop for Waiting {
 }
 
 /// Looks at the token and the clock when asked.
-struct Watch {
-    cancel: CancellationToken,
+struct Watch<C> {
+    cancel: C,
     deadline: Option<Instant>,
 }
 
-impl Interrupt for Watch {
+impl<C: Borrow<CancellationToken>> Interrupt for Watch<C> {
     fn poll(&mut self) -> Signal {
-        if self.cancel.is_cancelled() {
+        if self.cancel.borrow().is_cancelled() {
             return Signal::Cancel;
         }
         match self.deadline {
@@ -420,7 +425,7 @@ mod tests {
         assert_eq!(pool.run_to_spare(|_| Ok(())).await, Err(PoolError::Busy));
         drop(running);
         // Its thread is free once it has seen that.
-        while pool.threads.available_permits() < 2 {
+        while pool.0.threads.available_permits() < 2 {
             tokio::task::yield_now().await;
         }
         let mut spare = Box::pin(pool.run_to_spare(until_cancelled));
