@@ -206,7 +206,12 @@ async fn open(request: Request, limit: SentLimit) -> Result<BodyDataStream, Prob
 /// How the body is declared: as `application/json`, as another type that is written in JSON, or as NDJSON.
 fn format_of(headers: &HeaderMap) -> Option<Format> {
     let declared = headers.get(CONTENT_TYPE).and_then(|declared| declared.to_str().ok()).unwrap_or_default();
-    let essence = declared.split(';').next().unwrap_or_default().trim().to_ascii_lowercase();
+    let essence = declared.split(';').next().unwrap_or_default().trim();
+    // As most declare it.
+    if essence == "application/json" {
+        return Some(Format::Json);
+    }
+    let essence = essence.to_ascii_lowercase();
     match essence.strip_prefix("application/")? {
         "json" => Some(Format::Json),
         "x-ndjson" | "ndjson" => Some(Format::Ndjson),
@@ -220,20 +225,33 @@ async fn collect(
     limit: SentLimit,
     n_wanted: usize,
 ) -> Result<(Bytes, Option<BodyDataStream>), Problem> {
-    let mut bytes = Vec::new();
+    // Most bodies come in one piece, which is not copied.
+    let (mut first, mut bytes) = (Bytes::new(), Vec::new());
     while let Some(chunk) = stream.next().await {
         let chunk =
             chunk.map_err(|_| Problem::new(ProblemKind::IncompleteBody, "the connection ended within the body"))?;
-        if bytes.len() + chunk.len() > limit.n_bytes {
+        if first.len().max(bytes.len()) + chunk.len() > limit.n_bytes {
             discard(Body::from_stream(stream), limit.n_bytes).await;
             return Err(too_large(limit));
         }
-        bytes.extend_from_slice(&chunk);
-        if bytes.len() > n_wanted {
-            return Ok((bytes.into(), Some(stream)));
+        if first.is_empty() {
+            first = chunk;
+        } else {
+            if bytes.is_empty() {
+                bytes.extend_from_slice(&first);
+            }
+            bytes.extend_from_slice(&chunk);
+        }
+        if first.len().max(bytes.len()) > n_wanted {
+            return Ok((whole(first, bytes), Some(stream)));
         }
     }
-    Ok((bytes.into(), None))
+    Ok((whole(first, bytes), None))
+}
+
+/// All that there is in several pieces, of which the first is alone unless there are `bytes`.
+fn whole(first: Bytes, bytes: Vec<u8>) -> Bytes {
+    if bytes.is_empty() { first } else { bytes.into() }
 }
 
 async fn discard(body: Body, limit: usize) {
