@@ -1,7 +1,9 @@
 //! The table of policies.
 
+use std::sync::OnceLock;
+
 use jiff::Timestamp;
-use sqlx::{QueryBuilder, Row, Sqlite, SqliteConnection};
+use sqlx::{AssertSqlSafe, Row, SqlSafeStr, SqlStr, SqliteConnection};
 
 use super::refinements::NewRefinement;
 use super::writer::Write;
@@ -116,14 +118,25 @@ pub(super) async fn add_at_once(
 
 /// Adds some policies. Each statement costs the driver a change of threads, so there is only one.
 async fn insert(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
-    let mut insert = QueryBuilder::<Sqlite>::new("INSERT INTO policies (id, summary, policy, steps, created_at_ms) ");
-    insert.push_values(policies, |mut row, policy| {
-        row.push_bind(&policy.id)
-            .push_bind(&policy.summary)
-            .push("''")
-            .push_bind(&policy.steps)
-            .push_bind(policy.created_at.as_millisecond());
-    });
-    insert.build().execute(connection).await?;
+    let mut insert = sqlx::query(insert_of(policies.len()));
+    for policy in policies {
+        insert =
+            insert.bind(&policy.id).bind(&policy.summary).bind(&policy.steps).bind(policy.created_at.as_millisecond());
+    }
+    insert.execute(connection).await?;
     Ok(())
+}
+
+/// The statement that inserts so many policies, which is put together once.
+fn insert_of(n_rows: usize) -> SqlStr {
+    static INSERTS: [OnceLock<SqlStr>; MAX_ROWS + 1] = [const { OnceLock::new() }; MAX_ROWS + 1];
+    let put_together = || {
+        let rows = vec!["(?, ?, '', ?, ?)"; n_rows].join(", ");
+        let insert = format!("INSERT INTO policies (id, summary, policy, steps, created_at_ms) VALUES {rows}");
+        AssertSqlSafe(insert).into_sql_str()
+    };
+    match INSERTS.get(n_rows) {
+        Some(insert) => insert.get_or_init(put_together).clone(),
+        None => put_together(),
+    }
 }
