@@ -97,16 +97,26 @@ impl CompensatedSum {
 
 /// The sum, rounded to 15 significant digits.
 fn as_decimal(sum: CompensatedSum) -> f64 {
-    /// Powers of ten up to here are floats, so that dividing by them rounds correctly.
-    const MAX_EXACT_POWER: i32 = 22;
+    /// Powers of ten that are floats, so that dividing by them rounds correctly.
+    const POWERS: [f64; 23] = [
+        1e0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e15, 1e16, 1e17, 1e18, 1e19,
+        1e20, 1e21, 1e22,
+    ];
     let sum = sum.value();
     if sum == 0.0 {
         return sum;
     }
-    #[expect(clippy::cast_possible_truncation, reason = "the logarithm of a float is below 309")]
-    let n_decimals = 14 - sum.log10().floor() as i32;
-    let scale = 10_f64.powi(n_decimals);
-    if (0..=MAX_EXACT_POWER).contains(&n_decimals) { (sum * scale).round() / scale } else { sum }
+    let n_decimals = if (POWERS[0]..POWERS[15]).contains(&sum) {
+        // What most costs are, and this is sooner told than by a logarithm.
+        Some(15 - POWERS[..15].partition_point(|power| *power <= sum))
+    } else {
+        #[expect(clippy::cast_possible_truncation, reason = "the logarithm of a float is below 309")]
+        usize::try_from(14 - sum.log10().floor() as i32).ok()
+    };
+    match n_decimals.and_then(|n_decimals| POWERS.get(n_decimals)) {
+        Some(scale) => (sum * scale).round() / scale,
+        None => sum,
+    }
 }
 
 #[cfg(test)]
@@ -123,6 +133,18 @@ mod tests {
             assert_eq!(sum.cost(), expected, "after {n} steps");
         }
         assert_eq!(sum.cost().actions, 30.0);
+    }
+
+    #[test]
+    fn a_sum_is_rounded_to_15_digits_whatever_its_size() {
+        let written = |value: f64| format!("{value:.14e}").parse::<f64>().unwrap();
+        let powers = (-8..15).map(|power| 10_f64.powi(power));
+        for value in
+            powers.flat_map(|power| [power.next_down(), power, power.next_up(), 3.3 * power, power * 29.0 / 3.0])
+        {
+            let rounded = as_decimal(CompensatedSum { sum: value, compensation: 0.0 });
+            assert_eq!(rounded.to_bits(), written(value).to_bits(), "{value:e}");
+        }
     }
 
     #[test]
