@@ -39,6 +39,9 @@ impl WrittenPolicy {
     ///
     /// Never: all of it can be written.
     pub fn new(stamp: &Stamp, problem: &Problem<'_>, mapping: &Mapping) -> Result<Self, WriteError> {
+        /// About what a summary takes, and each of its weights.
+        const SUMMARY_BYTES: usize = 512;
+        const WEIGHT_BYTES: usize = 24;
         let weights = problem.named_weights();
         let short = ShortSteps::of(problem, mapping)?;
         let mut is_exact = vec![false; problem.demonstration.len()];
@@ -67,7 +70,9 @@ impl WrittenPolicy {
             refines: stamp.refines.as_deref(),
             refined_by: None,
         };
-        let summary = serde_json::to_string(&summary)?;
+        let mut text = Vec::with_capacity(SUMMARY_BYTES + weights.iter().count() * WEIGHT_BYTES);
+        serde_json::to_writer(&mut text, &summary)?;
+        let summary = String::from_utf8(text).map_err(serde_json::Error::custom)?;
         let answer = answer(&summary, weights.iter().map(|(name, _)| name), &short)?;
         Ok(Self { answer, steps: short.pack()?, summary })
     }
@@ -422,8 +427,12 @@ impl<'p> AnswerWriter<'p> {
         }
         self.member(r#"{"step":"#, self.n_steps)?;
         self.member(r#","observation":"#, step.observation)?;
-        self.member(r#","move":"#, kind)?;
-        self.raw(r#","action":"#);
+        self.raw(match kind {
+            MoveKind::Start => r#","move":"start","action":"#,
+            MoveKind::Match => r#","move":"match","action":"#,
+            MoveKind::Extra => r#","move":"extra","action":"#,
+            MoveKind::Skip => r#","move":"skip","action":"#,
+        });
         self.raw(action);
         self.raw(r#","state":{"#);
         self.text.extend_from_slice(&self.state);
