@@ -50,7 +50,7 @@ const WINDOW: Duration = Duration::from_millis(1500);
 const WARM_UP: Duration = Duration::from_millis(200);
 
 /// Connections that are kept open, each of which sends its next request when the one before was answered.
-const CLIENTS: [usize; 3] = [1, 16, 64];
+const CLIENTS: [usize; 4] = [1, 16, 64, 256];
 
 /// Demonstrations of a batch.
 const N_BATCH: usize = 1000;

@@ -121,7 +121,12 @@ const MAX_WAYS: usize = 1 << 18;
 /// Whether `n_nodes` of `model`, its states at so many observations, may be searched: there is memory for all of them, and
 /// each may be expanded and expanded again.
 pub(in crate::mapping) fn is_within(budget: Budget, model: &Model, n_nodes: usize) -> bool {
+    let attributes = 0..model.schema().len();
+    let n_values = |position| model.states().domain(position).len() as u128;
+    // So that the values of a state are one number.
+    let are_countable = attributes.map(n_values).try_fold(1, u128::checked_mul).is_some();
     model.graph().n_transitions() <= MAX_WAYS
+        && are_countable
         && n_nodes.saturating_mul(NODE_BYTES) <= budget.max_bytes
         && 2 * n_nodes as u64 <= budget.max_expansions
 }
@@ -440,13 +445,18 @@ impl Parts {
         self.joined.clear();
         self.classes.clear();
         self.classes.resize(model.graph().n_states(), [0; 2]);
-        for (part, columns) in [0..divide_at, divide_at..n_columns].into_iter().enumerate() {
+        for (part, range) in [0..divide_at, divide_at..n_columns].into_iter().enumerate() {
             self.n_first = self.joined.len();
-            let mut numbers: FxHashMap<Vec<u32>, u32> = FxHashMap::default();
+            let columns: Vec<(usize, u128)> = self.columns[range.clone()]
+                .iter()
+                .map(|column| (column.position(), n_values(column) as u128))
+                .collect();
+            let mut numbers: FxHashMap<u128, u32> = FxHashMap::default();
             for (state, of_state) in (0..).zip(&mut self.classes) {
-                let of_columns = projected.classes(model.states().row(state)).skip(columns.start).take(columns.len());
-                of_state[part] = *numbers.entry(of_columns.collect()).or_insert_with_key(|classes| {
-                    self.joined.push(classes.clone());
+                let row = model.states().row(state);
+                let values = columns.iter().fold(0, |all, (position, n)| all * n + u128::from(row[*position]));
+                of_state[part] = *numbers.entry(values).or_insert_with(|| {
+                    self.joined.push(projected.classes(row).skip(range.start).take(range.len()).collect());
                     #[expect(clippy::cast_possible_truncation, reason = "no more than two for each state")]
                     let number = self.joined.len() as u32 - 1;
                     number
