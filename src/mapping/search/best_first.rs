@@ -20,7 +20,7 @@ use std::ops::Range;
 use super::buckets::Buckets;
 use super::nodes::{Arrival, NO_NODE, NodeId, Nodes, Place, Reached, Step};
 use super::seen::{Estimates, Seen, SeenIdx, Way};
-use super::{Found, MoveKind, NO_ACTION, POLL_EVERY};
+use super::{End, Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{Deepened, Projected};
@@ -117,15 +117,6 @@ pub(in crate::mapping) fn search<S: Space>(
         }
     }
     Ok(search.found(first, end))
-}
-
-/// How a part of a search ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum End {
-    /// All is done that was to be done.
-    Done,
-    /// The budget was used up, or the interrupt said to finish.
-    CutShort,
 }
 
 struct Search<'s, 'p, S> {

@@ -14,7 +14,7 @@
 
 use rustc_hash::FxHashMap;
 
-use super::{Found, Move, MoveKind, POLL_EVERY};
+use super::{End, Found, Move, MoveKind, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{CHUNK_LEN, ChangingColumn, Estimate, Projected};
@@ -166,27 +166,18 @@ pub(in crate::mapping) fn search(
     for width in BEAM_WIDTHS.into_iter().chain([usize::MAX]) {
         is_complete = is_complete && search.go_through(width)? == End::Done;
     }
+    let least_f = if is_complete { f64::INFINITY } else { search.least_f() };
     let Search { cheapest, n_expanded, n_generated, .. } = search;
-    let start = parts.estimate(parts.at(0), problem.start);
     Ok(Found {
         paths: vec![
             cheapest
                 .map_or_else(|| nodes.path(body, 0, problem.start), |state| nodes.path(body, problem.last(), state)),
         ],
         is_complete,
-        least_f: if is_complete { f64::INFINITY } else { start.distance + start.cost_to_go },
+        least_f,
         n_expanded,
         n_generated,
     })
-}
-
-/// How a part of a search ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum End {
-    /// All is done that was to be done.
-    Done,
-    /// The budget was used up, or the interrupt said to finish.
-    CutShort,
 }
 
 struct Search<'s> {
@@ -243,7 +234,7 @@ impl Search<'_> {
         let (costs, next_costs) = costs[of_both.clone()].split_at_mut(n_states);
         let (links, next_links) = links[of_both.clone()].split_at_mut(n_states);
         let (are_open, are_next_open) = are_open[of_both].split_at_mut(n_states);
-        let Some([open, next_open]) = open.get_disjoint_mut([observation, observation + 1]).ok() else {
+        let Ok([open, next_open]) = open.get_disjoint_mut([observation, observation + 1]) else {
             return Ok(End::Done);
         };
         let mut n_left = width.saturating_add(width / 2);
@@ -301,6 +292,21 @@ impl Search<'_> {
         }
         open.truncate(n_kept);
         Ok(End::Done)
+    }
+
+    /// What mappings cost at least, of those that were not found: they lead through open nodes.
+    fn least_f(&self) -> f64 {
+        let Nodes { n_states, costs, are_open, open, .. } = &*self.nodes;
+        let fs = (0..=self.last).flat_map(|observation| {
+            let entries = self.parts.at(observation);
+            let open = open[observation].iter().map(move |state| (*state, observation * n_states + *state as usize));
+            // A list that was not gone through to the end may name some that are not open any more.
+            open.filter(|(_, at)| are_open[*at]).map(move |(state, at)| {
+                let Estimate { distance, cost_to_go } = self.parts.estimate(entries, state);
+                costs[at] + distance + cost_to_go
+            })
+        });
+        fs.fold(self.limit, f64::min)
     }
 
     /// Looks for a cheaper mapping among the nodes of the last layer that were reached.

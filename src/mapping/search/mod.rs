@@ -63,6 +63,15 @@ pub(in crate::mapping) struct Found {
     pub(in crate::mapping) n_generated: u64,
 }
 
+/// How a part of a search ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum End {
+    /// All is done that was to be done.
+    Done,
+    /// The budget was used up, or the interrupt said to finish.
+    CutShort,
+}
+
 /// How many distances are looked at between two looks at the interrupt: less than a millisecond with a few attributes.
 pub(in crate::mapping) const POLL_EVERY: u64 = 2048;
 

@@ -280,6 +280,31 @@ fn an_upper_bound_below_the_optimum_proves_that_there_is_no_such_mapping() {
 }
 
 #[test]
+fn a_small_search_that_is_cut_short_tells_what_its_open_nodes_cost_at_least() {
+    let (mapper, request) = belt(60, 100);
+    let request = read(&mapper, &request);
+    let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap().cost.total;
+    let map_until = |n: u32| {
+        let mut n_left = n;
+        let mut interrupt = || {
+            n_left = n_left.saturating_sub(1);
+            if n_left > 0 { Signal::Continue } else { Signal::Finish }
+        };
+        mapper.map(&request.problem, Settings::default(), &mut interrupt).unwrap()
+    };
+    let mappings: Vec<Mapping> = (2..1000).map(map_until).take_while(|found| found.status == Status::Bounded).collect();
+    assert!(mappings.len() > 3, "{}", mappings.len());
+    for mapping in &mappings {
+        let bound = mapping.lower_bound.unwrap();
+        assert!(bound <= optimum && optimum <= mapping.cost.total, "{bound}, {optimum}, {}", mapping.cost.total);
+    }
+    let bounds: Vec<f64> = mappings.iter().map(|mapping| mapping.lower_bound.unwrap()).collect();
+    // The start's alone would stay the same once there are estimates.
+    let n_rises = bounds.windows(2).filter(|pair| pair[0] < pair[1]).count();
+    assert!(bounds.is_sorted() && n_rises > 2, "{bounds:?}, {optimum}");
+}
+
+#[test]
 fn a_search_goes_on_where_there_is_no_room_for_a_sweep_and_none_is_begun_that_would_take_too_many_expansions() {
     let (mapper, request) = belt(3_000, 30);
     let patience = Patience {
