@@ -4,6 +4,7 @@ mod escalation;
 
 use std::iter::repeat_n;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::{self, ThreadId};
 
 use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
@@ -113,8 +114,9 @@ pub struct Mapping {
 pub struct Mapper {
     model: Arc<Model>,
     projections: Projections,
-    /// Of searches that have ended, for those that come: at most as many as ran at the same time.
-    buffers: Mutex<Vec<Buffers>>,
+    /// Of searches that have ended, for those that come: at most as many as ran at the same time, each with the thread that used it
+    /// last, whose processor may still have it in its cache.
+    buffers: Mutex<Vec<(ThreadId, Box<Buffers>)>>,
     patience: Patience,
 }
 
@@ -275,11 +277,16 @@ impl Mapper {
 
     /// Does `work` with buffers of work that was done before, if there are any.
     fn with_buffers<T>(&self, work: impl FnOnce(&mut Buffers) -> Result<T, Cancelled>) -> Result<T, Cancelled> {
-        let kept = self.buffers.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        let mut buffers = kept.unwrap_or_default();
+        let lock = || self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
+        let thread = thread::current().id();
+        let take = |kept: &mut Vec<(ThreadId, Box<Buffers>)>| {
+            let own = kept.iter().position(|(user, _)| *user == thread);
+            own.or(kept.len().checked_sub(1)).map(|at| kept.swap_remove(at).1)
+        };
+        let mut buffers = take(&mut lock()).unwrap_or_default();
         let done = work(&mut buffers)?;
         if buffers.are_small() {
-            self.buffers.lock().unwrap_or_else(PoisonError::into_inner).push(buffers);
+            lock().push((thread, buffers));
         }
         Ok(done)
     }
