@@ -56,7 +56,11 @@ impl Etude {
             None
         };
         let searched = match quick {
-            Some(searched) => searched,
+            Some(searched) => {
+                // The next request can be read to where this one stands, while the disk writes.
+                drop(body);
+                searched
+            }
             None => self.search_at_length(body, &id, &place, arrived).await?,
         };
         let Searched { policy, row, refinement } = searched;
