@@ -11,7 +11,6 @@
 //! ```
 
 use std::ops::Range;
-use std::sync::Arc;
 
 use serde::de::{Error as _, IgnoredAny};
 use serde::{Deserialize, Serialize};
@@ -108,9 +107,10 @@ pub(crate) fn read_answer(summary: &str, steps: &[u8]) -> Result<String, WriteEr
 
 /// The steps of a policy, in short. What some steps have more of than others stands together, in the order of the steps.
 #[derive(Serialize, Deserialize)]
-struct ShortSteps {
+struct ShortSteps<'a> {
     /// Names and costs of the actions that are taken.
-    actions: Vec<(Arc<str>, f64)>,
+    #[serde(borrow)]
+    actions: Vec<(&'a str, f64)>,
     steps: Vec<ShortStep>,
     /// What of the state has changed since the step before, all of it for the first one: attributes, and the bytes that their values
     /// take in `values`.
@@ -135,8 +135,8 @@ struct ShortStep {
     n_terms: Option<u32>,
 }
 
-impl ShortSteps {
-    fn of(problem: &Problem<'_>, mapping: &Mapping) -> Result<Self, WriteError> {
+impl<'a> ShortSteps<'a> {
+    fn of(problem: &Problem<'a>, mapping: &Mapping) -> Result<Self, WriteError> {
         let model = problem.model;
         let attributes = model.schema().attributes();
         let states = mapping.states.as_ref().unwrap_or(model.states());
@@ -209,10 +209,10 @@ impl ShortSteps {
     }
 
     /// The place of the action called `name`.
-    fn place_of(&mut self, name: &Arc<str>, cost: f64) -> u32 {
-        let known = self.actions.iter().position(|(known, _)| known == name);
+    fn place_of(&mut self, name: &'a str, cost: f64) -> u32 {
+        let known = self.actions.iter().position(|(known, _)| *known == name);
         count(known.unwrap_or_else(|| {
-            self.actions.push((Arc::clone(name), cost));
+            self.actions.push((name, cost));
             self.actions.len() - 1
         }))
     }
@@ -231,7 +231,11 @@ fn count(n: usize) -> u32 {
 
 /// Writes a policy as it is answered: its summary, with the actions and the steps before the coverage. `names` are those of the
 /// attributes.
-fn answer<'n>(summary: &str, names: impl Iterator<Item = &'n str>, short: &ShortSteps) -> Result<String, WriteError> {
+fn answer<'n>(
+    summary: &str,
+    names: impl Iterator<Item = &'n str>,
+    short: &ShortSteps<'_>,
+) -> Result<String, WriteError> {
     /// What comes after the steps. No string in JSON has a quote that is not escaped, and no weight is an object.
     const AFTER: &str = r#""coverage":{"#;
     let (before, after) = summary.split_at(summary.rfind(AFTER).ok_or(WriteError::Missing("a coverage"))?);
@@ -286,7 +290,7 @@ struct Pieces {
 }
 
 impl Pieces {
-    fn of<'n>(names: impl Iterator<Item = &'n str>, actions: &[(Arc<str>, f64)]) -> serde_json::Result<Self> {
+    fn of<'n>(names: impl Iterator<Item = &'n str>, actions: &[(&str, f64)]) -> serde_json::Result<Self> {
         /// About what a name takes, or a cost.
         const PIECE_BYTES: usize = 16;
         let n_names = names.size_hint().0;
