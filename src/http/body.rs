@@ -3,7 +3,7 @@
 use std::io::{self, BufRead, Read};
 use std::time::{Duration, Instant};
 
-use axum::body::{Body, BodyDataStream, Bytes};
+use axum::body::{Body, BodyDataStream, Bytes, HttpBody};
 use axum::extract::Request;
 use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, EXPECT};
 use axum::http::{HeaderMap, HeaderValue, StatusCode};
@@ -238,6 +238,9 @@ async fn collect(
             first = chunk;
         } else {
             if bytes.is_empty() {
+                // What was announced is within the limit.
+                let n_left = usize::try_from(HttpBody::size_hint(&stream).lower()).unwrap_or(0);
+                bytes.reserve_exact(first.len() + chunk.len() + n_left.min(n_wanted));
                 bytes.extend_from_slice(&first);
             }
             bytes.extend_from_slice(&chunk);

@@ -75,8 +75,10 @@ pub(super) async fn make_policies(
     let arrived = Instant::now();
     let body = read_json(request, &context).await?;
     let made = context.etude.make_policies(body, arrived, Timestamp::now()).await?;
-    let mut text = String::with_capacity(made.iter().flatten().map(|made| made.policy.len() + 1).sum());
-    let mut separator = r#"{"items":["#;
+    let (before, after) = (r#"{"items":["#, "]}");
+    let n_bytes: usize = made.iter().flatten().map(|made| made.policy.len() + 1).sum();
+    let mut text = String::with_capacity(before.len() + n_bytes + after.len());
+    let mut separator = before;
     for item in made {
         text.push_str(separator);
         match item {
@@ -88,7 +90,7 @@ pub(super) async fn make_policies(
         }
         separator = ",";
     }
-    text.push_str("]}");
+    text.push_str(after);
     Ok(json_text(StatusCode::OK, text))
 }
 
