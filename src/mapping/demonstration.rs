@@ -40,7 +40,7 @@ impl Demonstration {
     #[must_use]
     pub fn read_well_formed(schema: &Schema, text: &str) -> Option<Self> {
         let mut deserializer = serde_json::Deserializer::from_str(text);
-        let read = WellFormed { schema, n_bytes: text.len() }.deserialize(&mut deserializer).ok()?;
+        let read = WellFormed::in_text(schema, text.len()).deserialize(&mut deserializer).ok()?;
         deserializer.end().ok()?;
         Some(read)
     }
@@ -72,11 +72,21 @@ impl Demonstration {
     }
 }
 
-/// Reads a demonstration that is well-formed from JSON as it comes, in a fraction of the time that a document takes. It is in a text
-/// of `n_bytes`. An error does not tell what is wrong with it, as [`Demonstration::read`] can.
+/// Reads a demonstration that is well-formed from JSON as it comes, in a fraction of the time that a document takes. An error does not
+/// tell what is wrong with it, as [`Demonstration::read`] can.
 pub(crate) struct WellFormed<'s> {
     pub(crate) schema: &'s Schema,
-    pub(crate) n_bytes: usize,
+    /// How many values it has, about: room for so many is made first.
+    pub(crate) n_values: usize,
+}
+
+impl<'s> WellFormed<'s> {
+    /// One that takes most of a text of `n_bytes`.
+    pub(crate) fn in_text(schema: &'s Schema, n_bytes: usize) -> Self {
+        /// About what a value takes, with the name of its attribute.
+        const VALUE_BYTES: usize = 12;
+        Self { schema, n_values: n_bytes / VALUE_BYTES }
+    }
 }
 
 impl<'de> DeserializeSeed<'de> for WellFormed<'_> {
@@ -95,10 +105,8 @@ impl<'de> Visitor<'de> for WellFormed<'_> {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Demonstration, A::Error> {
-        /// About what a value takes, with the name of its attribute.
-        const VALUE_BYTES: usize = 12;
-        let Self { schema, n_bytes } = self;
-        let mut values = Vec::with_capacity(n_bytes / VALUE_BYTES);
+        let Self { schema, n_values } = self;
+        let mut values = Vec::with_capacity(n_values);
         while items.next_element_seed(OneObservation { schema, values: &mut values })?.is_some() {}
         let read = Demonstration { values, n_attributes: schema.len() };
         let is_within = (1..=Demonstration::MAX_OBSERVATIONS).contains(&read.len());

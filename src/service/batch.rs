@@ -6,6 +6,8 @@
 //!                                                  +---- lines up again --------+    (as many at a time as the pool has threads)
 //! ```
 //!
+//! A batch of well-formed items is read in one pass (`outline`), any other as a document: what comes of an item is the same.
+//!
 //! A batch takes one place in the pool, whatever its size, and gives its threads back after every slice: a request that
 //! comes meanwhile waits for a slice, not for the batch.
 
@@ -21,12 +23,15 @@ use serde_json::{Map, Value};
 use utoipa::ToSchema;
 use uuid::Uuid;
 
-use super::policies::{Envelope, Named, Searched, base_weights, follow, parse};
-use super::{Etude, MadePolicy, ServiceError};
+use super::outline::{AtHand, BatchOutline};
+use super::policies::{Envelope, MAX_INLINE_BYTES, Named, Searched, base_weights, follow, parse};
+use super::{Admission, Etude, MadePolicy, ServiceError};
 use crate::attribute::Weights;
-use crate::document::{Faults, Object, Path, Place};
+use crate::document::{self, Faults, Object, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{Conditions, HeuristicName, Mapper, ObservationDocument, Policy, Request, Stamp, StartReference};
+use crate::mapping::{
+    Conditions, Demonstration, HeuristicName, Mapper, ObservationDocument, Policy, Request, Stamp, StartReference,
+};
 use crate::model::{Model, Origin};
 
 /// Most items of a batch: as large a data set as most, while an answer full of short policies stays at some ten megabytes.
@@ -47,7 +52,7 @@ const ITEM_FIELDS: [&str; 6] = ["demonstration", "weights", "lookahead", "start"
 const SHARED_OPTIONS: [&str; 4] = ["lookahead", "start", "heuristic", "max_expansions"];
 
 impl Etude {
-    /// Makes a policy for every item of the batch in `body` (JSON), and stores them all at once. The batch came at `arrived`,
+    /// Makes a policy for every item of the batch in `body` (JSON, cheap to clone), and stores them all at once. The batch came at `arrived`,
     /// from which its deadline counts; `now` is the same moment on the calendar. Gives for each item, in order, its policy or
     /// what is wrong with it.
     ///
@@ -55,19 +60,26 @@ impl Etude {
     ///
     /// If the body is no batch, names no model, or the service cannot do it now; then nothing is stored.
     pub async fn make_policies(
-        &self,
-        body: impl AsRef<[u8]> + Send + 'static,
+        self: &Arc<Self>,
+        body: impl AsRef<[u8]> + Clone + Send + 'static,
         arrived: Instant,
         now: Timestamp,
     ) -> Result<Vec<Result<MadePolicy, ServiceError>>, ServiceError> {
         let place = self.pool.admit()?;
-        let document = parse(body, &place).await?;
-        let (envelope, faults) = Envelope::read(&document, &BATCH_FIELDS, "items");
+        let sent = self.read_batch(body.clone(), &place).await?;
+        let (envelope, faults) = Envelope::read(&sent.document, &BATCH_FIELDS, "items");
         let Some(envelope) = envelope else { return Err(faults.into()) };
         let deadline = envelope.deadline(arrived);
         let place = place.with_patience(deadline);
         let named = self.find(&envelope, faults, &place).await?;
-        let batch = place.run(None, move |_| Ok(Batch::read(document, envelope.model, named))).await??;
+        let sent = if sent.is_for(&named.mapper) {
+            drop(body);
+            sent
+        } else {
+            // Another model was given this name meanwhile.
+            SentBatch { document: parse(body, &place).await?, read: None }
+        };
+        let batch = place.run(None, move |_| Ok(Batch::read(sent, envelope.model, named))).await??;
 
         let batch = Arc::new(batch);
         let runners = (0..self.pool.n_threads()).map(|_| async {
@@ -106,6 +118,62 @@ impl Etude {
         }
         Ok(answer)
     }
+
+    /// Reads a batch, by its `place` in the pool if it is large.
+    async fn read_batch(
+        self: &Arc<Self>,
+        body: impl AsRef<[u8]> + Send + 'static,
+        place: &Admission,
+    ) -> Result<SentBatch, ServiceError> {
+        let etude = Arc::clone(self);
+        let is_small = body.as_ref().len() <= MAX_INLINE_BYTES;
+        let read = move || {
+            let at_hand = |model: &str| etude.mapper_at_hand(model).map(|(_, mapper)| mapper);
+            SentBatch::read(body.as_ref(), &at_hand)
+        };
+        if is_small { read() } else { place.run_reading(read).await? }
+    }
+}
+
+/// A batch as it was sent.
+struct SentBatch {
+    /// With something else in place of the items, if they were read already.
+    document: Value,
+    /// The items that were read for a model.
+    read: Option<(Arc<Mapper>, Vec<Item>)>,
+}
+
+impl SentBatch {
+    /// Reads a batch in one pass if that can be, else as a document. Items with a lookahead need documents: their requests are stored, to
+    /// be refined.
+    fn read(body: &[u8], at_hand: AtHand<'_>) -> Result<Self, ServiceError> {
+        let outline = BatchOutline::read(body, at_hand).filter(|BatchOutline { document, items, .. }| {
+            document["lookahead"].is_null() && items.iter().all(|(item, _)| item["lookahead"].is_null())
+        });
+        let Some(BatchOutline { document, items, mapper }) = outline else {
+            return Ok(Self { document: document::parse(body)?, read: None });
+        };
+        let as_item = |(document, demonstration)| Item { document, demonstration: Some(demonstration) };
+        Ok(Self { document, read: Some((mapper, items.into_iter().map(as_item).collect())) })
+    }
+
+    /// Whether it can be followed by this model.
+    fn is_for(&self, mapper: &Arc<Mapper>) -> bool {
+        self.read.as_ref().is_none_or(|(read_for, _)| Arc::ptr_eq(read_for, mapper))
+    }
+}
+
+/// An item that waits.
+struct Item {
+    document: Value,
+    /// If it was read already; then the document has something else in its place.
+    demonstration: Option<Demonstration>,
+}
+
+impl Item {
+    fn n_observations(&self) -> usize {
+        self.demonstration.as_ref().map_or_else(|| n_observations(&self.document), Demonstration::len)
+    }
 }
 
 /// A batch that was checked, but for its items.
@@ -118,7 +186,7 @@ struct Batch {
     /// What an item has unless it has its own.
     options: Map<String, Value>,
     /// The items that wait, with their places in the batch.
-    waiting: Mutex<Enumerate<std::vec::IntoIter<Value>>>,
+    waiting: Mutex<Enumerate<std::vec::IntoIter<Item>>>,
 }
 
 /// What became of an item, and its place in the batch.
@@ -126,14 +194,21 @@ type Outcome = (usize, Result<Searched, ServiceError>);
 
 impl Batch {
     /// Reads all but the items against the model.
-    fn read(mut document: Value, model: String, named: Named) -> Result<Self, Faults> {
+    fn read(sent: SentBatch, model: String, named: Named) -> Result<Self, Faults> {
+        let SentBatch { mut document, read } = sent;
         let Named { learner, model_hash, mapper } = named;
         let mut faults = Faults::default();
         let root = Place::root(&document);
         let object = root.object(&BATCH_FIELDS, &mut faults);
         let shared = object.and_then(|object| {
             let items = object.required("items", &mut faults);
-            let items = items.and_then(|items| check_items(mapper.model(), &items, &mut faults));
+            let items = items.and_then(|place| {
+                let lengths: Vec<_> = match &read {
+                    Some((_, items)) => items.iter().map(Item::n_observations).collect(),
+                    None => place.array(&mut faults)?.iter().map(n_observations).collect(),
+                };
+                check_items(mapper.model(), &lengths, &place, &mut faults)
+            });
             let shared = read_shared(
                 mapper.model(),
                 &object,
@@ -143,9 +218,12 @@ impl Batch {
             items.and(shared)
         });
         let (weights, options) = faults.check(shared)?;
-        let items = match document.get_mut("items").map(Value::take) {
-            Some(Value::Array(items)) => items,
-            _ => Vec::new(),
+        let items = match (read, document["items"].take()) {
+            (Some((_, items)), _) => items,
+            (None, Value::Array(items)) => {
+                items.into_iter().map(|document| Item { document, demonstration: None }).collect()
+            }
+            (None, _) => Vec::new(),
         };
         let stamp = Stamp {
             model,
@@ -173,19 +251,25 @@ impl Batch {
     fn follow(
         &self,
         n: usize,
-        item: Value,
+        item: Item,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Result<Searched, ServiceError>, Cancelled> {
         let items = Path::Member(&Path::Root, "items");
         let path = Path::Item(&items, n);
         let mut faults = Faults::default();
-        if (Place { value: &item, path }).object(&ITEM_FIELDS, &mut faults).is_none() {
+        let Item { document, demonstration } = item;
+        if (Place { value: &document, path }).object(&ITEM_FIELDS, &mut faults).is_none() {
             return Ok(Err(faults.into()));
         }
-        let document = self.as_single(item);
+        let document = self.as_single(document);
         let request = document.as_object().and_then(|members| {
-            let object = Object { members, path };
-            Request::read_over(self.mapper.model(), &object, |_| Some(self.weights.clone()), &mut faults)
+            let (model, object) = (self.mapper.model(), Object { members, path });
+            let base = |_: &mut Faults| Some(self.weights.clone());
+            match demonstration {
+                // It is not too long, as all of them together are not.
+                Some(read) => Request::read_beside(Some(read), model, &object, base, &mut faults),
+                None => Request::read_over(model, &object, base, &mut faults),
+            }
         });
         let request = match faults.check(request) {
             Ok(request) => request,
@@ -208,14 +292,19 @@ impl Batch {
     }
 }
 
-/// Checks how many items there are, and that their policies would not be too large together.
-fn check_items(model: &Model, place: &Place<'_, '_>, faults: &mut Faults) -> Option<()> {
-    let items = place.array(faults)?;
-    if items.is_empty() || items.len() > MAX_BATCH_ITEMS {
-        faults.note(place, format!("expected 1 to {MAX_BATCH_ITEMS} items, found {}", items.len()));
+/// How many observations an item has, as far as can be told without its faults.
+fn n_observations(item: &Value) -> usize {
+    item.get("demonstration").and_then(Value::as_array).map_or(0, Vec::len)
+}
+
+/// Checks how many items there are, and that their policies would not be too large together. `lengths` is how many observations each
+/// of them has.
+fn check_items(model: &Model, lengths: &[usize], place: &Place<'_, '_>, faults: &mut Faults) -> Option<()> {
+    if !(1..=MAX_BATCH_ITEMS).contains(&lengths.len()) {
+        faults.note(place, format!("expected 1 to {MAX_BATCH_ITEMS} items, found {}", lengths.len()));
         return None;
     }
-    let n_observations = items.iter().filter_map(|item| item.get("demonstration")?.as_array()).map(Vec::len).sum();
+    let n_observations = lengths.iter().sum();
     if !Policy::check_size(model, n_observations, place, &mut Faults::default()) {
         let detail = format!(
             "the policies of {n_observations} observations together would be larger than that of a single demonstration may \
@@ -308,4 +397,106 @@ pub struct BatchItemRequest {
     /// Instead of the batch's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub max_expansions: Option<u64>,
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use crate::interrupt::Uninterrupted;
+    use crate::model::{Definition, Limits};
+
+    const MODEL: &str = include_str!("../../examples/figure-4/model.json");
+    const DEMONSTRATION: &str = include_str!("../../examples/figure-4/demonstration.json");
+
+    fn mapper() -> Arc<Mapper> {
+        let model = serde_json::from_str(MODEL).unwrap();
+        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap())
+    }
+
+    /// What comes of the items, but for ids and times, and whether they were read in one pass if the model is at hand.
+    fn follow(text: &str, mapper: &Arc<Mapper>, is_at_hand: bool) -> (Vec<Result<Value, String>>, bool) {
+        let at_hand = |model: &str| (is_at_hand && model == "figure-4").then(|| Arc::clone(mapper));
+        let sent = SentBatch::read(text.as_bytes(), &at_hand).unwrap();
+        let is_read = sent.read.is_some();
+        let named = Named { learner: None, model_hash: "hash".to_owned(), mapper: Arc::clone(mapper) };
+        let batch = match Batch::read(sent, "figure-4".to_owned(), named) {
+            Ok(batch) => batch,
+            Err(faults) => return (vec![Err(format!("{faults:?}"))], is_read),
+        };
+        let mut outcomes = Vec::new();
+        loop {
+            let slice = batch.run_slice(&mut Uninterrupted).unwrap();
+            if slice.is_empty() {
+                return (outcomes, is_read);
+            }
+            outcomes.extend(slice.into_iter().map(|(_, outcome)| match outcome {
+                Ok(Searched { policy, .. }) => {
+                    let mut policy: Value = serde_json::from_str(&policy).unwrap();
+                    policy["id"] = Value::Null;
+                    policy["search"]["elapsed_us"] = Value::Null;
+                    Ok(policy)
+                }
+                Err(error) => Err(format!("{error:?}")),
+            }));
+        }
+    }
+
+    #[test]
+    fn what_comes_of_an_item_does_not_depend_on_how_the_batch_was_read() {
+        let mapper = mapper();
+        let demonstration: Value = serde_json::from_str(DEMONSTRATION).unwrap();
+        let good = json!({"demonstration": demonstration});
+        let with = |name: &str, value: Value| {
+            let mut item = good.clone();
+            item[name] = value;
+            item
+        };
+        let items = json!([
+            good,
+            with("weights", json!({"gold": 3, "x": 0})),
+            with("weights", json!({"gold": -1, "mood": 1})),
+            with("start", json!(7)),
+            with("start", json!(100_000)),
+            with("max_expansions", json!(5)),
+            with("heuristic", json!("paper")),
+            with("heuristic", json!("magic")),
+            with("lookahead", Value::Null),
+            with("model", json!("other")),
+            {"demonstration": [demonstration[0]]},
+        ]);
+        let n_items = items.as_array().unwrap().len();
+        let shared = r#""weights": {"x": 2}, "start": 3, "heuristic": "none""#;
+        for options in [r#""deadline_ms": null"#, shared, r#""weights": {"mood": 1}"#, r#""speed": 1"#] {
+            let model_first = format!(r#"{{"model": "figure-4", {options}, "items": {items}}}"#);
+            let items_first = format!(r#"{{"items": {items}, {options}, "model": "figure-4"}}"#);
+            let (expected, is_read) = follow(&model_first, &mapper, false);
+            assert!(!is_read, "no model was at hand");
+            assert!(expected.len() == n_items || expected.len() == 1);
+            for text in [&model_first, &items_first] {
+                assert_eq!(follow(text, &mapper, true), (expected.clone(), true), "{text}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_batch_with_anything_out_of_the_ordinary_is_read_as_a_document() {
+        let mapper = mapper();
+        let good = format!(r#"{{"demonstration": {DEMONSTRATION}}}"#);
+        let lookahead = format!(r#"{{"demonstration": {DEMONSTRATION}, "lookahead": 2}}"#);
+        for (items, options) in [
+            (format!("[{good}, {{}}]"), ""),
+            (format!("[{good}, 7]"), ""),
+            (format!(r#"[{{"demonstration": [{{"speed": 1}}]}}, {good}]"#), ""),
+            (format!("[{good}, {lookahead}]"), ""),
+            (format!("[{good}]"), r#""lookahead": 2, "#),
+            ("{}".to_owned(), ""),
+        ] {
+            let text = format!(r#"{{{options}"items": {items}, "model": "figure-4"}}"#);
+            assert_eq!(follow(&text, &mapper, true), follow(&text, &mapper, false), "{text}");
+        }
+    }
 }

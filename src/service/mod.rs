@@ -15,6 +15,7 @@ mod learners;
 mod models;
 mod name;
 mod opening;
+mod outline;
 mod owners;
 mod pipe;
 mod policies;

@@ -5,26 +5,24 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
-use serde::de::{Error as _, MapAccess, Visitor};
-use serde::{Deserializer, Serialize};
+use serde::Serialize;
+use serde_json::Value;
 use serde_json::value::RawValue;
-use serde_json::{Map, Value};
 use uuid::Uuid;
 
 use super::learners::Ready;
+use super::outline::Outline;
 use super::{Admission, Etude, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{
-    Demonstration, Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WellFormed, WrittenPolicy,
-};
+use crate::mapping::{Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
 /// Bodies up to this size are parsed where they arrive, which takes less than a millisecond; larger ones in the pool. Likewise
 /// for the states of an answer.
-const MAX_INLINE_BYTES: usize = 64 * 1024;
+pub(super) const MAX_INLINE_BYTES: usize = 64 * 1024;
 
 /// A policy that was just made and stored.
 #[derive(Debug)]
@@ -84,18 +82,17 @@ impl Etude {
         arrived: Instant,
     ) -> Result<Option<Searched>, ServiceError> {
         let at_hand = |model: &str| self.mapper_at_hand(model).map(|(_, mapper)| mapper);
-        let Some(Outline { document, demonstration }) = Outline::read(body, &at_hand) else { return Ok(None) };
-        let (Some(envelope), faults) = Envelope::read(&document, &Request::FIELDS, "demonstration") else {
+        let Some(outline) = Outline::read(body, &at_hand) else { return Ok(None) };
+        let (Some(envelope), faults) = Envelope::read(&outline.document, &Request::FIELDS, "demonstration") else {
             return Ok(None);
         };
         let deadline = envelope.deadline(arrived);
         let place = place.clone().with_patience(deadline);
         let Ok(named) = self.find(&envelope, faults, &place).await else { return Ok(None) };
         let model = named.mapper.model();
-        let demonstration = demonstration.of(&named.mapper);
-        let Some(demonstration) = demonstration.filter(|read| is_quick(model, &document, read.len())) else {
-            return Ok(None);
-        };
+        let read = outline.of(&named.mapper);
+        let read = read.filter(|(document, demonstration)| is_quick(model, document, demonstration.len()));
+        let Some((document, demonstration)) = read else { return Ok(None) };
         let stamp = envelope.stamp(id, &named);
         let Named { learner, mapper, .. } = &named;
         let job = |interrupt: &mut dyn Interrupt| {
@@ -207,80 +204,6 @@ pub(super) struct Envelope {
     pub(super) model: String,
     pub(super) learner: Option<String>,
     pub(super) deadline: Option<Duration>,
-}
-
-/// A request whose demonstration, which is most of it, is not in a document.
-struct Outline<'b> {
-    /// With something else in place of the demonstration.
-    document: Value,
-    demonstration: Sent<'b>,
-}
-
-/// A demonstration, as it came in a body.
-enum Sent<'b> {
-    /// After the name of a model that was at hand: as one for that.
-    Read(Arc<Mapper>, Demonstration),
-    /// Before the model was known.
-    Text(&'b RawValue),
-}
-
-impl Sent<'_> {
-    /// The demonstration for this mapper's model. Nothing if it is not well-formed, or was read for another model.
-    fn of(self, mapper: &Arc<Mapper>) -> Option<Demonstration> {
-        match self {
-            Self::Read(other, demonstration) => Arc::ptr_eq(mapper, &other).then_some(demonstration),
-            Self::Text(text) => Demonstration::read_well_formed(mapper.model().schema(), text.get()),
-        }
-    }
-}
-
-impl<'b> Outline<'b> {
-    /// Reads a request, which names one of the models that may be `at_hand`. Nothing if it is not well-formed.
-    fn read(body: &'b [u8], at_hand: &dyn Fn(&str) -> Option<Arc<Mapper>>) -> Option<Self> {
-        // Once, rather than string by string.
-        let body = std::str::from_utf8(body).ok()?;
-        let mut deserializer = serde_json::Deserializer::from_str(body);
-        let outline = deserializer.deserialize_map(Members { n_bytes: body.len(), at_hand }).ok()?;
-        deserializer.end().ok()?;
-        Some(outline)
-    }
-}
-
-/// Reads the members of a request of `n_bytes`.
-struct Members<'m> {
-    n_bytes: usize,
-    at_hand: &'m dyn Fn(&str) -> Option<Arc<Mapper>>,
-}
-
-impl<'de> Visitor<'de> for Members<'_> {
-    type Value = Outline<'de>;
-
-    fn expecting(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("a request")
-    }
-
-    fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<Outline<'de>, A::Error> {
-        let (mut document, mut demonstration) = (Map::new(), None);
-        while let Some(name) = members.next_key::<String>()? {
-            let value = if name == "demonstration" {
-                let model = document.get("model").and_then(Value::as_str);
-                demonstration = Some(match model.and_then(self.at_hand) {
-                    Some(mapper) => {
-                        let well_formed = WellFormed { schema: mapper.model().schema(), n_bytes: self.n_bytes };
-                        let read = members.next_value_seed(well_formed)?;
-                        Sent::Read(mapper, read)
-                    }
-                    None => Sent::Text(members.next_value()?),
-                });
-                Value::Bool(true)
-            } else {
-                members.next_value()?
-            };
-            document.insert(name, value);
-        }
-        let demonstration = demonstration.ok_or_else(|| A::Error::missing_field("demonstration"))?;
-        Ok(Outline { document: Value::Object(document), demonstration })
-    }
 }
 
 /// What a request names.
