@@ -1,5 +1,6 @@
 //! Connections: accepted, served, and ended in good order.
 
+use std::collections::HashMap;
 use std::pin::pin;
 use std::time::Duration;
 
@@ -10,6 +11,7 @@ use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::oneshot;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
 
@@ -27,26 +29,33 @@ pub async fn serve(listener: TcpListener, router: Router, head_timeout: Duration
         }
     });
     let mut connections = JoinSet::new();
+    // Dropped to end them. To ask a token costs a lock, which connections would share, twice a request.
+    let mut ends = HashMap::new();
     loop {
         tokio::select! {
             // Waits a moment where there are no more file descriptors.
             (stream, _) = listener.accept() => {
-                connections.spawn(serve_connection(builder.clone(), stream, router.clone(), stopping.clone()));
+                let (end, ended) = oneshot::channel();
+                let connection = connections.spawn(serve_connection(builder.clone(), stream, router.clone(), ended));
+                ends.insert(connection.id(), end);
             }
-            Some(_) = connections.join_next() => {}
+            Some(served) = connections.join_next_with_id() => {
+                ends.remove(&served.map_or_else(|error| error.id(), |(id, ())| id));
+            }
             () = stopping.cancelled() => break,
         }
     }
-    drop(listener);
+    drop((listener, ends));
     while connections.join_next().await.is_some() {}
 }
 
-async fn serve_connection(builder: http1::Builder, stream: TcpStream, router: Router, stopping: CancellationToken) {
+/// Serves a connection until it ends, or what runs on it when `end` is dropped has ended.
+async fn serve_connection(builder: http1::Builder, stream: TcpStream, router: Router, end: oneshot::Receiver<()>) {
     let service = TowerToHyperService::new(router.into_service::<Incoming>());
     let mut connection = pin!(builder.serve_connection(TokioIo::new(stream), service).with_upgrades());
     let served = tokio::select! {
         served = connection.as_mut() => served,
-        () = stopping.cancelled() => {
+        _ = end => {
             connection.as_mut().graceful_shutdown();
             connection.await
         }
