@@ -107,7 +107,9 @@ impl<'de> Visitor<'de> for WellFormed<'_> {
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Demonstration, A::Error> {
         let Self { schema, n_values } = self;
         let mut values = Vec::with_capacity(n_values);
-        while items.next_element_seed(OneObservation { schema, values: &mut values })?.is_some() {}
+        // Most observations have their members in the order of the first, and that is mostly the attributes'.
+        let mut order: Vec<usize> = (0..schema.len()).collect();
+        while items.next_element_seed(OneObservation { schema, values: &mut values, order: &mut order })?.is_some() {}
         let read = Demonstration { values, n_attributes: schema.len() };
         let is_within = (1..=Demonstration::MAX_OBSERVATIONS).contains(&read.len());
         if is_within { Ok(read) } else { Err(A::Error::custom("too few observations, or too many")) }
@@ -118,6 +120,8 @@ impl<'de> Visitor<'de> for WellFormed<'_> {
 struct OneObservation<'s, 'v> {
     schema: &'s Schema,
     values: &'v mut Vec<Option<Value>>,
+    /// The attributes that members were of, by their place, in the observation before.
+    order: &'v mut [usize],
 }
 
 impl<'de> DeserializeSeed<'de> for OneObservation<'_, '_> {
@@ -147,14 +151,15 @@ impl<'de> Visitor<'de> for OneObservation<'_, '_> {
     fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<(), A::Error> {
         let first = self.values.len();
         self.values.resize(first + self.schema.len(), None);
-        // Most name the attributes in their order.
-        let mut expected = 0;
-        while let Some(position) = members.next_key_seed(Name { schema: self.schema, expected })? {
-            let attribute = &self.schema.attributes()[position];
-            self.values[first + position] = members.next_value_seed(ValueSeed(attribute))?;
-            expected = position + 1;
+        let Self { schema, values, order } = self;
+        let mut places = order.iter_mut();
+        loop {
+            let mut further = 0;
+            let expected = places.next().unwrap_or(&mut further);
+            let Some(position) = members.next_key_seed(Name { schema, expected: *expected })? else { return Ok(()) };
+            *expected = position;
+            values[first + position] = members.next_value_seed(ValueSeed(&schema.attributes()[position]))?;
         }
-        Ok(())
     }
 }
 

@@ -1,13 +1,12 @@
 //! Requests that are read in one pass: their demonstrations, which are most of them, without a document in between.
 //!
-//! Only what is well-formed can be read like this, by a model that is at hand. The rest is read as a document, which takes several times
+//! Only what is well-formed can be read like this, for a model that is at hand. The rest is read as a document, which takes several times
 //! as long and tells what is wrong.
 
 use std::fmt;
 use std::sync::Arc;
 
 use serde::de::{DeserializeSeed, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
-use serde_json::value::RawValue;
 use serde_json::{Map, Value};
 
 use crate::mapping::{Demonstration, Mapper, WellFormed};
@@ -16,78 +15,51 @@ use crate::mapping::{Demonstration, Mapper, WellFormed};
 pub(super) type AtHand<'m> = &'m dyn Fn(&str) -> Option<Arc<Mapper>>;
 
 /// A request for a policy.
-pub(super) struct Outline<'b> {
+pub(super) struct Outline {
     /// With something else in place of the demonstration.
     pub(super) document: Value,
-    demonstration: Sent<'b>,
+    /// Of the model that it was read for.
+    mapper: Arc<Mapper>,
+    demonstration: Demonstration,
 }
 
-impl<'b> Outline<'b> {
-    /// Reads a request, which names one of the models that may be `at_hand`. Nothing if it is not well-formed.
-    pub(super) fn read(body: &'b [u8], at_hand: AtHand<'_>) -> Option<Self> {
-        let (document, demonstration) = read(body, OfRequest { n_bytes: body.len(), at_hand })?;
-        Some(Self { document, demonstration })
+impl Outline {
+    /// Reads a request, which names a model that is `at_hand`. Nothing if it is not well-formed.
+    pub(super) fn read(body: &[u8], at_hand: AtHand<'_>) -> Option<Self> {
+        let (document, (mapper, demonstration)) = read(body, |body| OfRequest { body, at_hand })?;
+        Some(Self { document, mapper, demonstration })
     }
 
-    /// The document, and the demonstration for this mapper's model. Nothing if that is not well-formed, or was read for another model.
+    /// The document, and the demonstration for this mapper's model. Nothing if it was read for another one.
     pub(super) fn of(self, mapper: &Arc<Mapper>) -> Option<(Value, Demonstration)> {
-        let demonstration = match self.demonstration {
-            Sent::Read(other, demonstration) => Arc::ptr_eq(mapper, &other).then_some(demonstration),
-            Sent::Text(text) => Demonstration::read_well_formed(mapper.model().schema(), text.get()),
-        };
-        Some((self.document, demonstration?))
+        Arc::ptr_eq(&self.mapper, mapper).then_some((self.document, self.demonstration))
     }
-}
-
-/// A demonstration, as it came in a body.
-enum Sent<'b> {
-    /// After the name of a model that was at hand: as one for that.
-    Read(Arc<Mapper>, Demonstration),
-    /// Before the model was known.
-    Text(&'b RawValue),
 }
 
 /// A request for many policies.
 pub(super) struct BatchOutline {
     /// With something else in place of the items.
     pub(super) document: Value,
-    /// Each with its demonstration, and something else in place of that.
-    pub(super) items: Vec<(Value, Demonstration)>,
     /// Of the model that they were read for.
     pub(super) mapper: Arc<Mapper>,
+    /// Each with its demonstration, and something else in place of that.
+    pub(super) items: Vec<(Value, Demonstration)>,
 }
 
 impl BatchOutline {
     /// Reads a batch, which names a model that is `at_hand`. Nothing if it is not well-formed.
     pub(super) fn read(body: &[u8], at_hand: AtHand<'_>) -> Option<Self> {
-        let (document, sent) = read(body, OfBatch { at_hand })?;
-        let (mapper, items) = match sent {
-            SentItems::Read(mapper, items) => (mapper, items),
-            SentItems::Text(text) => {
-                let mapper = model_at_hand(document.as_object()?, at_hand)?;
-                let mut deserializer = serde_json::Deserializer::from_str(text.get());
-                let items = Items { mapper: &mapper }.deserialize(&mut deserializer).ok()?;
-                (mapper, items)
-            }
-        };
-        Some(Self { document, items, mapper })
+        let (document, (mapper, items)) = read(body, |body| OfBatch { body, at_hand })?;
+        Some(Self { document, mapper, items })
     }
 }
 
-/// The items of a batch, as they came in a body.
-enum SentItems<'b> {
-    /// After the name of a model that was at hand: as those for that.
-    Read(Arc<Mapper>, Vec<(Value, Demonstration)>),
-    /// Before the model was known.
-    Text(&'b RawValue),
-}
-
 /// Reads an object: all of it as a document, but for what it is `about`, which has something else in its place.
-fn read<'de, T: About<'de>>(body: &'de [u8], about: T) -> Option<(Value, T::Read)> {
+fn read<'de, T: About<'de>>(body: &'de [u8], about: impl FnOnce(&'de str) -> T) -> Option<(Value, T::Read)> {
     // Once, rather than string by string.
     let body = std::str::from_utf8(body).ok()?;
     let mut deserializer = serde_json::Deserializer::from_str(body);
-    let read = Members(about).deserialize(&mut deserializer).ok()?;
+    let read = Members(about(body)).deserialize(&mut deserializer).ok()?;
     deserializer.end().ok()?;
     Some(read)
 }
@@ -101,42 +73,37 @@ trait About<'de> {
     fn read<A: MapAccess<'de>>(&self, before: &Map<String, Value>, members: &mut A) -> Result<Self::Read, A::Error>;
 }
 
-/// The demonstration of a request of `n_bytes`.
+/// The demonstration of a request, and the model that it was read for.
 struct OfRequest<'m> {
-    n_bytes: usize,
+    body: &'m str,
     at_hand: AtHand<'m>,
 }
 
 impl<'de> About<'de> for OfRequest<'_> {
     const NAME: &'static str = "demonstration";
-    type Read = Sent<'de>;
+    type Read = (Arc<Mapper>, Demonstration);
 
-    fn read<A: MapAccess<'de>>(&self, before: &Map<String, Value>, members: &mut A) -> Result<Sent<'de>, A::Error> {
-        let Some(mapper) = model_at_hand(before, self.at_hand) else { return members.next_value().map(Sent::Text) };
-        let read = members.next_value_seed(WellFormed::in_text(mapper.model().schema(), self.n_bytes))?;
-        Ok(Sent::Read(mapper, read))
+    fn read<A: MapAccess<'de>>(&self, before: &Map<String, Value>, members: &mut A) -> Result<Self::Read, A::Error> {
+        let mapper = model_at_hand(before, self.body, self.at_hand)?;
+        let read = members.next_value_seed(WellFormed::in_text(mapper.model().schema(), self.body.len()))?;
+        Ok((mapper, read))
     }
 }
 
-/// The items of a batch.
+/// The items of a batch, and the model that they were read for.
 struct OfBatch<'m> {
+    body: &'m str,
     at_hand: AtHand<'m>,
 }
 
 impl<'de> About<'de> for OfBatch<'_> {
     const NAME: &'static str = "items";
-    type Read = SentItems<'de>;
+    type Read = (Arc<Mapper>, Vec<(Value, Demonstration)>);
 
-    fn read<A: MapAccess<'de>>(
-        &self,
-        before: &Map<String, Value>,
-        members: &mut A,
-    ) -> Result<SentItems<'de>, A::Error> {
-        let Some(mapper) = model_at_hand(before, self.at_hand) else {
-            return members.next_value().map(SentItems::Text);
-        };
+    fn read<A: MapAccess<'de>>(&self, before: &Map<String, Value>, members: &mut A) -> Result<Self::Read, A::Error> {
+        let mapper = model_at_hand(before, self.body, self.at_hand)?;
         let items = members.next_value_seed(Items { mapper: &mapper })?;
-        Ok(SentItems::Read(mapper, items))
+        Ok((mapper, items))
     }
 }
 
@@ -155,9 +122,22 @@ impl<'de> About<'de> for OfItem<'_> {
     }
 }
 
-/// The model that is named among the members, if it is at hand.
-fn model_at_hand(members: &Map<String, Value>, at_hand: AtHand<'_>) -> Option<Arc<Mapper>> {
-    at_hand(members.get("model")?.as_str()?)
+/// The model that is named among the members `before`, or may be named further on in `body`: who sorts members has it last. Whether it
+/// is that one will be seen.
+fn model_at_hand<E: serde::de::Error>(
+    before: &Map<String, Value>,
+    body: &str,
+    at_hand: AtHand<'_>,
+) -> Result<Arc<Mapper>, E> {
+    let name = before.get("model").map_or_else(|| last_model(body), Value::as_str);
+    name.and_then(at_hand).ok_or_else(|| E::custom("no model is at hand"))
+}
+
+/// What stands in `body` after the last `"model":`, if it is a plain string.
+fn last_model(body: &str) -> Option<&str> {
+    let (_, after) = body.rsplit_once("\"model\"")?;
+    let value = after.trim_start().strip_prefix(':')?.trim_start().strip_prefix('"')?;
+    value.split_once('"').map(|(name, _)| name)
 }
 
 /// Reads the members of an object.
@@ -223,5 +203,57 @@ impl<'de> Visitor<'de> for Items<'_> {
             items.push(item);
         }
         Ok(items)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::interrupt::Uninterrupted;
+    use crate::model::{Definition, Limits, Model};
+
+    fn mapper() -> Arc<Mapper> {
+        let model = serde_json::from_str(include_str!("../../examples/figure-4/model.json")).unwrap();
+        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap())
+    }
+
+    /// Whether this is read for the model `a`; there is another one called `b`.
+    fn is_read_for_a(body: &str) -> bool {
+        let (a, b) = (mapper(), mapper());
+        let at_hand = |name: &str| match name {
+            "a" => Some(Arc::clone(&a)),
+            "b" => Some(Arc::clone(&b)),
+            _ => None,
+        };
+        let read = Outline::read(body.as_bytes(), &at_hand).and_then(|outline| outline.of(&a));
+        read.is_some_and(|(document, demonstration)| document["model"] == "a" && demonstration.len() == 2)
+    }
+
+    #[test]
+    fn a_request_is_read_for_its_model_wherever_that_is_named() {
+        const DEMONSTRATION: &str = r#""demonstration": [{"x": 0, "y": 0}, {"y": 1, "x": 0}]"#;
+        for body in [
+            format!(r#"{{"model": "a", {DEMONSTRATION}}}"#),
+            format!(r#"{{{DEMONSTRATION}, "model" :"a"}}"#),
+            format!(r#"{{"learner": "l", {DEMONSTRATION}, "model": "a", "start": 0}}"#),
+            format!(r#"{{{DEMONSTRATION}, "model": "a", "learner": "\"model\": \"b\""}}"#),
+        ] {
+            assert!(is_read_for_a(&body), "{body}");
+        }
+        for body in [
+            format!(r#"{{"model": "b", {DEMONSTRATION}}}"#),
+            format!(r#"{{{DEMONSTRATION}, "model": "b"}}"#),
+            format!(r#"{{"model": "b", {DEMONSTRATION}, "model": "a"}}"#),
+            format!(r#"{{{DEMONSTRATION}, "model": "a", "weights": {{"model": "b"}}}}"#),
+            format!(r#"{{{DEMONSTRATION}, "model": "c"}}"#),
+            format!(r#"{{{DEMONSTRATION}, "model": 7}}"#),
+            format!(r#"{{{DEMONSTRATION}, "model": "\u0061"}}"#),
+            format!("{{{DEMONSTRATION}}}"),
+            r#"{"model": "a"}"#.to_owned(),
+        ] {
+            assert!(!is_read_for_a(&body), "{body}");
+        }
     }
 }
