@@ -78,6 +78,8 @@ pub(crate) struct WellFormed<'s> {
     pub(crate) schema: &'s Schema,
     /// How many values it has, about: room for so many is made first.
     pub(crate) n_values: usize,
+    /// Most observations that it may have.
+    pub(crate) max_len: usize,
 }
 
 impl<'s> WellFormed<'s> {
@@ -85,7 +87,7 @@ impl<'s> WellFormed<'s> {
     pub(crate) fn in_text(schema: &'s Schema, n_bytes: usize) -> Self {
         /// About what a value takes, with the name of its attribute.
         const VALUE_BYTES: usize = 12;
-        Self { schema, n_values: n_bytes / VALUE_BYTES }
+        Self { schema, n_values: n_bytes / VALUE_BYTES, max_len: Demonstration::MAX_OBSERVATIONS }
     }
 }
 
@@ -105,14 +107,22 @@ impl<'de> Visitor<'de> for WellFormed<'_> {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Demonstration, A::Error> {
-        let Self { schema, n_values } = self;
+        let Self { schema, n_values, max_len } = self;
         let mut values = Vec::with_capacity(n_values);
+        let mut len = 0;
         // Most observations have their members in the order of the first, and that is mostly the attributes'.
         let mut order: Vec<usize> = (0..schema.len()).collect();
-        while items.next_element_seed(OneObservation { schema, values: &mut values, order: &mut order })?.is_some() {}
-        let read = Demonstration { values, n_attributes: schema.len() };
-        let is_within = (1..=Demonstration::MAX_OBSERVATIONS).contains(&read.len());
-        if is_within { Ok(read) } else { Err(A::Error::custom("too few observations, or too many")) }
+        while items.next_element_seed(OneObservation { schema, values: &mut values, order: &mut order })?.is_some() {
+            len += 1;
+            // As they come: what is not observed takes as much room as what is.
+            if len > max_len {
+                return Err(A::Error::custom("too many observations"));
+            }
+        }
+        if len == 0 {
+            return Err(A::Error::custom("no observations"));
+        }
+        Ok(Demonstration { values, n_attributes: schema.len() })
     }
 }
 

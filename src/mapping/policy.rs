@@ -231,8 +231,9 @@ impl Policy {
     /// whether it would not.
     /// What is estimated is what a step says of the imitator's state.
     pub(crate) fn check_size(model: &Model, n_observations: usize, place: &Place<'_, '_>, faults: &mut Faults) -> bool {
-        let n_bytes = n_observations.saturating_mul(model.state_bytes());
-        if n_bytes > MAX_STATES_BYTES {
+        let is_within = n_observations <= Self::max_observations(model);
+        if !is_within {
+            let n_bytes = n_observations.saturating_mul(model.state_bytes());
             let detail = format!(
                 "the states of a policy of {n_observations} observations would take about {} MB, and {} MB is the most: \
                  split the demonstration, or give the model fewer or shorter attributes",
@@ -241,7 +242,12 @@ impl Policy {
             );
             faults.note(place, detail);
         }
-        n_bytes <= MAX_STATES_BYTES
+        is_within
+    }
+
+    /// Most observations of a policy, or of several that are answered together, that is not too large.
+    pub(crate) fn max_observations(model: &Model) -> usize {
+        MAX_STATES_BYTES / model.state_bytes().max(1)
     }
 
     /// The policy of `mapping`, which must be of `problem`.

@@ -9,7 +9,8 @@ use std::sync::Arc;
 use serde::de::{DeserializeSeed, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 
-use crate::mapping::{Demonstration, Mapper, WellFormed};
+use super::batch::MAX_BATCH_ITEMS;
+use crate::mapping::{Demonstration, Mapper, Policy, WellFormed};
 
 /// Gives the model with a name, if it is at hand.
 pub(super) type AtHand<'m> = &'m dyn Fn(&str) -> Option<Arc<Mapper>>;
@@ -107,10 +108,11 @@ impl<'de> About<'de> for OfBatch<'_> {
     }
 }
 
-/// The demonstration of an item, of about `n_values`.
+/// The demonstration of an item, of about `n_values`, and of no more than `max_len` observations.
 struct OfItem<'m> {
     mapper: &'m Mapper,
     n_values: usize,
+    max_len: usize,
 }
 
 impl<'de> About<'de> for OfItem<'_> {
@@ -118,7 +120,8 @@ impl<'de> About<'de> for OfItem<'_> {
     type Read = Demonstration;
 
     fn read<A: MapAccess<'de>>(&self, _: &Map<String, Value>, members: &mut A) -> Result<Demonstration, A::Error> {
-        members.next_value_seed(WellFormed { schema: self.mapper.model().schema(), n_values: self.n_values })
+        let Self { mapper, n_values, max_len } = *self;
+        members.next_value_seed(WellFormed { schema: mapper.model().schema(), n_values, max_len })
     }
 }
 
@@ -174,7 +177,7 @@ impl<'de, T: About<'de>> Visitor<'de> for Members<T> {
     }
 }
 
-/// Reads the items of a batch.
+/// Reads the items of a batch, which must not be too large together.
 struct Items<'m> {
     mapper: &'m Mapper,
 }
@@ -195,26 +198,38 @@ impl<'de> Visitor<'de> for Items<'_> {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut sent: A) -> Result<Self::Value, A::Error> {
+        let model = self.mapper.model();
         let mut items = Vec::new();
-        let mut n_values = 0;
-        while let Some(item) = sent.next_element_seed(Members(OfItem { mapper: self.mapper, n_values }))? {
+        let (mut n_values, mut n_left) = (0, Policy::max_observations(model));
+        loop {
+            let max_len = n_left.min(Demonstration::MAX_OBSERVATIONS);
+            let item = OfItem { mapper: self.mapper, n_values, max_len };
+            let Some(item) = sent.next_element_seed(Members(item))? else { return Ok(items) };
             // Most are about as long as the one before.
-            n_values = item.1.len() * self.mapper.model().schema().len();
+            n_values = item.1.len() * model.schema().len();
+            n_left -= item.1.len();
             items.push(item);
+            if items.len() > MAX_BATCH_ITEMS {
+                return Err(A::Error::custom("too many items"));
+            }
         }
-        Ok(items)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use serde_json::json;
+
     use super::*;
     use crate::interrupt::Uninterrupted;
     use crate::model::{Definition, Limits, Model};
 
     fn mapper() -> Arc<Mapper> {
-        let model = serde_json::from_str(include_str!("../../examples/figure-4/model.json")).unwrap();
-        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        mapper_of(&serde_json::from_str(include_str!("../../examples/figure-4/model.json")).unwrap())
+    }
+
+    fn mapper_of(model: &Value) -> Arc<Mapper> {
+        let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap())
     }
@@ -255,5 +270,35 @@ mod tests {
         ] {
             assert!(!is_read_for_a(&body), "{body}");
         }
+    }
+
+    #[test]
+    fn a_batch_of_more_than_may_be_answered_is_not_read_to_its_end() {
+        let attribute = |n: usize| json!({"name": format!("{n:0>64}"), "kind": "number"});
+        let mapper = mapper_of(&json!({
+            "attributes": (0..256).map(attribute).collect::<Vec<_>>(), "actions": [],
+            "dynamics": {"kind": "table", "states": [vec![0; 256]], "transitions": []},
+        }));
+        let is_read = |lengths: &[usize]| {
+            let items = lengths.iter().map(|len| format!(r#"{{"demonstration": [{}]}}"#, vec!["{}"; *len].join(",")));
+            let items = items.collect::<Vec<_>>().join(",");
+            let body = format!(r#"{{"model": "wide", "items": [{items}]}}"#);
+            BatchOutline::read(body.as_bytes(), &|_| Some(Arc::clone(&mapper))).is_some()
+        };
+        let most = Policy::max_observations(mapper.model());
+        assert!((100..Demonstration::MAX_OBSERVATIONS).contains(&most));
+        assert!(is_read(&[most]) && is_read(&[most - 100, 99, 1]));
+        assert!(!is_read(&[most + 1]) && !is_read(&[most - 100, 99, 1, 1]) && !is_read(&[1, 0]));
+    }
+
+    #[test]
+    fn a_batch_of_too_many_items_is_not_read_to_its_end() {
+        let mapper = mapper();
+        let is_read = |n_items: usize| {
+            let items = vec![r#"{"demonstration": [{}]}"#; n_items].join(",");
+            let body = format!(r#"{{"items": [{items}], "model": "a"}}"#);
+            BatchOutline::read(body.as_bytes(), &|_| Some(Arc::clone(&mapper))).is_some()
+        };
+        assert!(is_read(MAX_BATCH_ITEMS) && !is_read(MAX_BATCH_ITEMS + 1));
     }
 }
