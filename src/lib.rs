@@ -33,11 +33,11 @@
 //! | [`cli`] | the subcommands |
 //! | [`config`], [`telemetry`] | settings, logs and measurements |
 //!
-//! A request for a policy passes `http::policies` (body), `service::policies` (model from `service::cache`, a place in
-//! `service::pool`), [`mapping::Request`] (faults), [`mapping::Mapper`] (search), [`mapping::WrittenPolicy`] (the answer, and what
-//! is stored of it), and `store::writer` (disk) before it is answered. An observation of a stream passes `http::stream` (transport),
-//! [`stream::run`] (frames), `service::sessions` (durable before it is acknowledged) and [`mapping::OnlineMapping`]
-//! (committed steps).
+//! A request for a policy passes `http::policies` (body), `service::policies` (a place in `service::pool`), `service::outline` (its
+//! demonstration, for the model from `service::cache`), [`mapping::Request`] (faults), [`mapping::Mapper`] (search),
+//! [`mapping::WrittenPolicy`] (the answer, and what is stored of it), and `store::writer` (disk) before it is answered. An observation
+//! of a stream passes `http::stream` (transport), [`stream::run`] (frames), `service::sessions` (durable before it is acknowledged) and
+//! [`mapping::OnlineMapping`] (committed steps).
 //!
 //! A model passes `http::body` (decompressed, and read as it comes if it is large), [`model::Definition::parse_from`] (into compact
 //! arrays, with all faults), [`model::Model::compile`], and `store::definitions` (its canonical text, in pieces if it is long) before
