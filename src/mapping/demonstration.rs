@@ -35,16 +35,6 @@ impl Demonstration {
         (faults.count() == n_before).then_some(Self { values, n_attributes: schema.len() })
     }
 
-    /// Reads a demonstration that is well-formed from its JSON text, in a fraction of the time. `None` if anything is wrong with it,
-    /// which [`Self::read`] can tell.
-    #[must_use]
-    pub fn read_well_formed(schema: &Schema, text: &str) -> Option<Self> {
-        let mut deserializer = serde_json::Deserializer::from_str(text);
-        let read = WellFormed::in_text(schema, text.len()).deserialize(&mut deserializer).ok()?;
-        deserializer.end().ok()?;
-        Some(read)
-    }
-
     /// How many observations there are: n + 1.
     #[must_use]
     #[expect(clippy::len_without_is_empty, reason = "it is never empty")]
@@ -220,6 +210,13 @@ mod tests {
         ])
     }
 
+    fn read_well_formed(schema: &Schema, text: &str) -> Option<Demonstration> {
+        let mut deserializer = serde_json::Deserializer::from_str(text);
+        let read = WellFormed::in_text(schema, text.len()).deserialize(&mut deserializer).ok()?;
+        deserializer.end().ok()?;
+        Some(read)
+    }
+
     /// A value that some attribute may have, and others may not.
     fn value() -> impl Strategy<Value = String> {
         const NUMBERS: [&str; 22] = [
@@ -316,7 +313,7 @@ mod tests {
                 let read = Demonstration::read(&schema, &Place::root(document), &mut faults);
                 read.filter(|_| faults.is_empty())
             });
-            let well_formed = Demonstration::read_well_formed(&schema, &text);
+            let well_formed = read_well_formed(&schema, &text);
             // Written out, 0 and -0 differ.
             prop_assert_eq!(format!("{well_formed:?}"), format!("{read:?}"), "{}", text);
         }
@@ -331,7 +328,7 @@ mod tests {
             let read = document.as_ref().ok().and_then(|document| {
                 Demonstration::read(&schema(), &Place::root(document), &mut faults)
             });
-            let well_formed = Demonstration::read_well_formed(&schema(), &text);
+            let well_formed = read_well_formed(&schema(), &text);
             prop_assert_eq!(format!("{well_formed:?}"), format!("{read:?}"), "{}", text);
         }
     }
@@ -342,6 +339,6 @@ mod tests {
         let document = document::parse(text.as_bytes()).unwrap();
         let read = Demonstration::read(&schema(), &Place::root(&document), &mut Faults::default());
         assert!(read.is_some());
-        assert_eq!(Demonstration::read_well_formed(&schema(), text), read);
+        assert_eq!(read_well_formed(&schema(), text), read);
     }
 }
