@@ -10,6 +10,7 @@ use serde::de::{DeserializeSeed, Deserializer, Error as _, MapAccess, SeqAccess,
 use serde_json::{Map, Value};
 
 use super::batch::MAX_BATCH_ITEMS;
+use super::policies::max_quick_observations;
 use crate::mapping::{Demonstration, Mapper, Policy, WellFormed};
 
 /// Gives the model with a name, if it is at hand.
@@ -86,7 +87,10 @@ impl<'de> About<'de> for OfRequest<'_> {
 
     fn read<A: MapAccess<'de>>(&self, before: &Map<String, Value>, members: &mut A) -> Result<Self::Read, A::Error> {
         let mapper = model_at_hand(before, self.body, self.at_hand)?;
-        let read = members.next_value_seed(WellFormed::in_text(mapper.model().schema(), self.body.len()))?;
+        let well_formed = WellFormed::in_text(mapper.model().schema(), self.body.len());
+        // More than that are read as a document, whose size is checked first.
+        let max_len = max_quick_observations(mapper.model());
+        let read = members.next_value_seed(WellFormed { max_len, ..well_formed })?;
         Ok((mapper, read))
     }
 }
@@ -289,6 +293,17 @@ mod tests {
         assert!((100..Demonstration::MAX_OBSERVATIONS).contains(&most));
         assert!(is_read(&[most]) && is_read(&[most - 100, 99, 1]));
         assert!(!is_read(&[most + 1]) && !is_read(&[most - 100, 99, 1, 1]) && !is_read(&[1, 0]));
+    }
+
+    #[test]
+    fn a_demonstration_that_takes_long_to_answer_is_not_read_to_its_end() {
+        let mapper = mapper();
+        let is_read = |len: usize| {
+            let body = format!(r#"{{"demonstration": [{}], "model": "a"}}"#, vec!["{}"; len].join(","));
+            Outline::read(body.as_bytes(), &|_| Some(Arc::clone(&mapper))).is_some()
+        };
+        let most = max_quick_observations(mapper.model());
+        assert!(most > 100 && is_read(most) && !is_read(most + 1));
     }
 
     #[test]

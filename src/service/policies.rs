@@ -265,7 +265,12 @@ fn is_quick(model: &Model, document: &Value, n_observations: usize) -> bool {
         && document["lookahead"].is_null()
         && document["heuristic"] != "paper"
         && n_observations.saturating_mul(size) <= MAX_INLINE_WORK
-        && n_observations.saturating_mul(model.state_bytes()) <= MAX_INLINE_BYTES
+        && n_observations <= max_quick_observations(model)
+}
+
+/// Most observations of a request that is quick, whose answer has a state for each of them.
+pub(super) fn max_quick_observations(model: &Model) -> usize {
+    MAX_INLINE_BYTES / model.state_bytes().max(1)
 }
 
 /// Where a request's demonstration is.
