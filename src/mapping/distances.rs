@@ -78,6 +78,16 @@ impl<'m> Distances<'m> {
         self.active.iter().fold(0.0, |sum, active| sum + active.term(observation, row[active.position]))
     }
 
+    /// `D(o_i, s)` of all states, in the order of their numbers.
+    pub(crate) fn of_states(&self, observation: usize, states: &States, distances: &mut [f64]) {
+        distances.fill(0.0);
+        for active in &self.active {
+            for (state, distance) in (0..).zip(&mut *distances) {
+                *distance += active.term(observation, states.row(state)[active.position]);
+            }
+        }
+    }
+
     /// The terms of `D(o_i, s)`, given the row of `s`, in schema order; attributes that take no part are left out.
     pub(crate) fn terms(&self, observation: usize, row: &[u32]) -> impl Iterator<Item = (usize, f64)> {
         self.active.iter().map(move |active| (active.position, active.term(observation, row[active.position])))

@@ -29,9 +29,10 @@
 //! the first way found to a node at its least cost is kept; costs are compared as the sums of floats along the path. Small problems
 //! are searched layer by layer, those nodes first that beams keep, and in the order in which they were found. In others nodes are
 //! expanded in the order of `f` to a thousandth, the most recently found of equals first. A search that takes long may be
-//! replaced by a sweep over all nodes, which tells them apart as [`OnlineMapping`] does; when it is depends on the problem and the budget
-//! alone.
+//! replaced by a sweep over all nodes, from the last observation back, in which a node is left by a skip unless a match is cheaper, and by
+//! a match unless an extra action is; when it is depends on the problem and the budget alone.
 
+mod backward;
 mod completion;
 mod cost;
 mod demonstration;

@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | [`layered`] | beams, and what they leave, layer by layer | the default heuristic, in small problems |
 //! | [`best_first`] | A* for consistent estimates, with an incumbent and buckets | the default heuristic, in larger ones |
+//! | [`sweep`] | what it costs to go on from every node, from the last layer back | what takes the others long |
 //! | [`astar`] | A* as in the textbook | the paper's heuristic, which is not consistent, and none |
 //! | [`seen`], [`nodes`] with [`index`], [`buckets`] | the states, the closed and the open list of [`best_first`] | |
 
@@ -14,6 +15,7 @@ mod index;
 pub(super) mod layered;
 mod nodes;
 mod seen;
+pub(super) mod sweep;
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;

@@ -1,13 +1,14 @@
 //! Searches that get more help the longer they take.
 
 use super::{Budget, Buffers, Mapper, Mapping, Settings, conclude, within};
-use crate::interrupt::{Cancelled, Interrupt, Signal};
-use crate::mapping::heuristic::GroupingPatience;
+use crate::interrupt::{Cancelled, Interrupt};
+use crate::mapping::Problem;
+use crate::mapping::cost::SLACK;
 use crate::mapping::heuristic::projected::{MAX_ENTRIES, Projected};
-use crate::mapping::search::Found;
-use crate::mapping::search::best_first;
-use crate::mapping::{OnlineMapping, Problem};
-use crate::model::Space;
+use crate::mapping::heuristic::{GroupingPatience, Heuristic};
+use crate::mapping::search::sweep::{Layer, Swept, sweep};
+use crate::mapping::search::{Found, best_first};
+use crate::model::{Space, StateIdx};
 
 impl Mapper {
     /// Searches best first, with more help the longer it takes: at first with tables of projections only where they are small,
@@ -24,7 +25,7 @@ impl Mapper {
         let Settings { budget, grouping, .. } = settings;
         let n_nodes =
             space.n_states().map_or(u64::MAX, |n| (n as u64).saturating_mul(problem.demonstration.len() as u64));
-        let may_be_swept = space.n_states().is_some_and(|n_states| n_states <= MAX_SWEPT_STATES);
+        let may_be_swept = space.n_states().is_some();
         let n_observations = problem.demonstration.len();
         // Where there are not even expansions enough to look at every observation, much depends on good estimates.
         let is_small_budget = budget.max_expansions < n_observations as u64;
@@ -59,16 +60,14 @@ impl Mapper {
                 continue;
             }
             if is_enough {
-                let swept = self.sweep(problem, budget, interrupt)?;
-                found.n_expanded += swept.n_expanded;
-                found.n_generated += swept.n_generated;
-                match swept.outcome {
-                    Outcome::Mapped(mapping) => {
-                        let Found { n_expanded, n_generated, .. } = found;
-                        return Ok(Mapping { n_expanded, n_generated, ..mapping });
+                match sweep(problem, budget, interrupt)? {
+                    Swept::Done(swept) => found = joined(Found { paths: Vec::new(), ..found }, swept),
+                    Swept::CutShort { known, n_expanded } => {
+                        let bound = known.map_or(0.0, |layer| bound_of(problem, &projected, &layer));
+                        found.least_f = found.least_f.max(bound);
+                        found.n_expanded += n_expanded;
                     }
-                    Outcome::CutShort => {}
-                    Outcome::TooLarge => {
+                    Swept::TooLarge => {
                         let max_expansions = budget.max_expansions - found.n_expanded;
                         let rest = Budget { max_expansions, ..budget };
                         let more = self.search(space, problem, &mut projected, rest, most_f, interrupt)?;
@@ -100,46 +99,17 @@ impl Mapper {
             best_first::search(problem, space, projected, budget, most_f, searching, interrupt)
         })
     }
-
-    /// The cheapest mapping, from the cheapest ways to all states at each observation after the other.
-    fn sweep(&self, problem: &Problem<'_>, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Swept, Cancelled> {
-        let mut online = OnlineMapping::new(self, problem.weights.clone(), Some(problem.start), None);
-        let mut is_cut_short = None;
-        for observation in problem.demonstration.iter() {
-            is_cut_short = match interrupt.poll() {
-                Signal::Continue if online.size_bytes() > budget.max_bytes => Some(Outcome::TooLarge),
-                Signal::Continue => None,
-                Signal::Finish => Some(Outcome::CutShort),
-                Signal::Cancel => return Err(Cancelled),
-            };
-            if is_cut_short.is_some() {
-                break;
-            }
-            online.observe(observation, interrupt)?;
-        }
-        let (n_expanded, n_generated) = (online.n_expanded(), online.n_generated());
-        let end = || online.end().map_or(Outcome::CutShort, |(_, mapping)| Outcome::Mapped(mapping));
-        Ok(Swept { outcome: is_cut_short.unwrap_or_else(end), n_expanded, n_generated })
-    }
 }
 
-/// What a sweep gave, and what it took.
-#[derive(Debug)]
-struct Swept {
-    outcome: Outcome,
-    n_expanded: u64,
-    n_generated: u64,
-}
-
-/// How a sweep ended.
-#[derive(Debug, PartialEq)]
-enum Outcome {
-    /// With the cheapest mapping.
-    Mapped(Mapping),
-    /// The interrupt said to finish.
-    CutShort,
-    /// The ways would have taken more memory than the budget allows.
-    TooLarge,
+/// What mappings cost at least, given what it costs to go on from a layer: to come there, they cost no less than the estimate falls.
+/// Those through nodes of infinite estimate cost no less than one that is known.
+fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &Layer) -> f64 {
+    let states = problem.model.states();
+    let estimate = |i: usize, row: &[u32]| problem.distances.distance(i, row) + projected.cost_to_go(i, row);
+    let rise = |(state, cost): (StateIdx, &f64)| cost - estimate(layer.observation, states.row(state));
+    let rises = (0..).zip(&layer.costs).map(rise).filter(|rise| rise.is_finite());
+    let least_rise = rises.fold(f64::INFINITY, f64::min);
+    (estimate(0, &problem.start_row) + least_rise) * (1.0 - SLACK)
 }
 
 /// What two searches for the same mappings found together, of which the later one is `found`.
@@ -190,9 +160,6 @@ impl Patience {
         grouping: GroupingPatience::DEFAULT,
     };
 }
-
-/// Most states of a model whose layers are swept: a layer takes tens of milliseconds then, between two looks at the interrupt.
-const MAX_SWEPT_STATES: usize = 1 << 20;
 
 #[cfg(test)]
 mod tests;

@@ -3,7 +3,7 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::document::{Faults, Place};
-use crate::interrupt::Uninterrupted;
+use crate::interrupt::{Signal, Uninterrupted};
 use crate::mapping::Request;
 use crate::mapping::heuristic::{Grouping, HeuristicName};
 use crate::mapping::mapper::Status;
@@ -218,7 +218,7 @@ fn a_state_with_thousands_of_ways_out_does_not_overrun_the_memory() {
 }
 
 #[test]
-fn tables_left_out_at_first_and_sweeps_come_to_the_same_cost_as_a_search_without_heuristic() {
+fn tables_left_out_at_first_come_to_the_same_cost_as_a_search_without_heuristic() {
     // The places' table is too large for a first attempt, which is not enough.
     let (mapper, request) = belt(3_000, 30);
     let request = read(&mapper, &request);
@@ -249,19 +249,36 @@ fn tables_left_out_at_first_and_sweeps_come_to_the_same_cost_as_a_search_without
         let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
         assert!(mapping.n_expanded <= max_expansions && mapping.lower_bound.unwrap() <= optimum + 1e-9);
     }
+}
 
-    let (mapper, request) = belt(6, 40);
+#[test]
+fn a_sweep_that_is_cut_short_raises_the_bound_and_counts() {
+    let (mapper, request) = belt(60, 100);
+    let patience = Patience {
+        max_layered_nodes: 0,
+        min_expansions_before_sweep: 10,
+        nodes_per_expansion: u64::MAX,
+        ..Patience::DEFAULT
+    };
+    let mapper = Mapper { patience, ..mapper };
     let request = read(&mapper, &request);
-    let sweep = |interrupt: &mut dyn Interrupt| mapper.sweep(&request.problem, Budget::DEFAULT, interrupt);
-    let swept = sweep(&mut Uninterrupted).unwrap();
-    assert_eq!(swept.n_expanded, 60 * 40);
-    let Outcome::Mapped(swept) = swept.outcome else { panic!("{swept:?}") };
-    let settings = Settings { heuristic: HeuristicName::None, ..Settings::default() };
-    let without = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
-    assert_eq!((swept.cost.total, swept.status), (without.cost.total, Status::Optimal));
-    assert_eq!(swept.lower_bound, Some(swept.cost.total));
-    assert_eq!(sweep(&mut || Signal::Finish).unwrap().outcome, Outcome::CutShort);
-    assert_eq!(sweep(&mut || Signal::Cancel).unwrap_err(), Cancelled);
+    let map_until = |n: u32| {
+        let mut n_left = n;
+        let mut interrupt = || {
+            n_left = n_left.saturating_sub(1);
+            if n_left > 0 { Signal::Continue } else { Signal::Finish }
+        };
+        mapper.map(&request.problem, Settings::default(), &mut interrupt).unwrap()
+    };
+    let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap();
+    assert_eq!(optimum.n_expanded, 10 + 600 * 100);
+    let cut_short = |n| Some(map_until(n)).filter(|mapping| mapping.status == Status::Bounded);
+    let swept: Vec<Mapping> = (1..1000).map_while(cut_short).filter(|mapping| mapping.n_expanded > 10).collect();
+    assert!(swept.len() > 3, "{}", swept.len());
+    let bounds: Vec<f64> = swept.iter().map(|mapping| mapping.lower_bound.unwrap()).collect();
+    assert!(bounds.is_sorted() && bounds[0] < bounds[bounds.len() - 1], "{bounds:?}");
+    assert!(bounds.iter().all(|bound| *bound <= optimum.cost.total), "{bounds:?}, of {:?}", optimum.cost);
+    assert!(swept.iter().all(|mapping| (mapping.n_expanded - 10) % 600 == 0));
 }
 
 #[test]
@@ -321,10 +338,9 @@ fn a_search_goes_on_where_there_is_no_room_for_a_sweep_and_none_is_begun_that_wo
     };
     let swept = map(Budget::DEFAULT);
     assert_eq!((swept.status, swept.n_expanded), (Status::Optimal, 100 + 30_000 * 30));
-    // The newest layer alone has 30,000 nodes.
     let searched = map(Budget { max_bytes: 20_000 * 64, ..Budget::DEFAULT });
     assert_eq!((searched.status, searched.cost.total), (Status::Optimal, swept.cost.total));
-    assert!(searched.n_expanded < swept.n_expanded / 4, "a few layers, and a search: {}", searched.n_expanded);
+    assert!(searched.n_expanded < swept.n_expanded / 4, "a search alone: {}", searched.n_expanded);
 
     let n_all = swept.n_expanded;
     assert_eq!(map(Budget { max_expansions: n_all, ..Budget::DEFAULT }).n_expanded, n_all);

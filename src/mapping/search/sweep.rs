@@ -1,0 +1,219 @@
+//! The cheapest mapping, from what it costs to go on from every node.
+//!
+//! The layers are gone through from the last to the first ([`backward`]), each from the one after it alone, and of each node it is
+//! kept how it is left, in two bytes. The mapping is then read off from the start. Where all layers together would take too
+//! much memory, they are divided into *sections*: of all but the first, only what its first layer costs is kept, and it is gone through
+//! again when the mapping has come there.
+
+use std::ops::Range;
+
+use super::{Found, Move, MoveKind};
+use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
+use crate::mapping::backward::{self, Distances, GoOn, Graph, Link, Links, NoLinks, Price};
+use crate::mapping::{Budget, Problem};
+use crate::model::Transition;
+
+/// What a sweep came to.
+#[derive(Debug)]
+pub(in crate::mapping) enum Swept {
+    /// The cheapest mapping.
+    Done(Found),
+    /// The interrupt said to finish.
+    CutShort {
+        /// The earliest layer that was done, if any was.
+        known: Option<Layer>,
+        n_expanded: u64,
+    },
+    /// It would take more memory than the budget allows, or states have too many ways out.
+    TooLarge,
+}
+
+/// What it costs to be at each state at an observation and to go on from there.
+#[derive(Debug)]
+pub(in crate::mapping) struct Layer {
+    pub(in crate::mapping) observation: usize,
+    /// By state.
+    pub(in crate::mapping) costs: Vec<f64>,
+}
+
+/// Finds the cheapest mapping of a problem in a model whose states are all known. Each node counts as one expansion.
+///
+/// # Errors
+///
+/// [`Cancelled`] if `interrupt` said so.
+pub(in crate::mapping) fn sweep(
+    problem: &Problem<'_>,
+    budget: Budget,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Swept, Cancelled> {
+    /// How many ways are looked at between two looks at the interrupt: tens of microseconds.
+    const POLL_EVERY: u64 = 1 << 14;
+    let Some(section_len) = section_len(problem, budget) else { return Ok(Swept::TooLarge) };
+    in_sections(problem, section_len, Meter::new(interrupt, POLL_EVERY))
+}
+
+/// The same, in sections of so many layers.
+fn in_sections(problem: &Problem<'_>, section_len: usize, meter: Meter<'_>) -> Result<Swept, Cancelled> {
+    let model = problem.model;
+    let n_states = model.graph().n_states();
+    let ways = model.graph().iter().map(|(from, transition)| (from, transition.to, transition.action));
+    let prices = model.actions().iter().map(|action| Price { share: action.cost, part: 0.0 });
+    let Some(graph) = Graph::new(n_states, ways, prices.collect()) else { return Ok(Swept::TooLarge) };
+    let mut sweep = Sweep {
+        problem,
+        graph: &graph,
+        observation: problem.last(),
+        distances: vec![0.0; n_states],
+        here: vec![0.0; n_states],
+        next: vec![0.0; n_states],
+        n_stepped: 0,
+        buffers: backward::Buffers::default(),
+        meter,
+    };
+    match sweep.run(section_len) {
+        Ok(path) => {
+            let n_layers = problem.demonstration.len() as u64;
+            Ok(Swept::Done(Found {
+                paths: vec![path],
+                is_complete: true,
+                least_f: f64::INFINITY,
+                n_expanded: n_states as u64 * n_layers,
+                n_generated: (n_states as u64 + 2 * model.graph().n_transitions() as u64) * n_layers,
+            }))
+        }
+        Err(CutShort { signal: Signal::Cancel, .. }) => Err(Cancelled),
+        Err(CutShort { known, .. }) => Ok(Swept::CutShort { known, n_expanded: sweep.n_stepped * n_states as u64 }),
+    }
+}
+
+/// How many layers a section has, as many as there is room for; `None` if there is not even for the shortest.
+fn section_len(problem: &Problem<'_>, budget: Budget) -> Option<usize> {
+    let (n_observations, graph) = (problem.demonstration.len(), problem.model.graph());
+    let n_states = graph.n_states();
+    // Besides the graph, distances, two layers, and one to be told if it is cut short.
+    let basis = Graph::bytes_for(n_states, graph.n_transitions()) + 4 * n_states * size_of::<f64>();
+    let room = budget.max_bytes.checked_sub(basis)? / n_states.max(1);
+    // The more sections, the shorter they are, but the more layers are kept from which they begin.
+    let mut divisions = (1..=n_observations.isqrt() + 1).map(|n| (n, n_observations.div_ceil(n)));
+    let fits = |(n_sections, len): &(usize, usize)| n_sections * size_of::<f64>() + len * size_of::<Link>() <= room;
+    divisions.find(fits).map(|(_, len)| len)
+}
+
+struct Sweep<'s, 'i> {
+    problem: &'s Problem<'s>,
+    graph: &'s Graph,
+    /// What was looked at last,
+    observation: usize,
+    /// what its states cost there,
+    distances: Vec<f64>,
+    /// and what going on from them costs.
+    here: Vec<f64>,
+    /// What being at each state costs at the observation after that, and going on from there.
+    next: Vec<f64>,
+    /// How many layers were done.
+    n_stepped: u64,
+    buffers: backward::Buffers,
+    meter: Meter<'i>,
+}
+
+/// Why a sweep has no mapping.
+struct CutShort {
+    signal: Signal,
+    known: Option<Layer>,
+}
+
+impl Sweep<'_, '_> {
+    /// Gives the cheapest mapping.
+    fn run(&mut self, section_len: usize) -> Result<Vec<Move>, CutShort> {
+        let (n_states, last) = (self.here.len(), self.problem.last());
+        // What going on costs from the first layers of the sections but the first two, the last one's first.
+        let mut kept: Vec<Vec<f64>> = Vec::new();
+        self.begin_at(last, None);
+        while self.observation > section_len {
+            self.step_back(&mut NoLinks)?;
+            if self.observation > section_len && self.observation.is_multiple_of(section_len) {
+                kept.push(self.here.clone());
+            }
+        }
+        let mut moves = vec![self.start()];
+        let mut links = vec![Link::SKIP; n_states * section_len.min(last)];
+        let mut first = 0;
+        let mut earliest = None;
+        loop {
+            for links in links.chunks_exact_mut(n_states).take(self.observation - first).rev() {
+                let stepped = self.step_back(links);
+                stepped.map_err(|cut_short| CutShort { known: earliest.take().or(cut_short.known), ..cut_short })?;
+            }
+            let end = (first + section_len).min(last);
+            self.follow(&links, first..end, &mut moves);
+            if end == last {
+                return Ok(moves);
+            }
+            if first == 0 {
+                let costs = self.distances.iter().zip(&self.here).map(|(distance, here)| distance + here);
+                earliest = Some(Layer { observation: 0, costs: costs.collect() });
+            }
+            first = end;
+            self.begin_at((first + section_len).min(last), kept.pop());
+        }
+    }
+
+    /// Begins anew at an observation, from which going on costs so much; nothing from the last one.
+    fn begin_at(&mut self, observation: usize, costs: Option<Vec<f64>>) {
+        self.observation = observation;
+        match costs {
+            Some(costs) => self.here = costs,
+            None => self.here.fill(0.0),
+        }
+        self.problem.distances.of_states(observation, self.problem.model.states(), &mut self.distances);
+    }
+
+    /// Goes back by an observation.
+    fn step_back<L: Links + ?Sized>(&mut self, links: &mut L) -> Result<(), CutShort> {
+        let Self { problem, graph, observation, distances, here, next, n_stepped, buffers, meter } = self;
+        for ((next, distance), here) in next.iter_mut().zip(&*distances).zip(&*here) {
+            *next = distance + here;
+        }
+        *observation -= 1;
+        problem.distances.of_states(*observation, problem.model.states(), distances);
+        let of_here = Distances { rests: distances, least: 0.0 };
+        graph.step_back(next, of_here, here, links, buffers, meter).map_err(|signal| {
+            let known = Layer { observation: *observation + 1, costs: std::mem::take(next) };
+            CutShort { signal, known: Some(known) }
+        })?;
+        *n_stepped += 1;
+        Ok(())
+    }
+
+    fn start(&self) -> Move {
+        Move { kind: MoveKind::Start, action: None, observation: 0, state: self.problem.start }
+    }
+
+    /// Goes on with `moves` through the layers of these observations, as `links` say: those of the states at the first, then the next.
+    fn follow(&self, links: &[Link], observations: Range<usize>, moves: &mut Vec<Move>) {
+        let (n_states, first) = (self.distances.len(), observations.start);
+        while let Some(&Move { kind, observation, state, .. }) = moves.last()
+            && (observation as usize) < observations.end
+        {
+            let link = links[(observation as usize - first) * n_states + state as usize];
+            let by_way = |way: usize, kind, observation| {
+                let Transition { action, to } = self.problem.model.graph().successors(state)[way];
+                Move { kind, action: Some(action), observation, state: to }
+            };
+            let step = match link.go_on() {
+                GoOn::Skip => Move { kind: MoveKind::Skip, action: None, observation: observation + 1, state },
+                GoOn::Match(way) => by_way(way, MoveKind::Match, observation + 1),
+                // The action instead of the skip leads here too, for no more.
+                GoOn::Extra(way) if kind == MoveKind::Skip => {
+                    moves.pop();
+                    by_way(way, MoveKind::Match, observation)
+                }
+                GoOn::Extra(way) => by_way(way, MoveKind::Extra, observation),
+            };
+            moves.push(step);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;
