@@ -4,6 +4,8 @@
 //! much work lies between two questions is each computation's to choose, so that it takes milliseconds at most; a
 //! `Meter` counts it. What the answer rests on (a deadline, a vanished client, a shutdown) is the caller's affair.
 
+use std::time::Duration;
+
 /// What a long computation is told when it asks whether to go on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Signal {
@@ -30,6 +32,14 @@ impl<F: FnMut() -> Signal> Interrupt for F {
     fn poll(&mut self) -> Signal {
         self()
     }
+}
+
+/// When to tell a computation to [`Signal::Finish`] that is to have its answer after `deadline`: a twentieth before it, but no more
+/// than ten milliseconds. That is what ends a search: up to a look at the clock, the bound of what is open, the mapping.
+#[must_use]
+pub fn time_until_finish(deadline: Duration) -> Duration {
+    const MOST_RESERVED: Duration = Duration::from_millis(10);
+    deadline.saturating_sub((deadline / 20).min(MOST_RESERVED))
 }
 
 /// Never interrupts.
@@ -76,5 +86,17 @@ impl<'i> Meter<'i> {
     #[inline]
     pub(crate) fn spend_or_cancel(&mut self, units: u64) -> Result<(), Cancelled> {
         if self.spend(units) == Signal::Cancel { Err(Cancelled) } else { Ok(()) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn little_time_is_reserved_for_the_end() {
+        let until_finish = [0, 1, 20, 200, 86_400_000].map(|ms| time_until_finish(Duration::from_millis(ms)));
+        let micros = [0, 950, 19_000, 190_000, 86_399_990_000].map(Duration::from_micros);
+        assert_eq!(until_finish, micros);
     }
 }

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use etude::interrupt::Signal;
+use etude::interrupt::{Signal, time_until_finish};
 use etude::mapping::Settings;
 
 use crate::worlds::World;
@@ -25,7 +25,8 @@ fn compare(world: &World, deadlines_us: &[u64]) {
         let deadline = Duration::from_micros(*deadline_us);
         let solve = || {
             let started = Instant::now();
-            let mut interrupt = || if started.elapsed() < deadline { Signal::Continue } else { Signal::Finish };
+            let finish = time_until_finish(deadline);
+            let mut interrupt = || if started.elapsed() < finish { Signal::Continue } else { Signal::Finish };
             let mapping = mapper.map(&problem, Settings::default(), &mut interrupt).expect("nothing cancels");
             (mapping, started.elapsed())
         };

@@ -12,7 +12,7 @@ use serde_json::{Map as Members, Value, json};
 
 use super::{CliError, render};
 use crate::document::{self, Faults, Place};
-use crate::interrupt::{Signal, Uninterrupted};
+use crate::interrupt::{Signal, Uninterrupted, time_until_finish};
 use crate::mapping::{Mapper, Policy, Request, Stamp};
 use crate::model::{CompileError, Definition, Limits, Model, hash_of};
 
@@ -69,7 +69,7 @@ impl Map {
         let asked = faults.check(read).map_err(|faults| CliError::Faults { what, faults })?;
 
         let started = Instant::now();
-        let mut interrupt = || match asked.deadline {
+        let mut interrupt = || match asked.deadline.map(time_until_finish) {
             Some(deadline) if started.elapsed() >= deadline => Signal::Finish,
             _ => Signal::Continue,
         };

@@ -15,7 +15,7 @@ use super::outline::Outline;
 use super::{Admission, Etude, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
-use crate::interrupt::{Cancelled, Interrupt};
+use crate::interrupt::{Cancelled, Interrupt, time_until_finish};
 use crate::mapping::{Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
@@ -234,9 +234,9 @@ impl Envelope {
         (envelope, faults)
     }
 
-    /// When a request that came at `arrived` is to be answered.
+    /// When the search for a request that came at `arrived` is to finish.
     pub(super) fn deadline(&self, arrived: Instant) -> Option<Instant> {
-        self.deadline.and_then(|deadline| arrived.checked_add(deadline))
+        self.deadline.and_then(|deadline| arrived.checked_add(time_until_finish(deadline)))
     }
 
     /// What the policy `id` is stamped with.
