@@ -10,7 +10,7 @@
 //!
 //! where the distance at the observation is `rest`, of which the graph tells the vertices apart, and `least`, of which a way pays its
 //! part. The vertices are the states of a model, each way paying all ([`super::search::sweep`]), or the classes of a group of
-//! attributes, whose ways pay the group's share ([`super::heuristic::whole`]).
+//! attributes, whose ways pay the group's share ([`super::heuristic`]'s tables of several attributes).
 //!
 //! The first two are looked up for one vertex after the other. Extra actions lead to others at the same observation, so these are gone
 //! over again and again until few of them change, and the rest is done by Dijkstra's algorithm. A way replaces one that was found only
@@ -44,12 +44,20 @@ struct Way {
 }
 
 /// What a way costs besides the distance of the vertex to which it leads.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Price {
     /// The action's cost, or a share of it.
     pub(super) share: f64,
     /// Which part of the least distance an extra action pays: from 0 to 1.
     pub(super) part: f64,
+}
+
+impl Price {
+    /// Of an extra action.
+    #[inline]
+    pub(super) fn of_extra(self, least_distance: f64) -> f64 {
+        self.share + self.part * least_distance
+    }
 }
 
 /// The number of a [`Price`].
@@ -191,7 +199,7 @@ impl Graph {
             links.set(vertex, link.unwrap_or(Link::SKIP));
         }
         buffers.prices.clear();
-        buffers.prices.extend(self.prices.iter().map(|price| price.share + price.part * distances.least));
+        buffers.prices.extend(self.prices.iter().map(|price| price.of_extra(distances.least)));
         self.linger(distances.rests, here, links, buffers, meter)
     }
 

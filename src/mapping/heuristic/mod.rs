@@ -6,12 +6,13 @@
 //! | `none` | yes | yes | nothing: A* becomes Dijkstra's algorithm |
 //! | `paper` | no | no | differences and least action cost ([`paper`]) |
 
-mod bounded;
 mod edges;
 mod grouping;
+mod joint;
 pub(super) mod paper;
 pub(super) mod projected;
 pub(super) mod projection;
+mod shares;
 
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
@@ -59,8 +60,11 @@ pub(super) struct GroupingPatience {
     pub(super) min_expansions: u64,
     /// and after so many for each of the model's transitions: looking at one takes about as long.
     pub(super) expansions_per_transition: u64,
-    /// How many expansions must have been done for each entry of a level's tables; if 0, these may be of any size.
+    /// How many expansions must have been done for each entry of a level's tables of the classes that matter; if 0, these may be of
+    /// any size.
     pub(super) expansions_per_entry: u64,
+    /// How many entries of tables of all classes are made for each expansion that was done.
+    pub(super) whole_entries_per_expansion: usize,
 }
 
 impl GroupingPatience {
@@ -70,6 +74,8 @@ impl GroupingPatience {
         // An entry takes about as long as two; attempts that fail should not take much of the search, and they are repeated
         // whenever it has doubled.
         expansions_per_entry: 16,
+        // In searches that are long enough, an entry takes a tenth of the time of an expansion: they wait for memory, and tables do not.
+        whole_entries_per_expansion: 16,
     };
 }
 

@@ -21,7 +21,7 @@
 //! attributes pay alone.
 //!
 //! Each attribute alone is projected for every problem. The groups of several that [`grouping`] chooses have many classes, and their
-//! tables are made for searches that take long ([`super::bounded`]).
+//! tables are made for searches that take long ([`super::joint`]).
 
 use std::sync::OnceLock;
 

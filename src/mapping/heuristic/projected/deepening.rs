@@ -2,13 +2,13 @@
 
 use std::collections::BinaryHeap;
 
-use super::shares::{Parts, Way, Ways};
 use super::{Column, Projected, Table};
 use crate::interrupt::{Cancelled, Meter, Signal};
 use crate::mapping::Problem;
 use crate::mapping::cost::SLACK;
-use crate::mapping::heuristic::bounded::{Basis, Bounded, Unsolved};
+use crate::mapping::heuristic::joint::{Basis, Joint, Room, Unsolved};
 use crate::mapping::heuristic::projection::Projections;
+use crate::mapping::heuristic::shares::{Parts, Way, Ways};
 use crate::mapping::heuristic::{Grouping, GroupingPatience};
 use crate::mapping::open_list::CheapestFirst;
 
@@ -75,8 +75,10 @@ pub(in crate::mapping) enum Deepened {
     CutShort,
 }
 
-/// Most entries of the tables of a level: 256 MB with the room in hash tables.
+/// Most entries of the tables of a level: 256 MB with the room in hash tables,
 const MAX_JOINT_ENTRIES: usize = 1 << 22;
+/// or of all classes.
+const MAX_WHOLE_ENTRIES: usize = 1 << 25;
 
 impl<'p> Projected<'p> {
     /// Sets when attributes are projected together, before any were.
@@ -112,8 +114,15 @@ impl<'p> Projected<'p> {
                 n_entries.and_then(|n_entries| usize::try_from(n_entries).ok()).unwrap_or(usize::MAX)
             }
         };
-        let most_entries = most_entries.min(MAX_JOINT_ENTRIES);
-        match self.solve_level(&mut deepening, limit, most_entries, meter) {
+        let most_whole = match deepening.grouping {
+            Grouping::Widest => MAX_WHOLE_ENTRIES,
+            Grouping::WhenItPays => {
+                let n_expanded = usize::try_from(n_expanded).unwrap_or(usize::MAX);
+                n_expanded.saturating_mul(deepening.patience.whole_entries_per_expansion).min(MAX_WHOLE_ENTRIES)
+            }
+        };
+        let room = Room { bounded: most_entries.min(MAX_JOINT_ENTRIES), whole: most_whole };
+        match self.solve_level(&mut deepening, limit, room, meter) {
             Ok(None) => Ok(Deepened::No),
             Ok(Some(joint)) => {
                 let columns = self.columns.iter();
@@ -148,9 +157,9 @@ impl<'p> Projected<'p> {
         &self,
         deepening: &mut Deepening<'p>,
         limit: f64,
-        mut n_left: usize,
+        mut room: Room,
         meter: &mut Meter<'_>,
-    ) -> Result<Option<Vec<Bounded<'p>>>, Unsolved> {
+    ) -> Result<Option<Vec<Joint<'p>>>, Unsolved> {
         let Deepening { projections, used, level, forward, .. } = deepening;
         let projections: &'p Projections = projections;
         let mut poll = || meter.spend(u64::MAX);
@@ -179,6 +188,7 @@ impl<'p> Projected<'p> {
             let least_terms = rows.map(|row| columns.iter().flatten().map(|number| row[*number]).sum());
             let least_terms: Vec<f64> = least_terms.collect();
             let basis = Basis {
+                states: self.problem.model.states(),
                 columns: &offsets,
                 least_distances: &self.least_distances,
                 least_terms: &least_terms,
@@ -186,12 +196,12 @@ impl<'p> Projected<'p> {
                 forward: costs,
                 limit: limit * (1.0 + SLACK) - others,
             };
-            joint.push(Bounded::solve(group, &basis, |edge, more| parts.of(edge, more), &mut n_left, meter)?);
+            joint.push(Joint::solve(group, &basis, &parts, &mut room, meter)?);
         }
         Ok(Some(joint))
     }
 
-    /// Costs from the start, forwards over the demonstration: with `F_i(v)` as in [`super::bounded`],
+    /// Costs from the start, forwards over the demonstration: with `F_i(v)` as in [`joint`](crate::mapping::heuristic::joint),
     ///
     /// ```text
     /// F_0(start) = term(0, start)
@@ -227,9 +237,9 @@ impl<'p> Projected<'p> {
                 } else {
                     for class in 0..n_classes {
                         here[class] = here[class].min(before[class] + term(class));
-                        for Way { class: to, share, .. } in ways.of(class) {
+                        for Way { class: to, price } in ways.of(class) {
                             let to = *to as usize;
-                            here[to] = here[to].min(before[class] + share + term(to));
+                            here[to] = here[to].min(before[class] + price.share + term(to));
                         }
                     }
                 }
@@ -245,7 +255,7 @@ impl<'p> Projected<'p> {
                     }
                     for way in ways.of(id as usize) {
                         let (to, rest) = (way.class as usize, term(way.class as usize) - least);
-                        let arrived = cost + way.share_of_extra(self.least_distances[i]) + rest;
+                        let arrived = cost + way.price.of_extra(self.least_distances[i]) + rest;
                         if arrived < here[to] {
                             here[to] = arrived;
                             open.push(CheapestFirst { cost: arrived, id: way.class });

@@ -1,7 +1,6 @@
 //! Projections solved for one demonstration: tables of distances and exact costs-to-go.
 
 mod deepening;
-mod shares;
 mod table;
 
 use std::collections::BinaryHeap;
@@ -12,14 +11,14 @@ pub(in crate::mapping) use table::CHUNK_LEN;
 pub(super) use table::Table;
 use table::stride_for;
 
-use super::bounded::Bounded;
+use super::joint::Joint;
 use super::projection::{Group, Projections};
+use super::shares::{Parts, Ways};
 use super::{Grouping, Heuristic};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
 use crate::mapping::open_list::CheapestFirst;
 use deepening::Deepening;
-use shares::{Parts, Ways};
 
 /// What a node `(i, s)` costs: what is paid on arriving, and what must still be paid after.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -61,7 +60,7 @@ pub(crate) struct Projected<'p> {
     /// The least term of each column. Shape `[n_observations, n_columns]`.
     least_terms: Vec<f64>,
     /// The tables of groups of several attributes. The columns of these have no costs-to-go of their own any more.
-    joint: Vec<Bounded<'p>>,
+    joint: Vec<Joint<'p>>,
     /// What deeper estimates are made of; `None` if there can be none.
     deepening: Option<Deepening<'p>>,
 }
@@ -374,7 +373,7 @@ impl<'p> Projected<'p> {
             for (class, next) in next.iter().enumerate() {
                 let cost = next.distance + next.cost_to_go;
                 for way in predecessors.of(class) {
-                    let matched = way.share + cost;
+                    let matched = way.price.share + cost;
                     let known = &mut here[way.class as usize].cost_to_go;
                     if matched < *known {
                         *known = matched;
@@ -418,7 +417,7 @@ fn relax(
     open: &mut BinaryHeap<CheapestFirst>,
 ) {
     for way in predecessors.of(class) {
-        let extra = way.share_of_extra(least_distance) + cost;
+        let extra = way.price.of_extra(least_distance) + cost;
         let known = &mut here[way.class as usize].cost_to_go;
         if extra < *known {
             *known = extra;

@@ -24,9 +24,16 @@ pub(super) fn stride_for(n_observations: usize) -> usize {
 
 impl<T: Copy> Table<T> {
     /// The same entry everywhere.
-    pub(super) fn filled_with(entry: T, n_classes: usize, n_observations: usize) -> Self {
-        let stride = stride_for(n_observations);
-        Self { entries: vec![entry; n_classes * stride], stride }
+    pub(in crate::mapping::heuristic) fn filled_with(entry: T, n_classes: usize, n_observations: usize) -> Self {
+        Self {
+            entries: vec![entry; Self::n_entries_for(n_classes, n_observations)],
+            stride: stride_for(n_observations),
+        }
+    }
+
+    /// How many entries a table has, with the room.
+    pub(in crate::mapping::heuristic) fn n_entries_for(n_classes: usize, n_observations: usize) -> usize {
+        n_classes.saturating_mul(stride_for(n_observations))
     }
 
     /// How many there are, with the room.
@@ -42,7 +49,7 @@ impl<T: Copy> Table<T> {
     }
 
     #[inline]
-    pub(super) fn at_mut(&mut self, class: usize, observation: usize) -> &mut T {
+    pub(in crate::mapping::heuristic) fn at_mut(&mut self, class: usize, observation: usize) -> &mut T {
         &mut self.entries[class * self.stride + observation]
     }
 

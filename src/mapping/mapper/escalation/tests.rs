@@ -106,7 +106,22 @@ const IMPATIENT: Patience = Patience {
     entries_per_expansion: 16,
     min_expansions_before_sweep: 40,
     nodes_per_expansion: u64::MAX,
-    grouping: GroupingPatience { min_expansions: 8, expansions_per_transition: 0, expansions_per_entry: 0 },
+    grouping: GroupingPatience {
+        min_expansions: 8,
+        expansions_per_transition: 0,
+        expansions_per_entry: 0,
+        whole_entries_per_expansion: 0,
+    },
+};
+
+/// With tables of all classes rather than of those that matter.
+const THOROUGH: Patience = Patience {
+    grouping: GroupingPatience {
+        expansions_per_entry: u64::MAX,
+        whole_entries_per_expansion: usize::MAX,
+        ..IMPATIENT.grouping
+    },
+    ..IMPATIENT
 };
 
 proptest! {
@@ -119,6 +134,8 @@ proptest! {
             Just(Patience::DEFAULT),
             Just(Patience { max_layered_nodes: 0, ..Patience::DEFAULT }),
             Just(IMPATIENT),
+            Just(THOROUGH),
+            Just(Patience { min_expansions_before_sweep: u64::MAX, ..THOROUGH }),
             Just(Patience { min_expansions_before_sweep: u64::MAX, ..IMPATIENT }),
             Just(Patience { grouping: GroupingPatience::DEFAULT, ..IMPATIENT }),
         ],
@@ -173,7 +190,7 @@ proptest! {
     fn what_a_mapper_searched_before_makes_no_difference(
         (model, request) in prop_oneof![wander(), hall()],
         variations in variations(),
-        patience in prop::sample::select(vec![Patience::DEFAULT, Patience { max_layered_nodes: 0, ..Patience::DEFAULT }, IMPATIENT]),
+        patience in prop::sample::select(vec![Patience::DEFAULT, Patience { max_layered_nodes: 0, ..Patience::DEFAULT }, IMPATIENT, THOROUGH]),
     ) {
         let fresh = || Mapper { patience, ..prepared(&model) };
         let reused = fresh();

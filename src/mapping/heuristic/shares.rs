@@ -1,6 +1,7 @@
 //! How the costs of actions are shared among groups, and the ways between a group's classes at these costs.
 
 use crate::mapping::Problem;
+use crate::mapping::backward::Price;
 use crate::mapping::heuristic::projection::{ClassIdx, Group, ProjectedEdge, Projections};
 use crate::model::Rows;
 
@@ -44,36 +45,26 @@ impl<'p> Parts<'p> {
 #[derive(Debug)]
 pub(super) struct Ways(Rows<Way>);
 
-/// The way to or from a class: the least share of those that there are, and the least part, which may be of different ones.
+/// The way to or from a class.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Way {
     pub(super) class: ClassIdx,
-    /// Of the action's cost.
-    pub(super) share: f64,
-    /// Of what else is paid: from 0 to 1.
-    part: f64,
-}
-
-impl Way {
-    /// What an extra action costs besides the distance that is left, if the least distance is `least_distance`.
-    #[inline]
-    pub(super) fn share_of_extra(&self, least_distance: f64) -> f64 {
-        self.share + self.part * least_distance
-    }
+    /// The least share of those that there are, and the least part, which may be of different ones.
+    pub(super) price: Price,
 }
 
 impl Ways {
     /// The ways into each class, with where they come from.
     pub(super) fn into_classes(group: &Group, parts: &Parts<'_>) -> Self {
         let mut ways = group.edges().map(|edge| {
-            let (share, part) = (parts.of(edge, 0.0), 1.0 / parts.divisors[edge.kind as usize]);
-            Way { class: edge.from, share, part }
+            let part = 1.0 / parts.divisors[edge.kind as usize];
+            Way { class: edge.from, price: Price { share: parts.of(edge, 0.0), part } }
         });
         ways.dedup(|way, other| {
             let is_same = way.class == other.class;
             if is_same {
-                way.share = way.share.min(other.share);
-                way.part = way.part.min(other.part);
+                way.price.share = way.price.share.min(other.price.share);
+                way.price.part = way.price.part.min(other.price.part);
             }
             is_same
         });
@@ -94,6 +85,11 @@ impl Ways {
     #[inline]
     pub(super) fn of(&self, class: usize) -> &[Way] {
         self.0.of(class)
+    }
+
+    /// The ways of one class after the other.
+    pub(super) fn iter(&self) -> impl Iterator<Item = &[Way]> {
+        self.0.iter()
     }
 
     /// How many there are.

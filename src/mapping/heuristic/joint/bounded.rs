@@ -22,29 +22,15 @@
 
 use std::collections::BinaryHeap;
 
-use super::projected::{Estimate, Table};
-use super::projection::{ClassIdx, Group, ProjectedEdge};
+use super::{Basis, Unsolved};
 use crate::interrupt::{Meter, Signal};
+use crate::mapping::heuristic::projection::{ClassIdx, Group};
+use crate::mapping::heuristic::shares::Parts;
 use crate::mapping::open_list::CheapestFirst;
-
-/// What the tables of the single attributes say, on which those of a group rest.
-pub(super) struct Basis<'b> {
-    /// By the group's digits: where the attribute's values begin in the tables; `None` if it is not in them.
-    pub(super) columns: &'b [Option<usize>],
-    /// Distances.
-    pub(super) table: &'b Table<Estimate>,
-    /// Least costs from the start, with the distance.
-    pub(super) forward: &'b Table<f64>,
-    /// The least distance of any state, and the least of what the group's attributes add to it. Shape `[n_observations]`.
-    pub(super) least_distances: &'b [f64],
-    pub(super) least_terms: &'b [f64],
-    /// What a mapping may cost in this group's part: what costs as much or more is dropped.
-    pub(super) limit: f64,
-}
 
 /// The table of a group: hash tables with linear probing, one per observation.
 #[derive(Debug)]
-pub(super) struct Bounded<'p> {
+pub(in crate::mapping::heuristic) struct Bounded<'p> {
     group: &'p Group,
     layers: Vec<Layer>,
     slots: Vec<Slot>,
@@ -67,15 +53,6 @@ struct Slot {
 /// Stands for "no class".
 const NO_CLASS: ClassIdx = ClassIdx::MAX;
 
-/// Why there is no table.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Unsolved {
-    /// It would have too many entries.
-    TooLarge,
-    /// The interrupt said so.
-    Interrupted(Signal),
-}
-
 /// A class of the layer in the making.
 #[derive(Clone, Copy, Debug)]
 struct Entry {
@@ -88,12 +65,11 @@ struct Entry {
 const NO_PLACE: u32 = u32::MAX;
 
 impl<'p> Bounded<'p> {
-    /// Makes the table, with at most `n_left` entries, of which it takes its own. `share` is what an edge costs the group
-    /// if its transition costs more than its action by so much.
+    /// Makes the table, with at most `n_left` entries, of which it takes its own.
     pub(super) fn solve(
         group: &'p Group,
         basis: &Basis<'_>,
-        share: impl Fn(&ProjectedEdge, f64) -> f64,
+        parts: &Parts<'_>,
         n_left: &mut usize,
         meter: &mut Meter<'_>,
     ) -> Result<Self, Unsolved> {
@@ -103,7 +79,7 @@ impl<'p> Bounded<'p> {
             Making { group, basis, observation: 0, places: vec![NO_PLACE; group.n_classes()], entries: Vec::new() };
         let mut open = BinaryHeap::new();
         here.observation = n_observations - 1;
-        here.enumerate(*n_left)?;
+        here.enumerate(*n_left, meter)?;
         table.finish_layer(n_observations - 1, &here.entries, n_left)?;
         for i in (0..n_observations - 1).rev() {
             let next = here.restart(i);
@@ -113,7 +89,7 @@ impl<'p> Bounded<'p> {
                 spend(meter, 1 + edges.len() as u64)?;
                 here.offer(entry.class, cost);
                 for edge in edges {
-                    here.offer(edge.from, share(edge, 0.0) + cost);
+                    here.offer(edge.from, parts.of(edge, 0.0) + cost);
                 }
             }
             for number in 0..here.entries.len() {
@@ -128,7 +104,7 @@ impl<'p> Bounded<'p> {
                 spend(meter, 1 + edges.len() as u64)?;
                 let cost = entry.distance - basis.least_terms[i] + cost;
                 for edge in edges {
-                    let offered = here.offer(edge.from, share(edge, basis.least_distances[i]) + cost);
+                    let offered = here.offer(edge.from, parts.of(edge, basis.least_distances[i]) + cost);
                     open.extend(offered.and_then(|number| here.as_open(number)));
                 }
                 if here.entries.len() > *n_left {
@@ -224,8 +200,25 @@ impl Making<'_> {
         entries
     }
 
-    /// Takes all classes of the last observation, from where nothing is still to be paid.
-    fn enumerate(&mut self, n_left: usize) -> Result<(), Unsolved> {
+    /// Takes all classes of the last observation, from where nothing is still to be paid: one of each state, or of all values if
+    /// there are fewer of those.
+    fn enumerate(&mut self, n_left: usize, meter: &mut Meter<'_>) -> Result<(), Unsolved> {
+        let states = self.basis.states;
+        if states.len() as usize > self.group.n_classes() {
+            return self.enumerate_values(n_left);
+        }
+        for state in 0..states.len() {
+            spend(meter, 1)?;
+            #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+            self.offer(self.group.class_of(states.row(state)) as ClassIdx, 0.0);
+            if self.entries.len() > n_left {
+                return Err(Unsolved::TooLarge);
+            }
+        }
+        Ok(())
+    }
+
+    fn enumerate_values(&mut self, n_left: usize) -> Result<(), Unsolved> {
         let mut partial = vec![(0usize, 0.0, 0.0)];
         let mut stride = 1;
         for ((_, n_values), column) in self.group.digits().zip(self.basis.columns) {
