@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 
 use etude::document::{Faults, Place};
 use etude::interrupt::Uninterrupted;
-use etude::mapping::{HeuristicName, Mapper, Problem, Request, Settings};
+use etude::mapping::{Grouping, HeuristicName, Mapper, Problem, Request, Settings};
 use etude::model::{Definition, Limits, Model};
 use peers::{Peer, Solved};
 use serde_json::json;
@@ -98,8 +98,8 @@ fn compare(world: &World) {
         problem.demonstration().len(),
     );
 
-    let etude = |heuristic| {
-        let settings = Settings { heuristic, ..Settings::default() };
+    let etude = |heuristic, grouping| {
+        let settings = Settings { heuristic, grouping, ..Settings::default() };
         move || {
             let mapping = mapper.map(problem, settings, &mut Uninterrupted).expect("nothing interrupts");
             Solved { cost: mapping.cost.total, n_expanded: mapping.n_expanded, n_steps: Some(mapping.moves.len()) }
@@ -107,8 +107,9 @@ fn compare(world: &World) {
     };
     let bound = mapper.lower_bounds(problem);
     let solvers: Vec<(&str, Solver<'_>)> = vec![
-        ("etude", Box::new(etude(HeuristicName::Default))),
-        ("etude, no heuristic", Box::new(etude(HeuristicName::None))),
+        ("etude", Box::new(etude(HeuristicName::Default, Grouping::WhenItPays))),
+        ("etude, widest groups", Box::new(etude(HeuristicName::Default, Grouping::Widest))),
+        ("etude, no heuristic", Box::new(etude(HeuristicName::None, Grouping::WhenItPays))),
         ("pathfinding A*, paper's", Box::new(|| peer.pathfinding(|node| peer.paper(node)))),
         ("pathfinding A*, ours", Box::new(|| peer.pathfinding(|(i, state)| peers::micro_floor(bound(i, state))))),
         ("pathfinding A*, none", Box::new(|| peer.pathfinding(|_| 0))),
@@ -132,8 +133,8 @@ fn compare(world: &World) {
         println!("{name:<26} {cost:>8.1} {n_expanded:>11} {spread:>36} {ratio:>8.1}");
         let is_exact = !name.contains("paper");
         assert!(!is_exact || (cost - solved[0].cost).abs() < 1e-3, "{name} found {cost}");
-        if let Some(n_steps) = n_steps.filter(|_| *name == "etude") {
-            println!("{:<26} {n_steps} steps", "");
+        if let Some(n_steps) = n_steps {
+            println!("{:<26} {n_steps} steps, {:.1} expansions a step", "", *n_expanded as f64 / *n_steps as f64);
         }
         if !name.starts_with("etude") && !name.contains("ours") {
             fastest_peer = fastest_peer.min(ratio);

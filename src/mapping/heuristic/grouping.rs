@@ -3,7 +3,7 @@
 //! Attributes belong together if the one says what the other can do: the position changes as the heading allows, a piece of
 //! gold is taken where it lies. So of each change of an attribute (from a value to another by an action) it is counted with
 //! how many values of every other attribute it occurs; if these are far fewer than they would be if the two were independent,
-//! the other *restricts* it. Groups are merged greedily, those first that restrict each other most, as far as a limit on
+//! the other *restricts* it, unless that is so of few of the attribute's changes. Groups are merged greedily, those first that restrict each other most, as far as a limit on
 //! the number of classes allows.
 
 use std::cmp::{Ordering, Reverse};
@@ -17,7 +17,7 @@ use crate::model::{ActionIdx, Model, StateIdx};
 pub(super) type Partition = Vec<Vec<usize>>;
 
 /// How many classes a group may have, by level.
-const MOST_CLASSES: [usize; 3] = [1 << 12, 1 << 16, 1 << 20];
+const MOST_CLASSES: [usize; 4] = [1 << 12, 1 << 16, 1 << 20, 1 << 24];
 
 /// Most states whose transitions are looked at, and most looks at an attribute of one.
 const MAX_STATES: usize = 1 << 17;
@@ -106,6 +106,9 @@ struct Sightings {
 const MAX_SIGHTINGS: usize = 64;
 const MIN_SIGHTINGS: usize = 8;
 
+/// A part of an attribute's changes that may well be restricted by chance, of the few that were seen only a few times.
+const CHANCE: f64 = 0.01;
+
 /// A change is restricted if it goes with at most this part of the values that are expected: that is hardly ever chance.
 const FEW: f64 = 0.6;
 
@@ -139,6 +142,10 @@ impl Restrictions {
         sightings.retain(|(_, seen)| seen.states.len() >= MIN_SIGHTINGS);
         sightings.sort_unstable_by_key(|(change, _)| *change);
         let mut scores = vec![0.0; n_attributes * n_attributes];
+        let mut n_changes = vec![0u32; n_attributes];
+        for (change, seen) in &sightings {
+            n_changes[change.attribute] += seen.n;
+        }
         for other in 0..n_attributes {
             let mut expected = Expected::new(states.iter().map(|state| model.states().row(*state)[other]));
             for (change, seen) in sightings.iter().filter(|(change, _)| change.attribute != other) {
@@ -152,6 +159,10 @@ impl Restrictions {
                         f64::from(seen.n) * (1.0 - part) / f64::from(n_transitions);
                 }
             }
+        }
+        for (scores, n_changes) in scores.chunks_exact_mut(n_attributes).zip(n_changes) {
+            let chance = f64::from(n_changes) * CHANCE / f64::from(n_transitions);
+            scores.iter_mut().filter(|score| **score < chance).for_each(|score| *score = 0.0);
         }
         let weighs = model.schema().attributes().iter().map(|attribute| attribute.weight > 0.0);
         Ok(Self { n_attributes, scores, weighs: weighs.collect() })
@@ -302,6 +313,27 @@ mod tests {
     fn independent_attributes_stay_apart() {
         assert!(groups(&dials(false)).is_empty());
         assert!(groups(&dials(true)).is_empty());
+    }
+
+    #[test]
+    fn what_restricts_few_changes_by_chance_is_not_grouped() {
+        // Places along a path, numbered by `a` and then `b`, with other marks at random, and steps of up to fifty.
+        let mut n = 0;
+        let mut random = |below: u64| {
+            n += 1;
+            scatter(n) % below
+        };
+        let mut states: Vec<[u64; 4]> = (0..20_000).map(|_| [random(20), random(100), random(8), random(4)]).collect();
+        states.sort_unstable();
+        let transitions: Vec<_> = (0..20_000_u64)
+            .flat_map(|from| [0, 1, 2].map(|action| json!([from, action, (from + random(101) + 19_950) % 20_000])))
+            .collect();
+        let model = json!({
+            "attributes": (["a", "b", "c", "d"]).map(|name| json!({"name": name, "kind": "number"})),
+            "actions": (["0", "1", "2"]).map(|name| json!({"name": name})),
+            "dynamics": {"kind": "table", "states": states, "transitions": transitions},
+        });
+        assert_eq!(groups(&model), [["a b", "c", "d"]]);
     }
 
     #[test]
