@@ -5,8 +5,6 @@
 //! much memory, they are divided into *sections*: of all but the first, only what its first layer costs is kept, and it is gone through
 //! again when the mapping has come there.
 
-use std::ops::Range;
-
 use super::{Found, Move, MoveKind};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::backward::{self, Distances, GoOn, Graph, Link, Links, NoLinks, Price};
@@ -136,16 +134,20 @@ impl Sweep<'_, '_> {
             }
         }
         let mut moves = vec![self.start()];
-        let mut links = vec![Link::SKIP; n_states * section_len.min(last)];
         let mut first = 0;
         let mut earliest = None;
+        // Of a section's layers, the last one's first. They are made one by one: together they take long to be written for the first time.
+        let mut links: Vec<Vec<Link>> = Vec::new();
         loop {
-            for links in links.chunks_exact_mut(n_states).take(self.observation - first).rev() {
-                let stepped = self.step_back(links);
+            let end = self.observation;
+            links.clear();
+            while self.observation > first {
+                let mut of_layer = vec![Link::SKIP; n_states];
+                let stepped = self.step_back(of_layer.as_mut_slice());
                 stepped.map_err(|cut_short| CutShort { known: earliest.take().or(cut_short.known), ..cut_short })?;
+                links.push(of_layer);
             }
-            let end = (first + section_len).min(last);
-            self.follow(&links, first..end, &mut moves);
+            self.follow(&links, end, &mut moves);
             if end == last {
                 return Ok(moves);
             }
@@ -189,13 +191,12 @@ impl Sweep<'_, '_> {
         Move { kind: MoveKind::Start, action: None, observation: 0, state: self.problem.start }
     }
 
-    /// Goes on with `moves` through the layers of these observations, as `links` say: those of the states at the first, then the next.
-    fn follow(&self, links: &[Link], observations: Range<usize>, moves: &mut Vec<Move>) {
-        let (n_states, first) = (self.distances.len(), observations.start);
+    /// Goes on with `moves` to the observation `end`, as `links` say: those of the layer before it, then of the one before that.
+    fn follow(&self, links: &[Vec<Link>], end: usize, moves: &mut Vec<Move>) {
         while let Some(&Move { kind, observation, state, .. }) = moves.last()
-            && (observation as usize) < observations.end
+            && let Some(before_end) = (end - observation as usize).checked_sub(1)
         {
-            let link = links[(observation as usize - first) * n_states + state as usize];
+            let link = links[before_end][state as usize];
             let by_way = |way: usize, kind, observation| {
                 let Transition { action, to } = self.problem.model.graph().successors(state)[way];
                 Move { kind, action: Some(action), observation, state: to }
