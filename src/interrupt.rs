@@ -34,12 +34,14 @@ impl<F: FnMut() -> Signal> Interrupt for F {
     }
 }
 
-/// When to tell a computation to [`Signal::Finish`] that is to have its answer after `deadline`: a twentieth before it, but no more
-/// than ten milliseconds. That is what ends a search: up to a look at the clock, the bound of what is open, the mapping.
+/// When to tell a computation to [`Signal::Finish`] that is to have its answer after `deadline`: a twentieth of it and a few
+/// microseconds before, but no more than ten milliseconds. That is what ends a search: up to a look at the clock, the bound of
+/// what is open, the mapping.
 #[must_use]
 pub fn time_until_finish(deadline: Duration) -> Duration {
+    const LEAST_RESERVED: Duration = Duration::from_micros(25);
     const MOST_RESERVED: Duration = Duration::from_millis(10);
-    deadline.saturating_sub((deadline / 20).min(MOST_RESERVED))
+    deadline.saturating_sub((LEAST_RESERVED + deadline / 20).min(MOST_RESERVED))
 }
 
 /// Never interrupts.
@@ -96,7 +98,7 @@ mod tests {
     #[test]
     fn little_time_is_reserved_for_the_end() {
         let until_finish = [0, 1, 20, 200, 86_400_000].map(|ms| time_until_finish(Duration::from_millis(ms)));
-        let micros = [0, 950, 19_000, 190_000, 86_399_990_000].map(Duration::from_micros);
+        let micros = [0, 925, 18_975, 190_000, 86_399_990_000].map(Duration::from_micros);
         assert_eq!(until_finish, micros);
     }
 }
