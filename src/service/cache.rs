@@ -17,16 +17,30 @@ use crate::store::ModelKey;
 /// most searches, and these need it in memory anyway.
 #[derive(Debug)]
 pub(super) struct MapperCache {
-    cache: Cache<ModelKey, Arc<Mapper>, SizeBytes>,
+    cache: Cache<ModelKey, Kept, SizeBytes>,
     oversized: Mutex<Option<(ModelKey, Arc<Mapper>)>>,
+}
+
+/// A model in the cache.
+#[derive(Clone, Debug)]
+struct Kept {
+    mapper: Arc<Mapper>,
+    /// What it took when it was put in. Long searches add to it, but the cache counts on a weight that stays the same.
+    size_bytes: u64,
+}
+
+impl From<Arc<Mapper>> for Kept {
+    fn from(mapper: Arc<Mapper>) -> Self {
+        Self { size_bytes: mapper.size_bytes() as u64 + 1, mapper }
+    }
 }
 
 #[derive(Clone, Debug)]
 struct SizeBytes;
 
-impl Weighter<ModelKey, Arc<Mapper>> for SizeBytes {
-    fn weight(&self, _: &ModelKey, mapper: &Arc<Mapper>) -> u64 {
-        mapper.size_bytes() as u64 + 1
+impl Weighter<ModelKey, Kept> for SizeBytes {
+    fn weight(&self, _: &ModelKey, kept: &Kept) -> u64 {
+        kept.size_bytes
     }
 }
 
@@ -45,13 +59,13 @@ impl MapperCache {
 
     /// Puts in a model that has just been compiled.
     pub(super) fn insert(&self, key: &ModelKey, mapper: &Arc<Mapper>) {
-        self.cache.insert(key.clone(), Arc::clone(mapper));
+        self.cache.insert(key.clone(), Arc::clone(mapper).into());
         self.keep_if_oversized(key, mapper);
     }
 
     /// The model with this key, if it is there.
     pub(super) fn get(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
-        self.cache.get(key)
+        self.cache.get(key).map(|kept| kept.mapper)
     }
 
     /// The model with this key; `compile` makes it if it is not there.
@@ -62,11 +76,11 @@ impl MapperCache {
     ) -> Result<Arc<Mapper>, E> {
         let get_or_compile = async {
             match self.oversized(key) {
-                Some(mapper) => Ok(mapper),
-                None => compile.await,
+                Some(mapper) => Ok(mapper.into()),
+                None => compile.await.map(Kept::from),
             }
         };
-        let mapper = self.cache.get_or_insert_async(key, get_or_compile).await?;
+        let Kept { mapper, .. } = self.cache.get_or_insert_async(key, get_or_compile).await?;
         self.keep_if_oversized(key, &mapper);
         Ok(mapper)
     }
@@ -78,7 +92,7 @@ impl MapperCache {
 
     fn keep_if_oversized(&self, key: &ModelKey, mapper: &Arc<Mapper>) {
         // The cache keeps nothing that exceeds its hot part, most of it.
-        if self.cache.peek(key).is_none() && SizeBytes.weight(key, mapper) > self.cache.capacity() / 2 {
+        if self.cache.peek(key).is_none() && mapper.size_bytes() as u64 > self.cache.capacity() / 2 {
             let kept = (key.clone(), Arc::clone(mapper));
             // What it replaces may take long to free, which nobody should wait for with the lock in hand.
             let _replaced = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).replace(kept);
@@ -93,7 +107,9 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+    use crate::document::{Faults, Place};
     use crate::interrupt::Uninterrupted;
+    use crate::mapping::{Grouping, Request, Settings};
     use crate::model::{Definition, Limits, Model};
 
     fn mapper(side: u32) -> Arc<Mapper> {
@@ -130,6 +146,26 @@ mod tests {
         assert!(is_compiled(&cache, &key("other"), &large).await);
         assert!(!is_compiled(&cache, &key("other"), &large).await);
         assert!(is_compiled(&cache, &key("large"), &large).await);
+    }
+
+    #[tokio::test]
+    async fn a_model_that_grows_in_long_searches_leaves_the_cache_as_it_came() {
+        let (growing, other) = (mapper(9), mapper(9));
+        let size_bytes = growing.size_bytes();
+        let cache = MapperCache::new(size_bytes as u64 * 3 / 2);
+        cache.insert(&key("growing"), &growing);
+        let object = json!({"model": "m", "demonstration": [{"x": 0}, {"x": 8}]});
+        let mut faults = Faults::default();
+        let object = Place::root(&object).object(&Request::FIELDS, &mut faults).unwrap();
+        let request = Request::read(growing.model(), &object, &mut faults).unwrap();
+        let settings = Settings { grouping: Grouping::Widest, ..Settings::default() };
+        growing.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+        assert!(growing.size_bytes() > size_bytes, "groups of attributes were made");
+        for name in ["other", "growing", "other", "another", "other"] {
+            cache.insert(&key(name), &other);
+            assert!(cache.cache.weight() <= cache.cache.capacity(), "{}", cache.cache.weight());
+            assert!(!is_compiled(&cache, &key(name), &other).await);
+        }
     }
 
     #[tokio::test]
