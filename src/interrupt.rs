@@ -80,6 +80,19 @@ impl<'i> Meter<'i> {
         self.interrupt.poll()
     }
 
+    /// As [`Self::spend`], for work that ends at once.
+    ///
+    /// # Errors
+    ///
+    /// What the interrupt said, if that was not to continue.
+    #[inline]
+    pub(crate) fn go_on(&mut self, units: u64) -> Result<(), Signal> {
+        match self.spend(units) {
+            Signal::Continue => Ok(()),
+            signal => Err(signal),
+        }
+    }
+
     /// As [`Self::spend`], for work that is of no use unless it is finished.
     ///
     /// # Errors

@@ -125,12 +125,13 @@ impl Links for NoLinks {
     fn set(&mut self, _: usize, _: Link) {}
 }
 
-/// What arriving at the vertices costs at an observation.
+/// What an extra action pays for arriving at the vertices.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Distances<'d> {
-    /// By vertex.
+pub(super) struct Arriving<'d> {
+    /// By vertex: the distance without the least. At least 0, without which it might pay to go round in a circle.
     pub(super) rests: &'d [f64],
-    pub(super) least: f64,
+    /// Of this, a way pays its part.
+    pub(super) least_distance: f64,
 }
 
 /// Buffers of a step back.
@@ -174,8 +175,8 @@ impl Graph {
         2 * (n_vertices * size_of::<u32>() + n_ways * size_of::<Way>())
     }
 
-    /// Writes to `here` what it costs to go on from each vertex at an observation, where arriving costs `distances`, if being there
-    /// at the next observation and going on costs `next`. `O(|V| + |E|)`, and `O(|E| log |V|)` where many extra actions follow
+    /// Writes to `here` what it costs to go on from each vertex at an observation, if being there at the next one and going on from there
+    /// costs `next`. `O(|V| + |E|)`, and `O(|E| log |V|)` where many extra actions follow
     /// each other.
     ///
     /// # Errors
@@ -184,23 +185,24 @@ impl Graph {
     pub(super) fn step_back<L: Links + ?Sized>(
         &self,
         next: &[f64],
-        distances: Distances<'_>,
+        arriving: Arriving<'_>,
         here: &mut [f64],
         links: &mut L,
         buffers: &mut Buffers,
         meter: &mut Meter<'_>,
     ) -> Result<(), Signal> {
+        debug_assert!(arriving.rests.iter().all(|rest| *rest >= 0.0), "no circle pays");
         buffers.prices.clear();
         buffers.prices.extend(self.prices.iter().map(|price| price.share));
         for (vertex, ((here, skipped), ways)) in here.iter_mut().zip(next).zip(self.out.iter()).enumerate() {
-            spend(meter, 1 + ways.len() as u64)?;
+            meter.go_on(1 + ways.len() as u64)?;
             let (cost, link) = cheapest(*skipped, ways, &buffers.prices, next, Link::matched);
             *here = cost;
             links.set(vertex, link.unwrap_or(Link::SKIP));
         }
         buffers.prices.clear();
-        buffers.prices.extend(self.prices.iter().map(|price| price.of_extra(distances.least)));
-        self.linger(distances.rests, here, links, buffers, meter)
+        buffers.prices.extend(self.prices.iter().map(|price| price.of_extra(arriving.least_distance)));
+        self.linger(arriving.rests, here, links, buffers, meter)
     }
 
     /// Makes cheaper what extra actions make cheaper, at the prices in `buffers`.
@@ -222,7 +224,7 @@ impl Graph {
         for _ in 0..MAX_PASSES {
             changed.clear();
             for (vertex, (here, ways)) in (0..).zip(here.iter_mut().zip(self.out.iter())) {
-                spend(meter, 1 + ways.len() as u64)?;
+                meter.go_on(1 + ways.len() as u64)?;
                 if let (cost, Some(link)) = cheapest(*here, ways, prices, arrivals, Link::extra) {
                     *here = cost;
                     arrivals[vertex as usize] = cost + rests[vertex as usize];
@@ -241,7 +243,7 @@ impl Graph {
                 continue;
             }
             let ways = self.into.of(id as usize);
-            spend(meter, 1 + ways.len() as u64)?;
+            meter.go_on(1 + ways.len() as u64)?;
             let arrival = cost + rests[id as usize];
             for way in ways {
                 let cost = prices[usize::from(way.price)] + arrival;
@@ -275,11 +277,4 @@ fn cheapest(
         least = select_unpredictable(is_less, cost, least);
     }
     (f64::from_bits(least), (number != NO_WAY).then(|| link_by(number)))
-}
-
-fn spend(meter: &mut Meter<'_>, units: u64) -> Result<(), Signal> {
-    match meter.spend(units) {
-        Signal::Continue => Ok(()),
-        signal => Err(signal),
-    }
 }

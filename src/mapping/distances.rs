@@ -4,6 +4,7 @@ use rustc_hash::FxHashMap;
 
 use super::Demonstration;
 use crate::attribute::{Attribute, Schema, Value, Weights};
+use crate::interrupt::{Meter, Signal};
 use crate::model::{Model, StateIdx, States};
 
 /// Weighted terms of the distance for one demonstration. Attributes without weight, and those that were never observed,
@@ -79,13 +80,28 @@ impl<'m> Distances<'m> {
     }
 
     /// `D(o_i, s)` of all states, in the order of their numbers.
-    pub(crate) fn of_states(&self, observation: usize, states: &States, distances: &mut [f64]) {
-        distances.fill(0.0);
-        for active in &self.active {
-            for (state, distance) in (0..).zip(&mut *distances) {
-                *distance += active.term(observation, states.row(state)[active.position]);
+    ///
+    /// # Errors
+    ///
+    /// What the interrupt of `meter` said, if that was not to continue.
+    pub(crate) fn of_states(
+        &self,
+        observation: usize,
+        states: &States,
+        distances: &mut [f64],
+        meter: &mut Meter<'_>,
+    ) -> Result<(), Signal> {
+        const CHUNK_LEN: usize = 1 << 10;
+        for (first, distances) in (0..states.len()).step_by(CHUNK_LEN).zip(distances.chunks_mut(CHUNK_LEN)) {
+            meter.go_on((distances.len() * self.active.len()) as u64)?;
+            distances.fill(0.0);
+            for active in &self.active {
+                for (state, distance) in (first..).zip(&mut *distances) {
+                    *distance += active.term(observation, states.row(state)[active.position]);
+                }
             }
         }
+        Ok(())
     }
 
     /// The terms of `D(o_i, s)`, given the row of `s`, in schema order; attributes that take no part are left out.

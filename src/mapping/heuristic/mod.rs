@@ -64,7 +64,7 @@ pub(super) struct GroupingPatience {
     /// any size.
     pub(super) expansions_per_entry: u64,
     /// How many entries of tables of all classes are made for each expansion that was done.
-    pub(super) whole_entries_per_expansion: usize,
+    pub(super) full_entries_per_expansion: u64,
 }
 
 impl GroupingPatience {
@@ -75,7 +75,7 @@ impl GroupingPatience {
         // whenever it has doubled.
         expansions_per_entry: 16,
         // In searches that are long enough, an entry takes a tenth of the time of an expansion: they wait for memory, and tables do not.
-        whole_entries_per_expansion: 16,
+        full_entries_per_expansion: 16,
     };
 }
 

@@ -28,7 +28,7 @@ pub struct Budget {
     /// Most nodes expanded.
     pub max_expansions: u64,
     /// Most memory for the nodes and states that it finds, in bytes. The tables of the default heuristic come on top: up to 256 MB,
-    /// and as much again where attributes are projected together.
+    /// and as much again where attributes are projected together, twice while other groups replace those.
     pub max_bytes: usize,
 }
 
@@ -59,7 +59,7 @@ pub struct Settings {
     /// What it may spend.
     pub budget: Budget,
     /// The cost of a mapping that is known already: nothing that costs more is looked at. If it is below the optimum, the mapping
-    /// is bounded by it. Has no effect with the paper's heuristic.
+    /// is bounded by it, unless all nodes had to be looked at. Has no effect with the paper's heuristic.
     pub upper_bound: Option<f64>,
     /// When the default heuristic projects attributes together.
     pub grouping: Grouping,

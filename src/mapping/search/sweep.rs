@@ -7,7 +7,7 @@
 
 use super::{Found, Move, MoveKind};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
-use crate::mapping::backward::{self, Distances, GoOn, Graph, Link, Links, NoLinks, Price};
+use crate::mapping::backward::{self, Arriving, GoOn, Graph, Link, Links, NoLinks, Price};
 use crate::mapping::{Budget, Problem};
 use crate::model::Transition;
 
@@ -18,9 +18,10 @@ pub(in crate::mapping) enum Swept {
     Done(Found),
     /// The interrupt said to finish.
     CutShort {
-        /// The earliest layer that was done, if any was.
-        known: Option<Layer>,
+        /// The earliest layer that was done.
+        known: Layer,
         n_expanded: u64,
+        n_generated: u64,
     },
     /// It would take more memory than the budget allows, or states have too many ways out.
     TooLarge,
@@ -68,19 +69,21 @@ fn in_sections(problem: &Problem<'_>, section_len: usize, meter: Meter<'_>) -> R
         buffers: backward::Buffers::default(),
         meter,
     };
-    match sweep.run(section_len) {
-        Ok(path) => {
-            let n_layers = problem.demonstration.len() as u64;
-            Ok(Swept::Done(Found {
-                paths: vec![path],
-                is_complete: true,
-                least_f: f64::INFINITY,
-                n_expanded: n_states as u64 * n_layers,
-                n_generated: (n_states as u64 + 2 * model.graph().n_transitions() as u64) * n_layers,
-            }))
-        }
+    let done = sweep.run(section_len);
+    // Those of later sections are gone through twice.
+    let n_layers = sweep.n_stepped.min(problem.last()) as u64 + 1;
+    let n_expanded = n_states as u64 * n_layers;
+    let n_generated = (n_states as u64 + 2 * model.graph().n_transitions() as u64) * n_layers;
+    match done {
+        Ok(path) => Ok(Swept::Done(Found {
+            paths: vec![path],
+            is_complete: true,
+            least_f: f64::INFINITY,
+            n_expanded,
+            n_generated,
+        })),
         Err(CutShort { signal: Signal::Cancel, .. }) => Err(Cancelled),
-        Err(CutShort { known, .. }) => Ok(Swept::CutShort { known, n_expanded: sweep.n_stepped * n_states as u64 }),
+        Err(CutShort { known, .. }) => Ok(Swept::CutShort { known, n_expanded, n_generated }),
     }
 }
 
@@ -88,8 +91,8 @@ fn in_sections(problem: &Problem<'_>, section_len: usize, meter: Meter<'_>) -> R
 fn section_len(problem: &Problem<'_>, budget: Budget) -> Option<usize> {
     let (n_observations, graph) = (problem.demonstration.len(), problem.model.graph());
     let n_states = graph.n_states();
-    // Besides the graph, distances, two layers, and one to be told if it is cut short.
-    let basis = Graph::bytes_for(n_states, graph.n_transitions()) + 4 * n_states * size_of::<f64>();
+    // Besides the graph, distances, two layers and one to be told if it is cut short, and as much in buffers.
+    let basis = Graph::bytes_for(n_states, graph.n_transitions()) + 8 * n_states * size_of::<f64>();
     let room = budget.max_bytes.checked_sub(basis)? / n_states.max(1);
     // The more sections, the shorter they are, but the more layers are kept from which they begin.
     let mut divisions = (1..=n_observations.isqrt() + 1).map(|n| (n, n_observations.div_ceil(n)));
@@ -109,7 +112,7 @@ struct Sweep<'s, 'i> {
     /// What being at each state costs at the observation after that, and going on from there.
     next: Vec<f64>,
     /// How many layers were done.
-    n_stepped: u64,
+    n_stepped: usize,
     buffers: backward::Buffers,
     meter: Meter<'i>,
 }
@@ -117,7 +120,12 @@ struct Sweep<'s, 'i> {
 /// Why a sweep has no mapping.
 struct CutShort {
     signal: Signal,
-    known: Option<Layer>,
+    known: Layer,
+}
+
+/// Tells the earliest layer that was done, if that was in an earlier section.
+fn with_earliest(earliest: &mut Option<Layer>) -> impl FnOnce(CutShort) -> CutShort {
+    |cut_short| CutShort { known: earliest.take().unwrap_or(cut_short.known), ..cut_short }
 }
 
 impl Sweep<'_, '_> {
@@ -126,7 +134,7 @@ impl Sweep<'_, '_> {
         let (n_states, last) = (self.here.len(), self.problem.last());
         // What going on costs from the first layers of the sections but the first two, the last one's first.
         let mut kept: Vec<Vec<f64>> = Vec::new();
-        self.begin_at(last, None);
+        self.begin_at(last, None)?;
         while self.observation > section_len {
             self.step_back(&mut NoLinks)?;
             if self.observation > section_len && self.observation.is_multiple_of(section_len) {
@@ -144,7 +152,7 @@ impl Sweep<'_, '_> {
             while self.observation > first {
                 let mut of_layer = vec![Link::SKIP; n_states];
                 let stepped = self.step_back(of_layer.as_mut_slice());
-                stepped.map_err(|cut_short| CutShort { known: earliest.take().or(cut_short.known), ..cut_short })?;
+                stepped.map_err(with_earliest(&mut earliest))?;
                 links.push(of_layer);
             }
             self.follow(&links, end, &mut moves);
@@ -156,18 +164,24 @@ impl Sweep<'_, '_> {
                 earliest = Some(Layer { observation: 0, costs: costs.collect() });
             }
             first = end;
-            self.begin_at((first + section_len).min(last), kept.pop());
+            self.begin_at((first + section_len).min(last), kept.pop()).map_err(with_earliest(&mut earliest))?;
         }
     }
 
     /// Begins anew at an observation, from which going on costs so much; nothing from the last one.
-    fn begin_at(&mut self, observation: usize, costs: Option<Vec<f64>>) {
+    fn begin_at(&mut self, observation: usize, costs: Option<Vec<f64>>) -> Result<(), CutShort> {
         self.observation = observation;
         match costs {
             Some(costs) => self.here = costs,
             None => self.here.fill(0.0),
         }
-        self.problem.distances.of_states(observation, self.problem.model.states(), &mut self.distances);
+        let Self { problem, distances, meter, .. } = self;
+        let looked_up = problem.distances.of_states(observation, problem.model.states(), distances, meter);
+        looked_up.map_err(|signal| {
+            // Nothing is less.
+            distances.fill(0.0);
+            CutShort { signal, known: Layer { observation, costs: std::mem::take(distances) } }
+        })
     }
 
     /// Goes back by an observation.
@@ -177,11 +191,14 @@ impl Sweep<'_, '_> {
             *next = distance + here;
         }
         *observation -= 1;
-        problem.distances.of_states(*observation, problem.model.states(), distances);
-        let of_here = Distances { rests: distances, least: 0.0 };
-        graph.step_back(next, of_here, here, links, buffers, meter).map_err(|signal| {
+        let looked_up = problem.distances.of_states(*observation, problem.model.states(), distances, meter);
+        let stepped = looked_up.and_then(|()| {
+            let arriving = Arriving { rests: distances, least_distance: 0.0 };
+            graph.step_back(next, arriving, here, links, buffers, meter)
+        });
+        stepped.map_err(|signal| {
             let known = Layer { observation: *observation + 1, costs: std::mem::take(next) };
-            CutShort { signal, known: Some(known) }
+            CutShort { signal, known }
         })?;
         *n_stepped += 1;
         Ok(())

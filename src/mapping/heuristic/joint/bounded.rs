@@ -23,9 +23,8 @@
 use std::collections::BinaryHeap;
 
 use super::{Basis, Unsolved};
-use crate::interrupt::{Meter, Signal};
+use crate::interrupt::Meter;
 use crate::mapping::heuristic::projection::{ClassIdx, Group};
-use crate::mapping::heuristic::shares::Parts;
 use crate::mapping::open_list::CheapestFirst;
 
 /// The table of a group: hash tables with linear probing, one per observation.
@@ -65,14 +64,12 @@ struct Entry {
 const NO_PLACE: u32 = u32::MAX;
 
 impl<'p> Bounded<'p> {
+    /// What an entry takes at most, with the room in hash tables.
+    pub(super) const ENTRY_BYTES: usize = 4 * size_of::<Slot>();
+
     /// Makes the table, with at most `n_left` entries, of which it takes its own.
-    pub(super) fn solve(
-        group: &'p Group,
-        basis: &Basis<'_>,
-        parts: &Parts<'_>,
-        n_left: &mut usize,
-        meter: &mut Meter<'_>,
-    ) -> Result<Self, Unsolved> {
+    pub(super) fn solve(basis: &Basis<'p, '_>, n_left: &mut usize, meter: &mut Meter<'_>) -> Result<Self, Unsolved> {
+        let Basis { group, parts, .. } = basis;
         let n_observations = basis.least_terms.len();
         let mut table = Self { group, layers: vec![Layer::default(); n_observations], slots: Vec::new() };
         let mut here =
@@ -86,7 +83,7 @@ impl<'p> Bounded<'p> {
             for entry in &next {
                 let cost = entry.distance + entry.cost_to_go;
                 let edges = group.edges_into(entry.class as usize);
-                spend(meter, 1 + edges.len() as u64)?;
+                meter.go_on(1 + edges.len() as u64).map_err(Unsolved::Interrupted)?;
                 here.offer(entry.class, cost);
                 for edge in edges {
                     here.offer(edge.from, parts.of(edge, 0.0) + cost);
@@ -101,7 +98,7 @@ impl<'p> Bounded<'p> {
                     continue;
                 }
                 let edges = group.edges_into(entry.class as usize);
-                spend(meter, 1 + edges.len() as u64)?;
+                meter.go_on(1 + edges.len() as u64).map_err(Unsolved::Interrupted)?;
                 let cost = entry.distance - basis.least_terms[i] + cost;
                 for edge in edges {
                     let offered = here.offer(edge.from, parts.of(edge, basis.least_distances[i]) + cost);
@@ -171,17 +168,10 @@ impl Layer {
     }
 }
 
-fn spend(meter: &mut Meter<'_>, units: u64) -> Result<(), Unsolved> {
-    match meter.spend(units) {
-        Signal::Continue => Ok(()),
-        signal => Err(Unsolved::Interrupted(signal)),
-    }
-}
-
 /// The layer in the making.
 struct Making<'b> {
     group: &'b Group,
-    basis: &'b Basis<'b>,
+    basis: &'b Basis<'b, 'b>,
     /// The observation.
     observation: usize,
     /// By class, where it is in `entries`, or [`NO_PLACE`].
@@ -208,7 +198,7 @@ impl Making<'_> {
             return self.enumerate_values(n_left);
         }
         for state in 0..states.len() {
-            spend(meter, 1)?;
+            meter.go_on(1).map_err(Unsolved::Interrupted)?;
             #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
             self.offer(self.group.class_of(states.row(state)) as ClassIdx, 0.0);
             if self.entries.len() > n_left {
@@ -221,7 +211,7 @@ impl Making<'_> {
     fn enumerate_values(&mut self, n_left: usize) -> Result<(), Unsolved> {
         let mut partial = vec![(0usize, 0.0, 0.0)];
         let mut stride = 1;
-        for ((_, n_values), column) in self.group.digits().zip(self.basis.columns) {
+        for ((_, n_values), column) in self.group.digits().zip(&self.basis.columns) {
             let mut extended = Vec::new();
             for (class, distance, forward) in partial {
                 for value in 0..n_values {
@@ -270,7 +260,7 @@ impl Making<'_> {
         }
         let (mut distance, mut total) = (0.0, cost);
         let mut rest = class as usize;
-        for ((_, n_values), column) in self.group.digits().zip(self.basis.columns) {
+        for ((_, n_values), column) in self.group.digits().zip(&self.basis.columns) {
             let (more_distance, forward) = self.at(*column, rest % n_values);
             distance += more_distance;
             total += forward;

@@ -2,55 +2,58 @@
 //!
 //! A class costs what it takes in the projection on the group, exactly ([`backward`]), with the least price of each way between two
 //! classes. A group's price is no less than those of its attributes together, so its table tells no less than theirs.
+//!
+//! Nothing is said of classes to which the start does not lead: where no action changes an attribute, the least term that
+//! extra actions pay is that of its value at the start, and those of other values are taken to be no less.
 
 use rustc_hash::FxHashMap;
 
-use super::Basis;
-use crate::interrupt::{Meter, Signal};
-use crate::mapping::backward::{self, Distances, Graph, NoLinks, PriceIdx};
+use super::{Basis, Unsolved};
+use crate::interrupt::Meter;
+use crate::mapping::backward::{self, Arriving, Graph, NoLinks, PriceIdx};
 use crate::mapping::heuristic::projected::Table;
 use crate::mapping::heuristic::projection::{ClassIdx, Group};
 use crate::mapping::heuristic::shares::{Parts, Way, Ways};
 
 /// The table of a group.
 #[derive(Debug)]
-pub(in crate::mapping::heuristic) struct Whole<'p> {
+pub(in crate::mapping::heuristic) struct Full<'p> {
     group: &'p Group,
     costs: Table<f64>,
 }
 
-impl<'p> Whole<'p> {
-    /// What is left of room for `n_entries` after that of `group`; `None` if there is too little.
-    pub(super) fn room_after(n_entries: usize, group: &Group, basis: &Basis<'_>) -> Option<usize> {
-        n_entries.checked_sub(Table::<f64>::n_entries_for(group.n_classes(), basis.least_terms.len()))
+impl<'p> Full<'p> {
+    pub(super) const ENTRY_BYTES: usize = size_of::<f64>();
+
+    /// How many entries the table would have.
+    pub(super) fn n_entries(basis: &Basis<'_, '_>) -> usize {
+        Table::<f64>::n_entries_for(basis.group.n_classes(), basis.least_terms.len())
     }
 
-    /// Makes the table. `None` if the group has more prices than can be numbered, or more ways out of a class.
-    pub(super) fn solve(
-        group: &'p Group,
-        basis: &Basis<'_>,
-        parts: &Parts<'_>,
-        meter: &mut Meter<'_>,
-    ) -> Result<Option<Self>, Signal> {
-        let Some(graph) = graph(group, parts) else { return Ok(None) };
+    /// Makes the table.
+    pub(super) fn solve(basis: &Basis<'p, '_>, meter: &mut Meter<'_>) -> Result<Self, Unsolved> {
+        let group = basis.group;
+        let graph = graph(group, &basis.parts).ok_or(Unsolved::Impossible)?;
         let (n_classes, last) = (group.n_classes(), basis.least_terms.len() - 1);
         let mut costs = Table::filled_with(0.0, n_classes, last + 1);
         let mut buffers = backward::Buffers::default();
         let (mut here, mut next) = (vec![0.0; n_classes], vec![0.0; n_classes]);
-        let mut distances = distances(group, basis, last);
+        let mut distances = distances(basis, last);
         for i in (0..last).rev() {
             for ((next, distance), here) in next.iter_mut().zip(&distances).zip(&here) {
                 *next = distance + here;
             }
-            distances = self::distances(group, basis, i);
-            let rests: Vec<f64> = distances.iter().map(|distance| distance - basis.least_terms[i]).collect();
-            let of_here = Distances { rests: &rests, least: basis.least_distances[i] };
-            graph.step_back(&next, of_here, &mut here, &mut NoLinks, &mut buffers, meter)?;
+            distances = self::distances(basis, i);
+            let rest = |distance: &f64| (distance - basis.least_terms[i]).max(0.0);
+            let rests: Vec<f64> = distances.iter().map(rest).collect();
+            let arriving = Arriving { rests: &rests, least_distance: basis.least_distances[i] };
+            let stepped = graph.step_back(&next, arriving, &mut here, &mut NoLinks, &mut buffers, meter);
+            stepped.map_err(Unsolved::Interrupted)?;
             for (class, cost) in here.iter().enumerate() {
                 *costs.at_mut(class, i) = *cost;
             }
         }
-        Ok(Some(Self { group, costs }))
+        Ok(Self { group, costs })
     }
 
     /// The cost-to-go of the class of a state with these domain indices.
@@ -64,7 +67,7 @@ impl<'p> Whole<'p> {
     }
 }
 
-/// The ways between the classes of a group.
+/// The ways between the classes of a group. `None` if it has more prices than can be numbered, or more ways out of a class.
 fn graph(group: &Group, parts: &Parts<'_>) -> Option<Graph> {
     let ways = Ways::into_classes(group, parts);
     let mut prices = Vec::new();
@@ -80,12 +83,13 @@ fn graph(group: &Group, parts: &Parts<'_>) -> Option<Graph> {
             numbered.push((*from, to, number));
         }
     }
+    drop(ways);
     Graph::new(group.n_classes(), numbered.iter().copied(), prices)
 }
 
 /// What the classes of a group cost at an observation.
-fn distances(group: &Group, basis: &Basis<'_>, i: usize) -> Vec<f64> {
-    group.digits().zip(basis.columns).fold(vec![0.0], |distances, ((_, n_values), column)| {
+fn distances(basis: &Basis<'_, '_>, i: usize) -> Vec<f64> {
+    basis.group.digits().zip(&basis.columns).fold(vec![0.0], |distances, ((_, n_values), column)| {
         let term = |value: usize| column.map_or(0.0, |column| basis.table.at(column + value, i).distance);
         (0..n_values).map(term).flat_map(|term| distances.iter().map(move |distance| distance + term)).collect()
     })

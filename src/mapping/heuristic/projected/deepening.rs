@@ -2,12 +2,12 @@
 
 use std::collections::BinaryHeap;
 
-use super::{Column, Projected, Table};
+use super::{Column, Layer, Projected, Table};
 use crate::interrupt::{Cancelled, Meter, Signal};
 use crate::mapping::Problem;
 use crate::mapping::cost::SLACK;
-use crate::mapping::heuristic::joint::{Basis, Joint, Room, Unsolved};
-use crate::mapping::heuristic::projection::Projections;
+use crate::mapping::heuristic::joint::{self, Basis, Joint, Room, Unsolved};
+use crate::mapping::heuristic::projection::{Group, Projections};
 use crate::mapping::heuristic::shares::{Parts, Way, Ways};
 use crate::mapping::heuristic::{Grouping, GroupingPatience};
 use crate::mapping::open_list::CheapestFirst;
@@ -55,6 +55,16 @@ impl GroupingPatience {
     }
 }
 
+impl GroupingPatience {
+    /// What tables may be made after `n_expanded` expansions.
+    fn room(self, n_expanded: u64) -> Room {
+        let bounded = n_expanded.checked_div(self.expansions_per_entry).unwrap_or(u64::MAX);
+        let full = n_expanded.saturating_mul(self.full_entries_per_expansion);
+        let [bounded, full] = [bounded, full].map(|n_entries| usize::try_from(n_entries).unwrap_or(usize::MAX));
+        Room { bounded, full }
+    }
+}
+
 /// Costs from the start.
 #[derive(Debug)]
 struct Forward {
@@ -71,14 +81,9 @@ pub(in crate::mapping) enum Deepened {
     Yes,
     /// Nothing has changed.
     No,
-    /// The interrupt said to finish; nothing has changed.
+    /// The interrupt said to finish.
     CutShort,
 }
-
-/// Most entries of the tables of a level: 256 MB with the room in hash tables,
-const MAX_JOINT_ENTRIES: usize = 1 << 22;
-/// or of all classes.
-const MAX_WHOLE_ENTRIES: usize = 1 << 25;
 
 impl<'p> Projected<'p> {
     /// Sets when attributes are projected together, before any were.
@@ -107,39 +112,26 @@ impl<'p> Projected<'p> {
         meter: &mut Meter<'_>,
     ) -> Result<Deepened, Cancelled> {
         let Some(mut deepening) = self.deepening.take() else { return Ok(Deepened::No) };
-        let most_entries = match deepening.grouping {
-            Grouping::Widest => MAX_JOINT_ENTRIES,
-            Grouping::WhenItPays => {
-                let n_entries = n_expanded.checked_div(deepening.patience.expansions_per_entry);
-                n_entries.and_then(|n_entries| usize::try_from(n_entries).ok()).unwrap_or(usize::MAX)
-            }
+        let room = match deepening.grouping {
+            Grouping::Widest => Room { bounded: usize::MAX, full: usize::MAX },
+            Grouping::WhenItPays => deepening.patience.room(n_expanded),
         };
-        let most_whole = match deepening.grouping {
-            Grouping::Widest => MAX_WHOLE_ENTRIES,
-            Grouping::WhenItPays => {
-                let n_expanded = usize::try_from(n_expanded).unwrap_or(usize::MAX);
-                n_expanded.saturating_mul(deepening.patience.whole_entries_per_expansion).min(MAX_WHOLE_ENTRIES)
-            }
-        };
-        let room = Room { bounded: most_entries.min(MAX_JOINT_ENTRIES), whole: most_whole };
         match self.solve_level(&mut deepening, limit, room, meter) {
             Ok(None) => Ok(Deepened::No),
             Ok(Some(joint)) => {
-                let columns = self.columns.iter();
-                let joined = columns.filter(|column| joint.iter().any(|table| table.group().has(column.position)));
-                for column in joined {
-                    for class in 0..column.group.n_classes() {
-                        self.table.of_mut(column.offset + class).iter_mut().for_each(|entry| entry.cost_to_go = 0.0);
-                    }
-                }
-                self.tell_unchanged();
                 self.joint = joint;
                 deepening.level += 1;
                 if deepening.grouping == Grouping::WhenItPays {
                     deepening.due = n_expanded.saturating_mul(2);
                 }
+                let divided = self.divide_columns(&deepening, meter);
+                self.tell_unchanged();
                 self.deepening = Some(deepening);
-                Ok(Deepened::Yes)
+                match divided {
+                    Ok(()) => Ok(Deepened::Yes),
+                    Err(Signal::Cancel) => Err(Cancelled),
+                    Err(_) => Ok(Deepened::CutShort),
+                }
             }
             Err(Unsolved::TooLarge) => {
                 // When the search has taken longer, more is worth while, and the limit may be lower.
@@ -147,9 +139,33 @@ impl<'p> Projected<'p> {
                 self.deepening = (deepening.grouping == Grouping::WhenItPays).then_some(deepening);
                 Ok(Deepened::No)
             }
+            Err(Unsolved::Impossible) => Ok(Deepened::No),
             Err(Unsolved::Interrupted(Signal::Cancel)) => Err(Cancelled),
             Err(Unsolved::Interrupted(_)) => Ok(Deepened::CutShort),
         }
+    }
+
+    /// Takes the costs-to-go out of the columns whose attributes are in groups with tables, and puts them back into those that were in
+    /// such groups at the level before.
+    fn divide_columns(&mut self, deepening: &Deepening<'p>, meter: &mut Meter<'_>) -> Result<(), Signal> {
+        for number in 0..self.columns.len() {
+            let Column { group, position, offset, is_joined } = self.columns[number];
+            let is_joined_now = self.joint.iter().any(|table| table.group().has(position));
+            self.columns[number].is_joined = is_joined_now;
+            if is_joined_now {
+                for class in 0..group.n_classes() {
+                    self.table.of_mut(offset + class).iter_mut().for_each(|entry| entry.cost_to_go = 0.0);
+                }
+            } else if is_joined {
+                let parts = Parts::new(deepening.projections, self.problem, &deepening.used, &[position]);
+                let ways = Ways::into_classes(group, &parts);
+                match self.solve_column(number, &ways, &mut Layer::default(), meter) {
+                    Signal::Continue => {}
+                    signal => return Err(signal),
+                }
+            }
+        }
+        Ok(())
     }
 
     /// The tables of the next level's groups; `None` if there is no next level.
@@ -157,7 +173,7 @@ impl<'p> Projected<'p> {
         &self,
         deepening: &mut Deepening<'p>,
         limit: f64,
-        mut room: Room,
+        room: Room,
         meter: &mut Meter<'_>,
     ) -> Result<Option<Vec<Joint<'p>>>, Unsolved> {
         let Deepening { projections, used, level, forward, .. } = deepening;
@@ -168,40 +184,48 @@ impl<'p> Projected<'p> {
         if forward.is_none() {
             *forward = Some(self.solve_forward(projections, used, meter).map_err(Unsolved::Interrupted)?);
         }
-        let Some(Forward { costs, optima }) = forward else { return Ok(None) };
-        let column_of = |position: usize| self.columns.iter().position(|column| column.position == position);
-        let mut joint = Vec::new();
-        for group in groups.iter().filter(|group| group.is_kept()) {
-            let columns: Vec<Option<usize>> = group.positions().map(column_of).collect();
-            let is_tabled = |position| !self.untabled.contains(&position);
-            if columns.iter().all(Option::is_none) || !group.positions().all(is_tabled) {
-                continue;
-            }
-            // A little more than the others leave, as sums differ by rounding.
-            let others = (0..self.columns.len()).filter(|number| !columns.contains(&Some(*number)));
-            let others: f64 = others.map(|number| optima[number]).sum();
-            let positions: Vec<usize> = group.positions().collect();
-            let parts = Parts::new(projections, self.problem, used, &positions);
-            let offsets: Vec<Option<usize>> =
-                columns.iter().map(|column| column.map(|number| self.columns[number].offset)).collect();
-            let rows = self.least_terms.chunks_exact(self.columns.len());
-            let least_terms = rows.map(|row| columns.iter().flatten().map(|number| row[*number]).sum());
-            let least_terms: Vec<f64> = least_terms.collect();
-            let basis = Basis {
-                states: self.problem.model.states(),
-                columns: &offsets,
-                least_distances: &self.least_distances,
-                least_terms: &least_terms,
-                table: &self.table,
-                forward: costs,
-                limit: limit * (1.0 + SLACK) - others,
-            };
-            joint.push(Joint::solve(group, &basis, &parts, &mut room, meter)?);
-        }
-        Ok(Some(joint))
+        let Some(forward) = forward else { return Ok(None) };
+        let bases = groups.iter().filter(|group| group.is_kept());
+        let bases: Vec<Basis<'p, '_>> =
+            bases.filter_map(|group| self.basis(group, projections, used, forward, limit)).collect();
+        joint::solve(&bases, room, meter).map(Some)
     }
 
-    /// Costs from the start, forwards over the demonstration: with `F_i(v)` as in [`joint`](crate::mapping::heuristic::joint),
+    /// What the table of a group is made from; `None` if its attributes have no tables.
+    fn basis<'b>(
+        &'b self,
+        group: &'p Group,
+        projections: &Projections,
+        used: &[bool],
+        forward: &'b Forward,
+        limit: f64,
+    ) -> Option<Basis<'p, 'b>> {
+        let column_of = |position: usize| self.columns.iter().position(|column| column.position == position);
+        let columns: Vec<Option<usize>> = group.positions().map(column_of).collect();
+        let is_tabled = |position| !self.untabled.contains(&position);
+        if columns.iter().all(Option::is_none) || !group.positions().all(is_tabled) {
+            return None;
+        }
+        let others = (0..self.columns.len()).filter(|number| !columns.contains(&Some(*number)));
+        let others: f64 = others.map(|number| forward.optima[number]).sum();
+        let positions: Vec<usize> = group.positions().collect();
+        let rows = self.least_terms.chunks_exact(self.columns.len());
+        let least_terms = rows.map(|row| columns.iter().flatten().map(|number| row[*number]).sum());
+        Some(Basis {
+            group,
+            parts: Parts::new(projections, self.problem, used, &positions),
+            states: self.problem.model.states(),
+            least_terms: least_terms.collect(),
+            columns: columns.iter().map(|column| column.map(|number| self.columns[number].offset)).collect(),
+            table: &self.table,
+            forward: &forward.costs,
+            least_distances: &self.least_distances,
+            // A little more than the others leave, as sums differ by rounding.
+            limit: limit * (1.0 + SLACK) - others,
+        })
+    }
+
+    /// Costs from the start, forwards over the demonstration: with `F_i(v)` as in [`bounded`](crate::mapping::heuristic::joint),
     ///
     /// ```text
     /// F_0(start) = term(0, start)
@@ -221,7 +245,7 @@ impl<'p> Projected<'p> {
         let mut optima = Vec::new();
         let start = &self.problem.start_row;
         let mut open = BinaryHeap::new();
-        for (number, Column { group, position, offset }) in self.columns.iter().enumerate() {
+        for (number, Column { group, position, offset, .. }) in self.columns.iter().enumerate() {
             let n_classes = group.n_classes();
             let parts = Parts::new(projections, self.problem, used, &[*position]);
             let ways = Ways::into_classes(group, &parts).reversed();

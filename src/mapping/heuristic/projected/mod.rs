@@ -66,13 +66,15 @@ pub(crate) struct Projected<'p> {
 }
 
 /// A group with a table.
-#[derive(Debug)]
+#[derive(Clone, Copy, Debug)]
 struct Column<'p> {
     group: &'p Group,
     /// The attribute's.
     position: usize,
     /// Where its values begin in the table.
     offset: usize,
+    /// Whether its costs-to-go are in the table of a group of several attributes.
+    is_joined: bool,
 }
 
 /// A column of an attribute that actions change.
@@ -153,7 +155,7 @@ impl<'p> Projected<'p> {
         let (mut width, n_observations) = (0, problem.demonstration.len());
         for (group, _) in projections.groups().iter().zip(&used).filter(|(_, is_used)| **is_used) {
             let Some(position) = group.positions().next() else { continue };
-            projected.columns.push(Column { group, position, offset: width });
+            projected.columns.push(Column { group, position, offset: width, is_joined: false });
             width += group.n_classes();
             projected.untabled.retain(|at| *at != position);
         }
@@ -218,6 +220,12 @@ impl<'p> Projected<'p> {
     /// The columns that tell states apart, in order.
     pub(in crate::mapping) fn changing_columns(&self) -> &[ChangingColumn] {
         &self.changing
+    }
+
+    /// Whether something is said of states with this row: what no action changes is as it is at the start.
+    pub(in crate::mapping) fn speaks_of(&self, values: &[u32]) -> bool {
+        let mut unchanging = self.columns.iter().filter(|column| column.group.n_edges() == 0);
+        unchanging.all(|column| values[column.position] == self.problem.start_row[column.position])
     }
 
     /// The classes of the state with this row, by their numbers in the table: one of each of the
@@ -289,7 +297,7 @@ impl<'p> Projected<'p> {
     /// Writes the terms of a column, and the least of them at each observation. What no action changes stays as it was at the start.
     fn write_terms(&mut self, number: usize, least: &mut Vec<f64>, meter: &mut Meter<'_>) -> Signal {
         let (n_observations, n_columns) = (self.problem.demonstration.len(), self.columns.len());
-        let Column { group, position, offset } = self.columns[number];
+        let Column { group, position, offset, .. } = self.columns[number];
         let start = self.problem.start_row[position];
         let is_unchanged = group.n_edges() == 0;
         let Some(terms) = self.problem.distances.of(position) else { return Signal::Continue };
@@ -328,7 +336,7 @@ impl<'p> Projected<'p> {
     fn tell_unchanged(&mut self) {
         self.unchanged.fill(Estimate::default());
         self.changing.clear();
-        for Column { group, position, offset } in &self.columns {
+        for Column { group, position, offset, .. } in &self.columns {
             if group.n_edges() == 0 {
                 let entries = self.table.of_mut(offset + self.problem.start_row[*position] as usize);
                 self.unchanged.iter_mut().zip(entries).for_each(|(sum, entry)| *sum += *entry);

@@ -101,19 +101,21 @@ proptest! {
     #[test]
     fn estimates_are_admissible_and_consistent_and_grow_with_the_groups(
         (definition, demonstration) in model_and_demonstration(),
-        groups in prop_oneof![
+        levels in prop::array::uniform2(prop_oneof![
             Just(vec![vec![0, 1], vec![2]]), Just(vec![vec![0], vec![1, 2]]), Just(vec![vec![0, 2], vec![1]]),
             Just(vec![vec![0, 1, 2]]),
-        ],
+        ]),
         room in prop_oneof![Just(0.0), 0.0..0.5, Just(1e12)],
-        is_whole in any::<bool>(),
+        is_full in any::<bool>(),
     ) {
         let definition = Definition::read(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let varies = |at: &usize| model.states().domain(*at).len() > 1;
-        let partition = groups.into_iter().map(|group| group.into_iter().filter(varies).collect());
-        let partition: Vec<Vec<usize>> = partition.filter(|group: &Vec<usize>| !group.is_empty()).collect();
-        let projections = Projections::with_levels(&model, [partition]);
+        let levels = levels.map(|groups| {
+            let partition = groups.into_iter().map(|group| group.into_iter().filter(varies).collect());
+            partition.filter(|group: &Vec<usize>| !group.is_empty()).collect()
+        });
+        let projections = Projections::with_levels(&model, levels);
         let seen: Vec<Value> = demonstration.as_array().unwrap().iter().map(|seen| {
             json!({"a": seen[0], "b": seen[1], "c": seen[2]})
         }).collect();
@@ -126,20 +128,21 @@ proptest! {
         let limit = optimum * (1.0 + room) + 1e-6;
         let close = 1e-9 * (1.0 + optimum);
 
-        let grouping = if is_whole { Grouping::WhenItPays } else { Grouping::Widest };
+        let grouping = if is_full { Grouping::WhenItPays } else { Grouping::Widest };
         let solved = Projected::solve(&projections, &problem, grouping, MAX_ENTRIES, &mut Buffers::default(), &mut Uninterrupted).unwrap();
         let mut projected = solved.unwrap();
         projected.set_patience(GroupingPatience {
             min_expansions: 0,
             expansions_per_transition: 0,
             expansions_per_entry: u64::MAX,
-            whole_entries_per_expansion: usize::MAX,
+            full_entries_per_expansion: u64::MAX,
         });
         // What no action changes is taken to be as it is at the start, so nothing is said of states that it does not lead to.
         let is_reached = |(i, state): &(usize, StateIdx)| from_start[*i][*state as usize].is_finite();
         let reached: Vec<_> = nodes(&problem).into_iter().filter(is_reached).collect();
         let mut alone: Vec<f64> = Vec::new();
-        for is_deep in [false, true] {
+        for n_deepened in 0..=2 {
+            let is_deep = n_deepened > 0;
             if is_deep {
                 let mut interrupt = Uninterrupted;
                 let mut meter = Meter::new(&mut interrupt, 1);
@@ -150,7 +153,7 @@ proptest! {
                 prop_assert!((estimate.distance - distance(&problem, i, state)).abs() <= close);
                 let h = estimate.cost_to_go;
                 let through = from_start[i][state as usize] + to_end[i][state as usize];
-                prop_assert!(h.is_finite() || (is_deep && !is_whole), "finite at ({i}, {state})");
+                prop_assert!(h.is_finite() || (is_deep && !is_full), "finite at ({i}, {state})");
                 if !is_deep || through < limit {
                     prop_assert!(h <= to_end[i][state as usize] + close, "admissible at ({i}, {state})");
                 }

@@ -62,10 +62,10 @@ impl Mapper {
             if is_enough {
                 match sweep(problem, budget, interrupt)? {
                     Swept::Done(swept) => found = joined(Found { paths: Vec::new(), ..found }, swept),
-                    Swept::CutShort { known, n_expanded } => {
-                        let bound = known.map_or(0.0, |layer| bound_of(problem, &projected, &layer));
-                        found.least_f = found.least_f.max(bound);
+                    Swept::CutShort { known, n_expanded, n_generated } => {
+                        found.least_f = found.least_f.max(bound_of(problem, &projected, &known));
                         found.n_expanded += n_expanded;
+                        found.n_generated += n_generated;
                     }
                     Swept::TooLarge => {
                         let max_expansions = budget.max_expansions - found.n_expanded;
@@ -102,13 +102,22 @@ impl Mapper {
 }
 
 /// What mappings cost at least, given what it costs to go on from a layer: to come there, they cost no less than the estimate falls.
-/// Those through nodes of infinite estimate cost no less than one that is known.
+/// Those through nodes of infinite estimate cost no less than one that is known. 0 if there are so many states that it would take long.
 fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &Layer) -> f64 {
+    /// That takes some ten milliseconds.
+    const MAX_STATES: StateIdx = 1 << 17;
     let states = problem.model.states();
+    if layer.observation == 0 {
+        return layer.costs[problem.start as usize] * (1.0 - SLACK);
+    }
+    if states.len() > MAX_STATES {
+        return 0.0;
+    }
     let estimate = |i: usize, row: &[u32]| problem.distances.distance(i, row) + projected.cost_to_go(i, row);
-    let rise = |(state, cost): (StateIdx, &f64)| cost - estimate(layer.observation, states.row(state));
-    let rises = (0..).zip(&layer.costs).map(rise).filter(|rise| rise.is_finite());
-    let least_rise = rises.fold(f64::INFINITY, f64::min);
+    let states = (0..states.len()).map(|state| states.row(state)).zip(&layer.costs);
+    let reachable = states.filter(|(row, _)| projected.speaks_of(row));
+    let rises = reachable.map(|(row, cost)| cost - estimate(layer.observation, row));
+    let least_rise = rises.filter(|rise| rise.is_finite()).fold(f64::INFINITY, f64::min);
     (estimate(0, &problem.start_row) + least_rise) * (1.0 - SLACK)
 }
 

@@ -110,7 +110,7 @@ const IMPATIENT: Patience = Patience {
         min_expansions: 8,
         expansions_per_transition: 0,
         expansions_per_entry: 0,
-        whole_entries_per_expansion: 0,
+        full_entries_per_expansion: 0,
     },
 };
 
@@ -118,7 +118,7 @@ const IMPATIENT: Patience = Patience {
 const THOROUGH: Patience = Patience {
     grouping: GroupingPatience {
         expansions_per_entry: u64::MAX,
-        whole_entries_per_expansion: usize::MAX,
+        full_entries_per_expansion: u64::MAX,
         ..IMPATIENT.grouping
     },
     ..IMPATIENT
@@ -213,6 +213,40 @@ proptest! {
             prop_assert!(mapping.lower_bound.unwrap() <= optimum * (1.0 + 1e-9), "{mapping:?}, of {optimum}");
         }
     }
+}
+
+#[test]
+fn classes_that_the_start_does_not_lead_to_do_not_pay_for_going_round_in_circles() {
+    // Two maps of a corridor with a clock, of which the second has a wall. The body is in the first, and sees one in the second.
+    let state = |x: usize, clock: usize, map: usize| (x * 16 + clock % 16) * 2 + map;
+    let places = (0..10).flat_map(|x| (0..16).flat_map(move |clock| (0..2).map(move |map| (x, clock, map))));
+    let transitions = places.clone().flat_map(|(x, clock, map)| {
+        let is_free = |wall: usize| map == 0 || x != wall;
+        let on = (x < 9 && is_free(4)).then(|| json!([state(x, clock, map), "on", state(x + 1, clock + 1, map)]));
+        let back = (x > 0 && is_free(5)).then(|| json!([state(x, clock, map), "back", state(x - 1, clock + 1, map)]));
+        on.into_iter().chain(back)
+    });
+    let model = json!({
+        "attributes": [
+            {"name": "x", "kind": "number"},
+            {"name": "clock", "kind": "cyclic", "period": 16},
+            {"name": "map", "kind": "number", "weight": 10},
+        ],
+        "actions": [{"name": "on", "cost": 0.3}, {"name": "back", "cost": 0.3}],
+        "dynamics": {
+            "kind": "table", "start": 0,
+            "states": places.collect::<Vec<_>>(), "transitions": transitions.collect::<Value>(),
+        },
+    });
+    let mapper =
+        Mapper { patience: Patience { min_expansions_before_sweep: u64::MAX, ..THOROUGH }, ..prepared(&model) };
+    let seen: Value = (0..60).map(|i| json!({"x": i * 7 % 10, "clock": i % 16, "map": 1})).collect();
+    let request = read(&mapper, &json!({"model": "maps", "demonstration": seen})).problem;
+    let map =
+        |heuristic| mapper.map(&request, Settings { heuristic, ..Settings::default() }, &mut Uninterrupted).unwrap();
+    let (by_default, without) = (map(HeuristicName::Default), map(HeuristicName::None));
+    assert_eq!((by_default.cost.total, by_default.status), (without.cost.total, Status::Optimal));
+    assert!(by_default.n_expanded < without.n_expanded / 2, "{} of {}", by_default.n_expanded, without.n_expanded);
 }
 
 #[test]
