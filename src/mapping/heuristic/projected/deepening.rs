@@ -53,9 +53,7 @@ impl GroupingPatience {
             }
         }
     }
-}
 
-impl GroupingPatience {
     /// What tables may be made after `n_expanded` expansions.
     fn room(self, n_expanded: u64) -> Room {
         let bounded = n_expanded.checked_div(self.expansions_per_entry).unwrap_or(u64::MAX);
@@ -77,7 +75,7 @@ struct Forward {
 /// What came of an attempt to make the estimates better.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(in crate::mapping) enum Deepened {
-    /// Estimates have changed: they are higher, and infinite where nothing is worth finding.
+    /// Estimates have changed, and are infinite where nothing is worth finding.
     Yes,
     /// Nothing has changed.
     No,
@@ -117,7 +115,7 @@ impl<'p> Projected<'p> {
             Grouping::WhenItPays => deepening.patience.room(n_expanded),
         };
         match self.solve_level(&mut deepening, limit, room, meter) {
-            Ok(None) => Ok(Deepened::No),
+            Ok(None) | Err(Unsolved::Impossible) => Ok(Deepened::No),
             Ok(Some(joint)) => {
                 self.joint = joint;
                 deepening.level += 1;
@@ -139,7 +137,6 @@ impl<'p> Projected<'p> {
                 self.deepening = (deepening.grouping == Grouping::WhenItPays).then_some(deepening);
                 Ok(Deepened::No)
             }
-            Err(Unsolved::Impossible) => Ok(Deepened::No),
             Err(Unsolved::Interrupted(Signal::Cancel)) => Err(Cancelled),
             Err(Unsolved::Interrupted(_)) => Ok(Deepened::CutShort),
         }
