@@ -17,7 +17,7 @@
 //!    |                     Projections (per model) --> Projected (per problem: distances, costs-to-go)
 //!    v                                                     |
 //! Mapper::map ---- search (layer by layer, best first) <---+
-//!    |                |  budget over: the incumbent, or completion (greedy)
+//!    |                |  long: a sweep over all nodes; budget over: the incumbent, or completion (greedy)
 //!    v                v
 //! Mapping (moves, status, lower bound, counts) --> Policy (what a client gets), WrittenPolicy (the same, as it is answered and stored)
 //! ```

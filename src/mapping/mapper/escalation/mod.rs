@@ -12,8 +12,8 @@ use crate::model::{Space, StateIdx};
 
 impl Mapper {
     /// Searches best first, with more help the longer it takes: at first with tables of projections only where they are small,
-    /// then with all of them; and where it has still looked at a good part of all nodes, what is left is to look at all of them,
-    /// layer by layer, which takes a fraction of the time for each.
+    /// then with all of them; and where it has still looked at a good part of all nodes, what is left is to [`sweep`] over all of
+    /// them, which takes a fraction of the time for each.
     pub(super) fn best_first<S: Space>(
         &self,
         space: &mut S,
