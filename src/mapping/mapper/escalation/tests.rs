@@ -98,6 +98,15 @@ fn hall() -> impl Strategy<Value = (Value, Value)> {
     })
 }
 
+/// Says to finish when it is asked for the `n`-th time.
+fn finish_at(n: u64) -> impl FnMut() -> Signal {
+    let mut n_left = n;
+    move || {
+        n_left = n_left.saturating_sub(1);
+        if n_left > 0 { Signal::Continue } else { Signal::Finish }
+    }
+}
+
 /// Whatever takes long is done as soon as may be.
 const IMPATIENT: Patience = Patience {
     max_layered_nodes: 0,
@@ -165,11 +174,7 @@ proptest! {
         let max_bytes = 64 * usize::try_from(few).unwrap();
         let mapping = map(Budget { max_bytes, ..Budget::DEFAULT }, &mut Uninterrupted);
         prop_assert!(is_true(&mapping), "{mapping:?}, of {optimum} in {max_bytes} bytes");
-        let mut n_left = few / 8;
-        let mapping = map(Budget::DEFAULT, &mut || {
-            n_left = n_left.saturating_sub(1);
-            if n_left > 0 { Signal::Continue } else { Signal::Finish }
-        });
+        let mapping = map(Budget::DEFAULT, &mut finish_at(few / 8));
         prop_assert!(is_true(&mapping), "{mapping:?}, of {optimum}");
     }
 }
@@ -286,12 +291,7 @@ fn tables_left_out_at_first_come_to_the_same_cost_as_a_search_without_heuristic(
     // Cut short between the two attempts, it keeps what the first one found.
     let optimum = without.cost.total;
     for n_polls in 1..60 {
-        let mut n_left = n_polls;
-        let mut interrupt = || {
-            n_left -= i32::from(n_left > 0);
-            if n_left > 0 { Signal::Continue } else { Signal::Finish }
-        };
-        let mapping = mapper.map(&request.problem, Settings::default(), &mut interrupt).unwrap();
+        let mapping = mapper.map(&request.problem, Settings::default(), &mut finish_at(n_polls)).unwrap();
         let lower_bound = mapping.lower_bound.unwrap();
         assert!(lower_bound <= optimum + 1e-9 && optimum <= mapping.cost.total + 1e-9, "after {n_polls} polls");
     }
@@ -313,14 +313,7 @@ fn a_sweep_that_is_cut_short_raises_the_bound_and_counts() {
     };
     let mapper = Mapper { patience, ..mapper };
     let request = read(&mapper, &request);
-    let map_until = |n: u32| {
-        let mut n_left = n;
-        let mut interrupt = || {
-            n_left = n_left.saturating_sub(1);
-            if n_left > 0 { Signal::Continue } else { Signal::Finish }
-        };
-        mapper.map(&request.problem, Settings::default(), &mut interrupt).unwrap()
-    };
+    let map_until = |n| mapper.map(&request.problem, Settings::default(), &mut finish_at(n)).unwrap();
     let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap();
     assert_eq!(optimum.n_expanded, 10 + 600 * 100);
     let cut_short = |n| Some(map_until(n)).filter(|mapping| mapping.status == Status::Bounded);
@@ -352,14 +345,7 @@ fn a_small_search_that_is_cut_short_tells_what_its_open_nodes_cost_at_least() {
     let (mapper, request) = belt(60, 100);
     let request = read(&mapper, &request);
     let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap().cost.total;
-    let map_until = |n: u32| {
-        let mut n_left = n;
-        let mut interrupt = || {
-            n_left = n_left.saturating_sub(1);
-            if n_left > 0 { Signal::Continue } else { Signal::Finish }
-        };
-        mapper.map(&request.problem, Settings::default(), &mut interrupt).unwrap()
-    };
+    let map_until = |n| mapper.map(&request.problem, Settings::default(), &mut finish_at(n)).unwrap();
     let mappings: Vec<Mapping> = (2..1000).map(map_until).take_while(|found| found.status == Status::Bounded).collect();
     assert!(mappings.len() > 3, "{}", mappings.len());
     for mapping in &mappings {
