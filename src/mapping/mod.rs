@@ -33,6 +33,8 @@
 //! a match unless an extra action is; when it is depends on the problem and the budget alone.
 
 mod backward;
+#[cfg(test)]
+mod by_definition;
 mod completion;
 mod cost;
 mod demonstration;

@@ -7,8 +7,9 @@ use super::*;
 use crate::document::{Faults, Place};
 use crate::interrupt::Uninterrupted;
 use crate::mapping::Request;
+use crate::mapping::by_definition::least_costs;
 use crate::mapping::cost::cost_of;
-use crate::model::{Definition, Limits, Model, StateIdx, Whole};
+use crate::model::{Definition, Limits, Model, Whole};
 
 /// A model of up to 14 states, and a demonstration. Actions may cost nothing, states look alike, and not all is observed, so that many
 /// extra actions may follow each other.
@@ -31,33 +32,6 @@ fn model_and_demonstration() -> impl Strategy<Value = (Value, Value)> {
         });
         (model, json!({"model": "m", "demonstration": seen}))
     })
-}
-
-/// The least cost of a mapping, by going over all moves until nothing changes.
-fn least_cost(problem: &Problem<'_>) -> f64 {
-    let model = problem.model;
-    let distance = |i: usize, state: StateIdx| problem.distances.distance(i, model.states().row(state));
-    let mut costs = vec![vec![f64::INFINITY; model.states().len() as usize]; problem.demonstration.len()];
-    costs[0][problem.start as usize] = distance(0, problem.start);
-    loop {
-        let before = costs.clone();
-        for (i, state) in (0..costs.len()).flat_map(|i| (0..model.states().len()).map(move |state| (i, state))) {
-            let mut moves = vec![(i + 1, state, 0.0)];
-            for transition in model.graph().successors(state) {
-                let cost = model.action(transition.action).cost;
-                moves.extend([(i + 1, transition.to, cost), (i, transition.to, cost)]);
-            }
-            moves.retain(|(next, _, _)| *next < costs.len());
-            for (next, to, cost) in moves {
-                let cost = costs[i][state as usize] + cost + distance(next, to);
-                let known = &mut costs[next][to as usize];
-                *known = known.min(cost);
-            }
-        }
-        if costs == before {
-            return costs[problem.last()].iter().copied().fold(f64::INFINITY, f64::min);
-        }
-    }
 }
 
 /// Whether each of `moves` leads on from the one before, and the last one to the end.
@@ -95,7 +69,8 @@ proptest! {
         let mut faults = Faults::default();
         let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
-        let least = least_cost(&problem);
+        let [from_start, _] = least_costs(&problem);
+        let least = from_start[problem.last()].iter().copied().fold(f64::INFINITY, f64::min);
         let n_observations = problem.demonstration.len();
         for section_len in 1..=n_observations {
             let swept = in_sections(&problem, section_len, Meter::new(&mut Uninterrupted, 1)).unwrap();
