@@ -148,8 +148,8 @@ impl<'p> Projected<'p> {
         buffers: &mut Buffers,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
-        /// How many classes are looked at between two looks at the interrupt: about a millisecond.
-        const POLL_EVERY: u64 = 1 << 14;
+        /// How many classes are looked at between two looks at the interrupt: tens of microseconds.
+        const POLL_EVERY: u64 = 1 << 11;
         let (used, n_left_out) = used_groups(projections, problem, max_entries);
         let mut projected = Self { n_left_out, ..Self::blind(problem) };
         let (mut width, n_observations) = (0, problem.demonstration.len());
