@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use clap::Args;
 
+use crate::memory::{self, Memory};
 use crate::model;
 use crate::service::{PoolSettings, Settings};
 use crate::stream::Limits;
@@ -43,9 +44,12 @@ pub struct ServeConfig {
         long, env = "ETUDE_MAX_TRANSITIONS", default_value_t = model::Limits::DEFAULT.max_transitions, value_name = "N"
     )]
     pub max_transitions: usize,
-    /// Memory for models that are kept ready to be searched.
-    #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", default_value_t = 1024 * 1024 * 1024, value_name = "BYTES")]
-    pub model_cache_bytes: u64,
+    /// Memory that the service may use in all [default: three quarters of what the machine or its cgroup has].
+    #[arg(long, env = "ETUDE_MAX_MEMORY", value_parser = parse_memory, value_name = "BYTES")]
+    pub max_memory: Option<u64>,
+    /// Of that, for models that are kept ready to be searched [default: a quarter, 1 GiB at most].
+    #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", value_name = "BYTES")]
+    pub model_cache_bytes: Option<u64>,
     /// Streams that may run at the same time; further ones are answered 503.
     #[arg(long, env = "ETUDE_MAX_STREAMS", default_value_t = 4096, value_parser = parse_places, value_name = "N")]
     pub max_streams: usize,
@@ -75,10 +79,12 @@ impl ServeConfig {
     #[must_use]
     pub fn settings(&self) -> Settings {
         let n_cores = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
+        let max_memory = self.max_memory.unwrap_or_else(memory::default_max_bytes);
         Settings {
             database: self.database.clone(),
             limits: model::Limits { max_states: self.max_states, max_transitions: self.max_transitions },
-            model_cache_bytes: self.model_cache_bytes,
+            memory: Memory::new(max_memory),
+            model_cache_bytes: self.model_cache_bytes.unwrap_or(MAX_MODEL_CACHE_BYTES.min(max_memory / 4)),
             session_idle_timeout: self.session_idle_timeout,
             pool: PoolSettings {
                 n_threads: self.search_threads.map_or(n_cores, NonZeroUsize::get),
@@ -104,6 +110,12 @@ impl ServeConfig {
 /// Largest frame of a stream: a thousand observations of a dozen attributes.
 const STREAM_FRAME_BYTES: usize = 262_144;
 
+/// Most memory for models by default.
+const MAX_MODEL_CACHE_BYTES: u64 = 1 << 30;
+
+/// Least memory of a service: it keeps half of that for what it does not count.
+const MIN_MEMORY_BYTES: u64 = 128 << 20;
+
 /// Most threads: half of those that the runtime has for what blocks.
 const MAX_THREADS: usize = 256;
 
@@ -121,6 +133,17 @@ fn parse_places(text: &str) -> Result<usize, String> {
 
 fn parse_threads(text: &str) -> Result<NonZeroUsize, String> {
     NonZeroUsize::new(parse_at_most(text, MAX_THREADS)?).ok_or_else(|| "expected at least 1".to_owned())
+}
+
+/// Reads a number of bytes, such as 800000000, 512M or 2G (2^20 and 2^30 bytes).
+fn parse_memory(text: &str) -> Result<u64, String> {
+    const UNITS: [(char, u64); 3] = [('K', 1 << 10), ('M', 1 << 20), ('G', 1 << 30)];
+    let number = text.strip_suffix("iB").unwrap_or(text);
+    let with_unit = UNITS.iter().find_map(|(letter, unit)| Some((number.strip_suffix(*letter)?, *unit)));
+    let (digits, unit) = with_unit.unwrap_or((number, 1));
+    let n_bytes = digits.parse::<u64>().ok().and_then(|count| count.checked_mul(unit));
+    let n_bytes = n_bytes.ok_or("expected a number of bytes, such as 800000000, 512M or 2G")?;
+    if n_bytes >= MIN_MEMORY_BYTES { Ok(n_bytes) } else { Err("expected at least 128M".to_owned()) }
 }
 
 fn parse_duration(text: &str) -> Result<Duration, String> {
@@ -142,6 +165,15 @@ mod tests {
         assert_eq!(parse_duration("1s"), Ok(Duration::from_secs(1)));
         assert_eq!(parse_duration("500ms"), Ok(Duration::from_millis(500)));
         assert!(parse_duration("-1s").is_err() && parse_duration("7").is_err());
+    }
+
+    #[test]
+    fn memory_is_written_in_bytes_or_with_a_unit() {
+        assert_eq!((parse_memory("134217728"), parse_memory("2G")), (Ok(128 << 20), Ok(2 << 30)));
+        assert_eq!((parse_memory("512M"), parse_memory("512MiB")), (Ok(512 << 20), Ok(512 << 20)));
+        for text in ["", "G", "1.5G", "-1", "127M", "99999999999G", "2T"] {
+            assert!(parse_memory(text).is_err(), "{text}");
+        }
     }
 
     #[test]

@@ -12,7 +12,7 @@
 //!
 //! ```text
 //! interrupt, document <- attribute <- model <- mapping <- learning <- world <- experiment   |   store <- service <- stream <- http <- server <- cli
-//!                                                                                           |   config, telemetry
+//!                                                                                           |   memory, config, telemetry
 //! ```
 //!
 //! | module | is |
@@ -31,6 +31,7 @@
 //! | [`http`] | routes, bodies, problem documents, the OpenAPI description |
 //! | [`server`] | the assembled program, from listening to clean shutdown |
 //! | [`cli`] | the subcommands |
+//! | [`memory`] | the one budget of memory |
 //! | [`config`], [`telemetry`] | settings, logs and measurements |
 //!
 //! A request for a policy passes `http::policies` (body), `service::policies` (a place in `service::pool`), `service::outline` (its
@@ -56,6 +57,7 @@ pub mod http;
 pub mod interrupt;
 pub mod learning;
 pub mod mapping;
+pub mod memory;
 pub mod model;
 pub mod server;
 pub mod service;

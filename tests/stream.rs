@@ -6,10 +6,10 @@ mod process;
 mod service;
 
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use etude::document::Place;
-use etude::service::Etude;
+use etude::service::{Caller, Etude};
 use etude::stream::{Closed, Incoming, Outgoing};
 use futures_util::{SinkExt, StreamExt};
 use jiff::Timestamp;
@@ -898,6 +898,9 @@ async fn an_exploring_session_ends_with_its_policy_if_no_reward_is_to_come_any_m
     assert_eq!(again.closed().await, 1000);
 }
 
+/// Whoever speaks the protocol without a connection.
+const CLIENT: etude::service::Client = etude::service::Client::LOCAL;
+
 /// The application that was a service, without the service.
 async fn without_service(service: Service, abort: &CancellationToken) -> (Etude, TempDir) {
     let directory = service.stop().await;
@@ -911,10 +914,11 @@ async fn resuming_and_repeating_keep_a_session_from_expiring() {
     let (service, demonstration) = figure_4().await;
     let (etude, _directory) = without_service(service, &CancellationToken::new()).await;
     let at = |minute: i64| Timestamp::from_second(60 * minute).unwrap();
+    let caller = |minute| Caller { client: CLIENT, arrived: Instant::now(), now: at(minute) };
     let states = json!(demonstration);
     let states = Place::root(&states);
     let open = json!({"type": "open", "model": "figure-4"});
-    let mut session = etude.open_session(&open, at(0)).await.unwrap();
+    let mut session = etude.open_session(&open, caller(0)).await.unwrap();
     let id = session.id().to_owned();
     let active_at = async || etude.session(&id).await.unwrap().active_at;
     session.receive(&etude, 0, &states, at(1)).await.unwrap();
@@ -922,13 +926,13 @@ async fn resuming_and_repeating_keep_a_session_from_expiring() {
     session.receive(&etude, 0, &states, at(2)).await.unwrap();
     assert_eq!(active_at().await, at(2));
     drop(session);
-    let mut resumed = etude.resume_session(&id, at(3)).await.unwrap();
+    let mut resumed = etude.resume_session(&id, caller(3)).await.unwrap();
     assert_eq!((active_at().await, resumed.session.n_received()), (at(3), 16));
     // What is not settled yet came before.
     let more = json!([demonstration[0]]);
     resumed.session.receive(&etude, 16, &Place::root(&more), at(4)).await.unwrap();
     drop(resumed);
-    assert_eq!(etude.resume_session(&id, at(5)).await.unwrap().session.n_received(), 17);
+    assert_eq!(etude.resume_session(&id, caller(5)).await.unwrap().session.n_received(), 17);
     assert_eq!(active_at().await, at(5));
     etude.close().await;
 }
@@ -945,7 +949,7 @@ async fn who_stays_slow_is_closed_as_overloaded() {
     let (outgoing, mut goes) = mpsc::channel(1);
     let open = json!({"type": "open", "model": "figure-4"}).to_string();
     came.send(Incoming::Frame(open.into_bytes())).await.unwrap();
-    let closed = etude::stream::run(&etude, limits, &mut incoming, &outgoing, &abort).await;
+    let closed = etude::stream::run(&etude, CLIENT, limits, &mut incoming, &outgoing, &abort).await;
     assert_eq!((closed, closed.code().0), (Closed::Overloaded, 1013));
     assert!(matches!(goes.try_recv(), Ok(Outgoing::Frame(hello)) if hello.contains("hello")));
     etude.close().await;
@@ -964,8 +968,9 @@ impl Wire {
         let (outgoing, from_server) = mpsc::channel(1);
         let (etude, stopping) = (Arc::clone(etude), stopping.clone());
         let limits = service::flags(&["--slow-reader-timeout", "1h"]).stream_limits();
-        let running =
-            tokio::spawn(async move { etude::stream::run(&etude, limits, &mut incoming, &outgoing, &stopping).await });
+        let running = tokio::spawn(async move {
+            etude::stream::run(&etude, CLIENT, limits, &mut incoming, &outgoing, &stopping).await
+        });
         Self { to_server, from_server, running }
     }
 

@@ -17,6 +17,7 @@ use super::map::read_json;
 use super::{CliError, runtime};
 use crate::document::{Faults, Place};
 use crate::learning::{Distribution, Learner, LearnerDocument};
+use crate::memory::{self, Memory};
 use crate::model::Limits;
 use crate::service::{Etude, Name, PoolSettings, Replay, Settings};
 
@@ -204,6 +205,7 @@ async fn with_database<T>(
     let settings = Settings {
         database: database.to_owned(),
         limits: Limits::DEFAULT,
+        memory: Memory::new(memory::default_max_bytes()),
         model_cache_bytes: 0,
         pool: PoolSettings { n_threads: 1, max_waiting: 0 },
         session_idle_timeout: Duration::MAX,

@@ -5,6 +5,7 @@ use std::pin::pin;
 use std::time::Duration;
 
 use axum::Router;
+use axum::http::Request;
 use axum::serve::{Listener, ListenerExt};
 use hyper::body::Incoming;
 use hyper::server::conn::http1;
@@ -14,6 +15,9 @@ use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::oneshot;
 use tokio::task::JoinSet;
 use tokio_util::sync::CancellationToken;
+use tower::ServiceExt;
+
+use crate::service::Client;
 
 /// Serves `router` on whatever connects, until `stopping` is cancelled and the requests that run then are answered. A client
 /// whose next request is not there, up to its body, after `head_timeout` finds its connection closed. So does everybody if the
@@ -34,9 +38,11 @@ pub async fn serve(listener: TcpListener, router: Router, head_timeout: Duration
     loop {
         tokio::select! {
             // Waits a moment where there are no more file descriptors.
-            (stream, _) = listener.accept() => {
+            (stream, peer) = listener.accept() => {
                 let (end, ended) = oneshot::channel();
-                let connection = connections.spawn(serve_connection(builder.clone(), stream, router.clone(), ended));
+                let client = Client::from(peer.ip());
+                let connection = serve_connection(builder.clone(), stream, client, router.clone(), ended);
+                let connection = connections.spawn(connection);
                 ends.insert(connection.id(), end);
             }
             Some(served) = connections.join_next_with_id() => {
@@ -50,8 +56,18 @@ pub async fn serve(listener: TcpListener, router: Router, head_timeout: Duration
 }
 
 /// Serves a connection until it ends, or what runs on it when `end` is dropped has ended.
-async fn serve_connection(builder: http1::Builder, stream: TcpStream, router: Router, end: oneshot::Receiver<()>) {
-    let service = TowerToHyperService::new(router.into_service::<Incoming>());
+async fn serve_connection(
+    builder: http1::Builder,
+    stream: TcpStream,
+    client: Client,
+    router: Router,
+    end: oneshot::Receiver<()>,
+) {
+    let service = router.into_service::<Incoming>().map_request(move |mut request: Request<Incoming>| {
+        request.extensions_mut().insert(client);
+        request
+    });
+    let service = TowerToHyperService::new(service);
     let mut connection = pin!(builder.serve_connection(TokioIo::new(stream), service).with_upgrades());
     let served = tokio::select! {
         served = connection.as_mut() => served,

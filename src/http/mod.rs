@@ -9,6 +9,7 @@
 //! The OpenAPI description is generated from the handlers of this module; [`openapi`] gives it without a running service.
 
 mod body;
+mod caller;
 mod connections;
 mod encoding;
 mod learners;

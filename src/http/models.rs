@@ -21,7 +21,7 @@ use super::path::PathName;
 use super::problem::Problem;
 use crate::attribute::AttributeDocument;
 use crate::model::{ActionDocument, DefinitionDocument};
-use crate::service::{Etude, ModelAnswer, ModelDefinition, Registered, ServiceError};
+use crate::service::{Caller, Etude, ModelAnswer, ModelDefinition, Registered, ServiceError};
 use crate::store::ModelSummary;
 
 /// A registered model.
@@ -123,6 +123,7 @@ struct WholeModelBody {
 pub(super) async fn put_model(
     State(context): State<SharedContext>,
     PathName(name): PathName,
+    caller: Caller,
     request: Request,
 ) -> Result<Response, Problem> {
     let sent = match context.max_model_bytes {
@@ -131,7 +132,7 @@ pub(super) async fn put_model(
     };
     let decoded = DecodedLimit { n_bytes: context.max_model_text_bytes, setting: "ETUDE_MAX_MODEL_TEXT_BYTES" };
     let SentModel { text, format, pump } = read_model(request, sent, decoded).await?;
-    let put = context.etude.put_model(&name, text, format, Timestamp::now());
+    let put = context.etude.put_model(&name, text, format, caller);
     let (put, ()) = tokio::join!(put, OptionFuture::from(pump.map(Pump::run)).map(|_| ()));
     let (registered, summary) = put?;
     let status = match registered {

@@ -1,13 +1,10 @@
 //! `/v1/policies`.
 
-use std::time::Instant;
-
 use axum::Extension;
 use axum::extract::{Request, State};
 use axum::http::header::LOCATION;
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::Response;
-use jiff::Timestamp;
 use serde::Serialize;
 use utoipa::ToSchema;
 
@@ -18,7 +15,7 @@ use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::Problem;
 use crate::mapping::{Policy, PolicySummary, RequestDocument};
-use crate::service::{BatchRequest, ServiceError};
+use crate::service::{BatchRequest, Caller, ServiceError};
 
 /// Follow a demonstration: the policy whose effects come closest to it, stored.
 #[utoipa::path(
@@ -36,10 +33,13 @@ use crate::service::{BatchRequest, ServiceError};
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn make_policy(State(context): State<SharedContext>, request: Request) -> Result<Response, Problem> {
-    let arrived = Instant::now();
+pub(super) async fn make_policy(
+    State(context): State<SharedContext>,
+    caller: Caller,
+    request: Request,
+) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
-    let made = context.etude.make_policy(body, arrived, Timestamp::now()).await?;
+    let made = context.etude.make_policy(body, caller).await?;
     let mut response = json_text(StatusCode::CREATED, made.policy);
     if let Ok(location) = HeaderValue::try_from(format!("/v1/policies/{}", made.id)) {
         response.headers_mut().insert(LOCATION, location);
@@ -69,12 +69,12 @@ pub(super) async fn make_policy(State(context): State<SharedContext>, request: R
 )]
 pub(super) async fn make_policies(
     State(context): State<SharedContext>,
+    caller: Caller,
     Extension(id): Extension<RequestId>,
     request: Request,
 ) -> Result<Response, Problem> {
-    let arrived = Instant::now();
     let body = read_json(request, &context).await?;
-    let made = context.etude.make_policies(body, arrived, Timestamp::now()).await?;
+    let made = context.etude.make_policies(body, caller).await?;
     let (before, after) = (r#"{"items":["#, "]}");
     let n_bytes: usize = made.iter().flatten().map(|made| made.policy.len() + 1).sum();
     let mut text = String::with_capacity(before.len() + n_bytes + after.len());

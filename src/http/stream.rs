@@ -27,6 +27,7 @@ use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{Problem, ProblemKind};
 use crate::attribute::ByAttribute;
+use crate::service::{Caller, Client};
 use crate::store::{SessionRow, SessionWeights};
 use crate::stream::{self, Closed, Incoming, Outgoing, PROTOCOL};
 
@@ -56,6 +57,7 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 )]
 pub(super) async fn websocket(
     State(context): State<SharedContext>,
+    Caller { client, .. }: Caller,
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
     let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::UpgradeRequired, rejection.body_text()))?;
@@ -72,11 +74,11 @@ pub(super) async fn websocket(
     let span = tracing::Span::current();
     Ok(upgrade.on_upgrade(move |socket| {
         let streams = context.streams.clone();
-        streams.track_future(serve_websocket(context, socket, place).instrument(span))
+        streams.track_future(serve_websocket(context, client, socket, place).instrument(span))
     }))
 }
 
-async fn serve_websocket(context: SharedContext, socket: WebSocket, place: OwnedSemaphorePermit) {
+async fn serve_websocket(context: SharedContext, client: Client, socket: WebSocket, place: OwnedSemaphorePermit) {
     let (sink, source) = socket.split();
     let (came, mut incoming) = mpsc::channel(MAX_WAITING);
     let (outgoing, goes) = mpsc::channel(MAX_WAITING);
@@ -84,7 +86,7 @@ async fn serve_websocket(context: SharedContext, socket: WebSocket, place: Owned
     let (gone, ended) = (CancellationToken::new(), CancellationToken::new());
     let speaking = async {
         let closed = tokio::select! {
-            closed = stream::run(&context.etude, context.stream_limits, &mut incoming, &outgoing, &context.stopping) => closed,
+            closed = stream::run(&context.etude, client, context.stream_limits, &mut incoming, &outgoing, &context.stopping) => closed,
             // A search that still runs ends with this.
             () = gone.cancelled() => Closed::ByClient,
         };
@@ -193,7 +195,11 @@ async fn write_frames(sink: &mut SplitSink<WebSocket, Message>, goes: &mut mpsc:
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn ndjson(State(context): State<SharedContext>, request: Request) -> Result<Response, Problem> {
+pub(super) async fn ndjson(
+    State(context): State<SharedContext>,
+    Caller { client, .. }: Caller,
+    request: Request,
+) -> Result<Response, Problem> {
     // A decoder gives what it has when it likes, and each would keep a window of megabytes for as long as its stream runs.
     if Encoding::declared(request.headers()) != Ok(Encoding::Identity) {
         let detail = "the frames of a stream are sent as they are, without `Content-Encoding`";
@@ -209,7 +215,7 @@ pub(super) async fn ndjson(State(context): State<SharedContext>, request: Reques
     let serving = async move {
         let speaking = async {
             tokio::select! {
-                _ = stream::run(&context.etude, context.stream_limits, &mut incoming, &outgoing, &context.stopping) => {}
+                _ = stream::run(&context.etude, client, context.stream_limits, &mut incoming, &outgoing, &context.stopping) => {}
                 // The client does not read any more: it is gone.
                 () = lines.closed() => {}
             }

@@ -16,7 +16,7 @@ use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
 use super::problem::Problem;
 use crate::mapping::{ObservationDocument, Policy, StartReference};
-use crate::service::{ServiceError, TrialAnswer};
+use crate::service::{Caller, ServiceError, TrialAnswer};
 use crate::store::{StoreError, TrialStatus};
 
 /// A request for a trial.
@@ -139,10 +139,11 @@ pub(super) struct FailureBody {
 pub(super) async fn make_trial(
     State(context): State<SharedContext>,
     PathName(name): PathName,
+    caller: Caller,
     request: Request,
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
-    let made = TrialBody::of(context.etude.make_trial(&name, body, Timestamp::now()).await?)?;
+    let made = TrialBody::of(context.etude.make_trial(&name, body, caller).await?)?;
     let location = HeaderValue::from_str(&format!("/v1/trials/{}", made.id));
     let mut response = json(StatusCode::CREATED, &made);
     if let Ok(location) = location {

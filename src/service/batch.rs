@@ -17,7 +17,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use futures_util::future::try_join_all;
-use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use utoipa::ToSchema;
@@ -25,7 +24,7 @@ use uuid::Uuid;
 
 use super::outline::{AtHand, BatchOutline};
 use super::policies::{Envelope, MAX_INLINE_BYTES, Named, Searched, base_weights, follow, parse};
-use super::{Admission, Etude, MadePolicy, ServiceError};
+use super::{Admission, Caller, Etude, MadePolicy, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Object, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt};
@@ -52,9 +51,8 @@ const ITEM_FIELDS: [&str; 6] = ["demonstration", "weights", "lookahead", "start"
 const SHARED_OPTIONS: [&str; 4] = ["lookahead", "start", "heuristic", "max_expansions"];
 
 impl Etude {
-    /// Makes a policy for every item of the batch in `body` (JSON, cheap to clone), and stores them all at once. The batch came at `arrived`,
-    /// from which its deadline counts; `now` is the same moment on the calendar. Gives for each item, in order, its policy or
-    /// what is wrong with it.
+    /// Makes a policy for every item of the batch in `body` (JSON, cheap to clone), and stores them all at once. Gives for each item,
+    /// in order, its policy or what is wrong with it.
     ///
     /// # Errors
     ///
@@ -62,9 +60,9 @@ impl Etude {
     pub async fn make_policies(
         self: &Arc<Self>,
         body: impl AsRef<[u8]> + Clone + Send + 'static,
-        arrived: Instant,
-        now: Timestamp,
+        caller: Caller,
     ) -> Result<Vec<Result<MadePolicy, ServiceError>>, ServiceError> {
+        let Caller { arrived, now, .. } = caller;
         let place = self.pool.admit()?;
         let sent = self.read_batch(body.clone(), &place).await?;
         let (envelope, faults) = Envelope::read(&sent.document, &BATCH_FIELDS, "items");

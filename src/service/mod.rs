@@ -10,6 +10,7 @@
 
 mod batch;
 mod cache;
+mod caller;
 mod learner_task;
 mod learners;
 mod models;
@@ -30,6 +31,7 @@ use std::time::Duration;
 use jiff::{Timestamp, Unit};
 
 pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS};
+pub use caller::{Caller, Client};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, ModelText, OpenText, Registered};
 pub use name::{InvalidName, Name};
@@ -43,6 +45,7 @@ pub use trials::TrialAnswer;
 
 use crate::document::{Faults, ParseError, Quoted};
 use crate::mapping::WriteError;
+use crate::memory::Memory;
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
 use cache::{MapperCache, ModelNames};
@@ -64,6 +67,8 @@ pub struct Settings {
     pub session_idle_timeout: Duration,
     /// Threads and queue of the searches.
     pub pool: PoolSettings,
+    /// What everything large takes its memory from.
+    pub memory: Memory,
 }
 
 /// Why the service could not do as asked.
@@ -141,6 +146,7 @@ pub enum ServiceError {
 #[derive(Debug)]
 pub struct Etude {
     store: Store,
+    memory: Memory,
     pool: SearchPool,
     mappers: MapperCache,
     model_names: ModelNames,
@@ -164,6 +170,7 @@ impl Etude {
     pub async fn open(settings: &Settings, tasks: &TaskTracker, abort: CancellationToken) -> Result<Self, StoreError> {
         Ok(Self {
             store: Store::open(&settings.database, tasks).await?,
+            memory: settings.memory.clone(),
             pool: SearchPool::new(settings.pool, tasks.clone(), abort),
             mappers: MapperCache::new(settings.model_cache_bytes),
             model_names: ModelNames::new(),
@@ -198,6 +205,12 @@ impl Etude {
     /// Closes the store. Whoever still asks for something gets an error.
     pub async fn close(&self) {
         self.store.close().await;
+    }
+
+    /// The budget of memory.
+    #[must_use]
+    pub fn memory(&self) -> &Memory {
+        &self.memory
     }
 
     /// The pool that searches run on.

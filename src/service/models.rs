@@ -4,13 +4,12 @@ use std::io::{self, BufRead};
 use std::sync::Arc;
 
 use futures_util::future::OptionFuture;
-use jiff::Timestamp;
 use serde_json::value::RawValue;
 use sha2::{Digest, Sha256};
 use tokio::sync::{Semaphore, SemaphorePermit, mpsc};
 
 use super::pool::Admission;
-use super::{Etude, Name, PipeWriter, PoolError, ServiceError, as_stored, pipe};
+use super::{Caller, Etude, Name, PipeWriter, PoolError, ServiceError, as_stored, pipe};
 use crate::attribute::AttributeDocument;
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::Mapper;
@@ -106,7 +105,7 @@ impl Etude {
         name: &Name,
         text: ModelText,
         format: Format,
-        now: Timestamp,
+        caller: Caller,
     ) -> Result<(Registered, ModelSummary), ServiceError> {
         let limits = self.limits;
         // Where something is registered already, nothing is stored; what it is then depends on the hash.
@@ -142,7 +141,7 @@ impl Etude {
                 n_transitions: model.n_transitions() as u64,
             }),
             n_unsafe: model.n_unsafe() as u64,
-            created_at: as_stored(now),
+            created_at: as_stored(caller.now),
         };
         let key = ModelKey { hash: summary.hash.clone(), is_lazy: model.is_lazy() };
         let put = match (text, stored) {

@@ -12,7 +12,7 @@ use uuid::Uuid;
 
 use super::learners::Ready;
 use super::outline::Outline;
-use super::{Admission, Etude, ServiceError};
+use super::{Admission, Caller, Etude, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt, time_until_finish};
@@ -34,8 +34,7 @@ pub struct MadePolicy {
 }
 
 impl Etude {
-    /// Makes a policy for the request in `body` (JSON), and stores it. The request came at `arrived`, from which its deadline
-    /// counts; `now` is the same moment on the calendar.
+    /// Makes a policy for the request in `body` (JSON), and stores it.
     ///
     /// # Errors
     ///
@@ -43,9 +42,9 @@ impl Etude {
     pub async fn make_policy(
         &self,
         body: impl AsRef<[u8]> + Send + 'static,
-        arrived: Instant,
-        now: Timestamp,
+        caller: Caller,
     ) -> Result<MadePolicy, ServiceError> {
+        let Caller { arrived, now, .. } = caller;
         let place = self.pool.admit()?;
         let id = Uuid::now_v7().to_string();
         let quick = if body.as_ref().len() <= MAX_INLINE_BYTES {

@@ -184,23 +184,29 @@ mod tests {
 
     use super::*;
     use crate::interrupt::{Signal, Uninterrupted};
+    use crate::memory::Memory;
     use crate::model::{Format, Limits};
-    use crate::service::{ModelText, Name, PoolSettings};
+    use crate::service::{Caller, Client, ModelText, Name, PoolSettings};
     use crate::store::NewPolicy;
 
     const NOW: Timestamp = Timestamp::UNIX_EPOCH;
+
+    fn caller() -> Caller {
+        Caller { client: Client::LOCAL, arrived: Instant::now(), now: NOW }
+    }
 
     async fn etude(directory: &std::path::Path) -> Etude {
         let settings = super::super::Settings {
             database: directory.join("etude.db"),
             limits: Limits::DEFAULT,
+            memory: Memory::with_room(1 << 30),
             model_cache_bytes: 1 << 20,
             session_idle_timeout: Duration::MAX,
             pool: PoolSettings { n_threads: 1, max_waiting: 1 },
         };
         let etude = Etude::open(&settings, &TaskTracker::new(), CancellationToken::new()).await.unwrap();
         let world = ModelText::Whole(br#"{"dynamics": {"kind": "wumpus", "width": 4, "height": 4}}"#.to_vec());
-        etude.put_model(&Name::new("world").unwrap(), world, Format::Json, NOW).await.unwrap();
+        etude.put_model(&Name::new("world").unwrap(), world, Format::Json, caller()).await.unwrap();
         etude
     }
 
@@ -210,7 +216,7 @@ mod tests {
     }
 
     async fn made(etude: &Etude, request: &Value) -> String {
-        etude.make_policy(request.to_string().into_bytes(), Instant::now(), NOW).await.unwrap().id
+        etude.make_policy(request.to_string().into_bytes(), caller()).await.unwrap().id
     }
 
     async fn read(etude: &Etude, id: &str) -> Value {

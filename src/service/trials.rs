@@ -11,7 +11,7 @@ use uuid::Uuid;
 
 use super::learners::{Ready, unknown};
 use super::policies::{self, Envelope, Named, Searched};
-use super::{Etude, Name, ServiceError, as_stored};
+use super::{Caller, Etude, Name, ServiceError, as_stored};
 use crate::attribute::{Schema, Weights};
 use crate::document::{Faults, Path, Place, Range};
 use crate::interrupt::Interrupt;
@@ -44,7 +44,7 @@ impl Etude {
         &self,
         name: &Name,
         body: impl AsRef<[u8]> + Send + 'static,
-        now: Timestamp,
+        caller: Caller,
     ) -> Result<TrialAnswer, ServiceError> {
         let Ready { sequence, name, learner, weights } = self.ready(name.as_str(), None).await?;
         let place = self.pool.admit()?;
@@ -90,7 +90,7 @@ impl Etude {
         let (number, weights) = drawn.ok_or(StoreError::Closed)?;
         let weights = weights?;
 
-        let now = as_stored(now);
+        let now = as_stored(caller.now);
         let lease_expires_at = now.checked_add(Duration::from_secs(lease_s)).unwrap_or(Timestamp::MAX);
         let new = NewTrial {
             id: id.clone(),

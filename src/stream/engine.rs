@@ -1,7 +1,7 @@
 //! The protocol, one connection at a time.
 
 use std::error::Error;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use serde_json::Value;
@@ -11,7 +11,9 @@ use tokio_util::sync::CancellationToken;
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem};
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
-use crate::service::{Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError};
+use crate::service::{
+    Caller, Client, Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError,
+};
 use crate::store::{AcceptedReward, StoreError};
 
 /// The protocol's name; also the websocket subprotocol.
@@ -116,6 +118,7 @@ const GOODBYE_TIMEOUT: Duration = Duration::from_secs(2);
 /// shuts down, whatever is under way. Dropping the future at any time leaves a session that can be resumed.
 pub async fn run(
     etude: &Etude,
+    client: Client,
     limits: Limits,
     incoming: &mut mpsc::Receiver<Incoming>,
     outgoing: &mpsc::Sender<Outgoing>,
@@ -123,7 +126,7 @@ pub async fn run(
 ) -> Closed {
     let taken_over = SetOnce::new();
     let mut connection =
-        Connection { etude, limits, outgoing, session: None, taken_over: &taken_over, is_reward_told: false };
+        Connection { etude, client, limits, outgoing, session: None, taken_over: &taken_over, is_reward_told: false };
     let ended = tokio::select! {
         biased;
         () = stopping.cancelled() => {
@@ -167,6 +170,7 @@ impl Over {
 
 struct Connection<'c> {
     etude: &'c Etude,
+    client: Client,
     limits: Limits,
     outgoing: &'c mpsc::Sender<Outgoing>,
     session: Option<Session>,
@@ -199,18 +203,19 @@ impl Connection<'_> {
     /// Answers a frame. Gives how the connection ends, if it does.
     async fn answer(&mut self, frame: ClientFrame) -> Result<Option<Closed>, Over> {
         let now = Timestamp::now();
+        let caller = Caller { client: self.client, arrived: Instant::now(), now };
         match (frame, &mut self.session) {
             (ClientFrame::Open(_) | ClientFrame::Resume { .. }, Some(_)) => {
                 Err(not_allowed("a session is open already"))
             }
             (ClientFrame::Open(request), None) => {
-                let session = self.etude.open_session(&request, now).await.map_err(|error| ends(&error))?;
+                let session = self.etude.open_session(&request, caller).await.map_err(|error| ends(&error))?;
                 self.opened(session).await?;
                 Ok(None)
             }
             (ClientFrame::Resume { session, step }, None) => {
                 let Resumed { session, steps, policy } =
-                    self.etude.resume_session(&session, now).await.map_err(|error| ends(&error))?;
+                    self.etude.resume_session(&session, caller).await.map_err(|error| ends(&error))?;
                 self.opened(session).await?;
                 self.send_steps(steps.get(step as usize..).unwrap_or_default()).await?;
                 let Some(policy) = policy else { return Ok(None) };

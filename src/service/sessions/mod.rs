@@ -19,7 +19,7 @@ pub use session::{Ended, Observation, Received, RewardState, Session};
 use super::opening::{Names, Opening};
 use super::owners::{Ownership, TakenOver};
 use super::policies::Named;
-use super::{Etude, PoolError, ServiceError};
+use super::{Caller, Etude, PoolError, ServiceError};
 use crate::attribute::{Schema, Weights};
 use crate::document::{self, Faults, Place};
 use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, TooManySteps};
@@ -105,7 +105,8 @@ impl Etude {
     /// # Errors
     ///
     /// If the request has faults or names what is unknown, or the service cannot do it now.
-    pub async fn open_session(&self, request: &Value, now: Timestamp) -> Result<Session, SessionError> {
+    pub async fn open_session(&self, request: &Value, caller: Caller) -> Result<Session, SessionError> {
+        let now = caller.now;
         let place = self.pool.admit()?;
         let mut faults = Faults::default();
         let object = Place::root(request).object(&Session::OPEN_FIELDS, &mut faults);
@@ -175,7 +176,7 @@ impl Etude {
     /// # Errors
     ///
     /// If there is none, it has expired, its model is gone, or it is taken over meanwhile.
-    pub async fn resume_session(&self, id: &str, now: Timestamp) -> Result<Resumed, SessionError> {
+    pub async fn resume_session(&self, id: &str, caller: Caller) -> Result<Resumed, SessionError> {
         // Looked up first, so that nobody is bothered for what does not exist.
         self.session(id).await?;
         let ownership = self.owners.take(id).await?;
@@ -183,13 +184,13 @@ impl Etude {
         tokio::select! {
             biased;
             () = taken_over.cancelled() => Err(SessionError::TakenOver),
-            resumed = self.resume_owned(id, ownership, now) => resumed,
+            resumed = self.resume_owned(id, ownership, caller) => resumed,
         }
     }
 
-    async fn resume_owned(&self, id: &str, ownership: Ownership, now: Timestamp) -> Result<Resumed, SessionError> {
+    async fn resume_owned(&self, id: &str, ownership: Ownership, caller: Caller) -> Result<Resumed, SessionError> {
         // Behind whatever is still to be written for the owner before. It may be done already.
-        let _is_open = self.store.touch_session(id, now).await?;
+        let _is_open = self.store.touch_session(id, caller.now).await?;
         let row = self.session(id).await?;
         if row.status == SessionStatus::Expired {
             return Err(SessionError::NotOpen);

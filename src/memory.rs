@@ -1,0 +1,237 @@
+//! The one budget of memory, from which everything large takes what it uses.
+//!
+//! ```text
+//! --max-memory = base (connections, caches of SQLite, small requests) + room
+//!                                                                       ^
+//!                models, searches, batches, bodies, answers, streams ---+  take() and give back
+//! ```
+//!
+//! Whoever is about to use much memory takes so many bytes first, and gives them back by dropping what it holds. What does not fit
+//! waits ([`Memory::take`]) or is refused ([`Memory::try_take`]). The budget counts what it is told; it measures nothing.
+
+use std::fs;
+use std::sync::Arc;
+
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+
+/// Memory is taken in units of this size, of which there can be 2^32.
+const UNIT_BYTES: u64 = 4096;
+
+/// There is no room for so much now; or there never is, if it is more than all the room.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{wanted} bytes do not fit into the memory of this service (ETUDE_MAX_MEMORY), which has {room} for requests")]
+pub struct NoRoom {
+    /// How much was wanted, in bytes.
+    pub wanted: u64,
+    /// How much there is when nobody uses any, in bytes.
+    pub room: u64,
+}
+
+/// The budget. Clones share it.
+#[derive(Clone, Debug)]
+pub struct Memory {
+    room: u64,
+    free: Arc<Semaphore>,
+}
+
+impl Memory {
+    /// Least that is kept for what takes nothing from the budget.
+    const MIN_BASE_BYTES: u64 = 64 << 20;
+
+    /// A budget of `max_bytes`, a quarter of which is kept for what is too small or too scattered to be counted.
+    #[must_use]
+    pub fn new(max_bytes: u64) -> Self {
+        let base = (max_bytes / 4).max(Self::MIN_BASE_BYTES);
+        Self::with_room(max_bytes.saturating_sub(base))
+    }
+
+    /// A budget that has all of `n_bytes` for whoever asks.
+    #[must_use]
+    pub fn with_room(n_bytes: u64) -> Self {
+        let n_units = (n_bytes / UNIT_BYTES).min(u64::from(u32::MAX));
+        let n_permits = usize::try_from(n_units).unwrap_or(usize::MAX).min(Semaphore::MAX_PERMITS);
+        Self { room: n_bytes, free: Arc::new(Semaphore::new(n_permits)) }
+    }
+
+    /// How much there is when nobody uses any, in bytes.
+    #[must_use]
+    pub fn room(&self) -> u64 {
+        self.room
+    }
+
+    /// How much nobody uses now, in bytes.
+    #[must_use]
+    pub fn free(&self) -> u64 {
+        self.free.available_permits() as u64 * UNIT_BYTES
+    }
+
+    /// Takes `n_bytes` if they are free.
+    ///
+    /// # Errors
+    ///
+    /// [`NoRoom`] if they are not.
+    pub fn try_take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
+        let permit = Arc::clone(&self.free).try_acquire_many_owned(self.units(n_bytes)?);
+        let permit = permit.map_err(|_| self.no_room(n_bytes))?;
+        Ok(Held { memory: self.clone(), permit })
+    }
+
+    /// Takes `n_bytes` once they are free. Whoever waits longest is served first.
+    ///
+    /// # Errors
+    ///
+    /// [`NoRoom`] if there is never so much.
+    pub async fn take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
+        let n_units = self.units(n_bytes)?;
+        let permit = Arc::clone(&self.free).acquire_many_owned(n_units).await.map_err(|_| self.no_room(n_bytes))?;
+        Ok(Held { memory: self.clone(), permit })
+    }
+
+    /// What `n_bytes` are in units, if there is so much at all.
+    fn units(&self, n_bytes: u64) -> Result<u32, NoRoom> {
+        let n_units = if n_bytes <= self.room { u32::try_from(n_bytes.div_ceil(UNIT_BYTES)).ok() } else { None };
+        n_units.ok_or_else(|| self.no_room(n_bytes))
+    }
+
+    fn no_room(&self, wanted: u64) -> NoRoom {
+        NoRoom { wanted, room: self.room }
+    }
+}
+
+/// Memory that was taken, until this is dropped.
+#[derive(Debug)]
+pub struct Held {
+    memory: Memory,
+    permit: OwnedSemaphorePermit,
+}
+
+impl Held {
+    /// How much it is, in bytes.
+    #[must_use]
+    pub fn n_bytes(&self) -> u64 {
+        self.permit.num_permits() as u64 * UNIT_BYTES
+    }
+
+    /// Takes more, if it is free, until this holds at least `n_bytes`.
+    ///
+    /// # Errors
+    ///
+    /// [`NoRoom`] if it is not free; then this holds what it did before.
+    pub fn grow_to(&mut self, n_bytes: u64) -> Result<(), NoRoom> {
+        if n_bytes > self.n_bytes() {
+            let more = self.memory.try_take(n_bytes - self.n_bytes());
+            self.permit.merge(more.map_err(|_| self.memory.no_room(n_bytes))?.permit);
+        }
+        Ok(())
+    }
+
+    /// Gives back what is not needed to hold `n_bytes`.
+    pub fn shrink_to(&mut self, n_bytes: u64) {
+        let kept = usize::try_from(n_bytes.div_ceil(UNIT_BYTES)).unwrap_or(usize::MAX);
+        drop(self.permit.split(self.permit.num_permits().saturating_sub(kept)));
+    }
+}
+
+/// What a process may use by default: three quarters of what its machine or its cgroup has, half of its address space.
+#[must_use]
+pub fn default_max_bytes() -> u64 {
+    /// Where nothing can be read of the machine.
+    const UNKNOWN: u64 = 4 << 30;
+    let resident = [machine_bytes(), cgroup_bytes()].into_iter().flatten().min();
+    let by_resident = resident.map(|n_bytes| n_bytes / 4 * 3);
+    let by_addresses = address_space_bytes().map(|n_bytes| n_bytes / 2);
+    [by_resident, by_addresses].into_iter().flatten().min().unwrap_or(UNKNOWN)
+}
+
+/// The memory of the machine.
+fn machine_bytes() -> Option<u64> {
+    let text = fs::read_to_string("/proc/meminfo").ok()?;
+    let total = text.lines().find_map(|line| line.strip_prefix("MemTotal:"))?;
+    Some(total.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()? * 1024)
+}
+
+/// The least limit of the cgroups that this process is in, of either version.
+fn cgroup_bytes() -> Option<u64> {
+    let groups = fs::read_to_string("/proc/self/cgroup").ok()?;
+    let files = groups.lines().filter_map(|line| {
+        let (_, rest) = line.split_once(':')?;
+        let (controllers, path) = rest.split_once(':')?;
+        match controllers {
+            "" => Some(("/sys/fs/cgroup", path, "memory.max")),
+            _ if controllers.split(',').any(|name| name == "memory") => {
+                Some(("/sys/fs/cgroup/memory", path, "memory.limit_in_bytes"))
+            }
+            _ => None,
+        }
+    });
+    // A group has no more than the groups around it. In a container the path may be that of the host, and only the root is there.
+    let limits = files.flat_map(|(root, path, file)| {
+        let ancestors = std::path::Path::new(path.trim_start_matches('/')).ancestors().map(std::path::Path::to_owned);
+        ancestors.filter_map(move |group| {
+            let text = fs::read_to_string(std::path::Path::new(root).join(group).join(file)).ok()?;
+            text.trim().parse::<u64>().ok()
+        })
+    });
+    limits.min()
+}
+
+/// The limit of the process's address space, if it has one.
+fn address_space_bytes() -> Option<u64> {
+    let limits = fs::read_to_string("/proc/self/limits").ok()?;
+    let line = limits.lines().find_map(|line| line.strip_prefix("Max address space"))?;
+    line.split_whitespace().next()?.parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use futures_util::poll;
+
+    use super::*;
+
+    const MIB: u64 = 1 << 20;
+
+    #[test]
+    fn what_is_held_is_given_back_when_it_is_dropped() {
+        let memory = Memory::with_room(MIB);
+        let held = memory.try_take(MIB - 1).unwrap();
+        assert_eq!((held.n_bytes(), memory.free()), (MIB, 0));
+        assert_eq!(memory.try_take(1).unwrap_err(), NoRoom { wanted: 1, room: MIB });
+        drop(held);
+        assert_eq!(memory.free(), MIB);
+    }
+
+    #[test]
+    fn what_is_held_grows_if_there_is_room_and_shrinks() {
+        let memory = Memory::with_room(MIB);
+        let mut held = memory.try_take(0).unwrap();
+        held.grow_to(MIB / 2).unwrap();
+        assert_eq!(held.grow_to(2 * MIB), Err(NoRoom { wanted: 2 * MIB, room: MIB }));
+        let other = memory.try_take(MIB / 2).unwrap();
+        assert!(held.grow_to(MIB / 2 + 1).is_err());
+        assert_eq!((held.n_bytes(), memory.free()), (MIB / 2, 0));
+        held.shrink_to(5000);
+        assert_eq!((held.n_bytes(), memory.free()), (8192, MIB / 2 - 8192));
+        drop((held, other));
+        assert_eq!(memory.free(), MIB);
+    }
+
+    #[tokio::test]
+    async fn who_waits_for_much_is_not_passed_over_for_little() {
+        let memory = Memory::with_room(MIB);
+        let held = memory.try_take(MIB).unwrap();
+        let mut much = Box::pin(memory.take(MIB));
+        let mut little = Box::pin(memory.take(1));
+        assert!(poll!(&mut much).is_pending() && poll!(&mut little).is_pending());
+        drop(held);
+        assert!(poll!(&mut little).is_pending());
+        drop(much.await.unwrap());
+        assert_eq!(little.await.unwrap().n_bytes(), UNIT_BYTES);
+        assert!(memory.take(MIB + 1).await.is_err(), "it would wait for ever");
+    }
+
+    #[test]
+    fn a_process_may_use_a_part_of_what_there_is() {
+        let machine = machine_bytes().unwrap();
+        assert!((1..machine).contains(&default_max_bytes()));
+    }
+}
