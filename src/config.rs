@@ -9,7 +9,7 @@ use clap::Args;
 
 use crate::memory::{self, Memory};
 use crate::model;
-use crate::service::{PoolSettings, Settings};
+use crate::service::{PoolSettings, Settings, TimeLimits};
 use crate::stream::Limits;
 
 /// Settings of the service.
@@ -25,7 +25,7 @@ pub struct ServeConfig {
     #[arg(long, env = "ETUDE_SEARCH_THREADS", value_parser = parse_threads, value_name = "N")]
     pub search_threads: Option<NonZeroUsize>,
     /// Searches that wait for a thread; further ones are answered 503.
-    #[arg(long, env = "ETUDE_SEARCH_QUEUE", default_value_t = 64, value_parser = parse_places, value_name = "N")]
+    #[arg(long, env = "ETUDE_SEARCH_QUEUE", default_value_t = 256, value_parser = parse_places, value_name = "N")]
     pub search_queue: usize,
     /// Largest request body; once it is decompressed, too.
     #[arg(long, env = "ETUDE_MAX_BODY_BYTES", default_value_t = 8 * 1024 * 1024, value_name = "BYTES")]
@@ -50,6 +50,17 @@ pub struct ServeConfig {
     /// Of that, for models that are kept ready to be searched [default: a quarter, 1 GiB at most].
     #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", value_name = "BYTES")]
     pub model_cache_bytes: Option<u64>,
+    /// How long a search may take, from the arrival of its request, unless that says so itself.
+    #[arg(
+        long, env = "ETUDE_DEFAULT_DEADLINE", default_value = "10s", value_parser = parse_period, value_name = "TIME"
+    )]
+    pub default_deadline: Duration,
+    /// How long a search may take at most, whatever its request says.
+    #[arg(long, env = "ETUDE_MAX_DEADLINE", default_value = "10m", value_parser = parse_period, value_name = "TIME")]
+    pub max_deadline: Duration,
+    /// How long compiling a model may take; beyond that, it is refused.
+    #[arg(long, env = "ETUDE_MAX_COMPILE_TIME", default_value = "30s", value_parser = parse_period, value_name = "TIME")]
+    pub max_compile_time: Duration,
     /// Streams that may run at the same time; further ones are answered 503.
     #[arg(long, env = "ETUDE_MAX_STREAMS", default_value_t = 4096, value_parser = parse_places, value_name = "N")]
     pub max_streams: usize,
@@ -86,9 +97,15 @@ impl ServeConfig {
             memory: Memory::new(max_memory),
             model_cache_bytes: self.model_cache_bytes.unwrap_or(MAX_MODEL_CACHE_BYTES.min(max_memory / 4)),
             session_idle_timeout: self.session_idle_timeout,
+            time_limits: TimeLimits {
+                default_deadline: self.default_deadline.min(self.max_deadline),
+                max_deadline: self.max_deadline,
+                compile: self.max_compile_time,
+            },
             pool: PoolSettings {
                 n_threads: self.search_threads.map_or(n_cores, NonZeroUsize::get),
                 max_waiting: self.search_queue,
+                max_long: MAX_LONG_SEARCHES,
             },
         }
     }
@@ -118,6 +135,10 @@ const MIN_MEMORY_BYTES: u64 = 128 << 20;
 
 /// Most threads: half of those that the runtime has for what blocks.
 const MAX_THREADS: usize = 256;
+
+/// Most searches that have run for longer than a moment, each of which may keep a thread of the operating system. One client may
+/// have half of these.
+const MAX_LONG_SEARCHES: usize = 256;
 
 /// Most searches that wait, and most streams: beyond what memory and files allow.
 const MAX_PLACES: usize = 1_000_000;

@@ -7,7 +7,8 @@
 //! ```
 //!
 //! Whoever is about to use much memory takes so many bytes first, and gives them back by dropping what it holds. What does not fit
-//! waits ([`Memory::take`]) or is refused ([`Memory::try_take`]). The budget counts what it is told; it measures nothing.
+//! waits ([`Memory::take`]) or is refused ([`Memory::try_take`]). An eighth of the room is left to what takes up to [`SMALL_BYTES`], so that
+//! large requests cannot keep small ones from being answered. The budget counts what it is told; it measures nothing.
 
 use std::fs;
 use std::sync::Arc;
@@ -16,6 +17,9 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
 /// Memory is taken in units of this size, of which there can be 2^32.
 const UNIT_BYTES: u64 = 4096;
+
+/// Most that is small, for which an eighth of the room is kept.
+pub const SMALL_BYTES: u64 = 1 << 20;
 
 /// There is no room for so much now; or there never is, if it is more than all the room.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -65,12 +69,26 @@ impl Memory {
         self.free.available_permits() as u64 * UNIT_BYTES
     }
 
+    /// How much of that something large may take now, in bytes.
+    #[must_use]
+    pub fn free_for_large(&self) -> u64 {
+        self.free().saturating_sub(self.room / 8)
+    }
+
     /// Takes `n_bytes` if they are free.
     ///
     /// # Errors
     ///
     /// [`NoRoom`] if they are not.
     pub fn try_take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
+        self.try_take_for(n_bytes, n_bytes)
+    }
+
+    /// Takes `n_bytes` more for what will then have `n_in_all`.
+    fn try_take_for(&self, n_in_all: u64, n_bytes: u64) -> Result<Held, NoRoom> {
+        if n_in_all > SMALL_BYTES && n_bytes > self.free_for_large() {
+            return Err(self.no_room(n_bytes));
+        }
         let permit = Arc::clone(&self.free).try_acquire_many_owned(self.units(n_bytes)?);
         let permit = permit.map_err(|_| self.no_room(n_bytes))?;
         Ok(Held { memory: self.clone(), permit })
@@ -119,7 +137,7 @@ impl Held {
     /// [`NoRoom`] if it is not free; then this holds what it did before.
     pub fn grow_to(&mut self, n_bytes: u64) -> Result<(), NoRoom> {
         if n_bytes > self.n_bytes() {
-            let more = self.memory.try_take(n_bytes - self.n_bytes());
+            let more = self.memory.try_take_for(n_bytes, n_bytes - self.n_bytes());
             self.permit.merge(more.map_err(|_| self.memory.no_room(n_bytes))?.permit);
         }
         Ok(())
@@ -213,6 +231,18 @@ mod tests {
         assert_eq!((held.n_bytes(), memory.free()), (8192, MIB / 2 - 8192));
         drop((held, other));
         assert_eq!(memory.free(), MIB);
+    }
+
+    #[test]
+    fn what_is_large_leaves_an_eighth_to_what_is_small() {
+        let memory = Memory::with_room(16 * MIB);
+        assert!(memory.try_take(14 * MIB + 1).is_err());
+        let mut large = memory.try_take(14 * MIB).unwrap();
+        assert!(large.grow_to(15 * MIB).is_err() && memory.try_take(MIB + 1).is_err());
+        let small = [MIB, MIB].map(|n_bytes| memory.try_take(n_bytes).unwrap());
+        assert_eq!(memory.free(), 0);
+        drop((large, small));
+        assert_eq!((memory.free(), memory.free_for_large()), (16 * MIB, 14 * MIB));
     }
 
     #[tokio::test]

@@ -19,7 +19,7 @@ use crate::document::{Faults, Place};
 use crate::learning::{Distribution, Learner, LearnerDocument};
 use crate::memory::{self, Memory};
 use crate::model::Limits;
-use crate::service::{Etude, Name, PoolSettings, Replay, Settings};
+use crate::service::{Etude, Name, PoolSettings, Replay, Settings, TimeLimits};
 
 /// What an exported learner says it is.
 const FORMAT: &str = "etude.learner.v1";
@@ -207,8 +207,9 @@ async fn with_database<T>(
         limits: Limits::DEFAULT,
         memory: Memory::new(memory::default_max_bytes()),
         model_cache_bytes: 0,
-        pool: PoolSettings { n_threads: 1, max_waiting: 0 },
+        pool: PoolSettings { n_threads: 1, max_waiting: 0, max_long: 1 },
         session_idle_timeout: Duration::MAX,
+        time_limits: TimeLimits::DEFAULT,
     };
     let tasks = TaskTracker::new();
     let etude = Etude::open(&settings, &tasks, CancellationToken::new()).await;

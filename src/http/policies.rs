@@ -74,15 +74,16 @@ pub(super) async fn make_policies(
     request: Request,
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
-    let made = context.etude.make_policies(body, caller).await?;
+    let mut made = context.etude.make_policies(body, caller).await?;
     let (before, after) = (r#"{"items":["#, "]}");
-    let n_bytes: usize = made.iter().flatten().map(|made| made.policy.len() + 1).sum();
+    let n_bytes: usize = made.items.iter().flatten().map(|made| made.policy.len() + 1).sum();
     let mut text = String::with_capacity(before.len() + n_bytes + after.len());
     let mut separator = before;
-    for item in made {
+    // What they take is held until the answer is written.
+    for item in std::mem::take(&mut made.items) {
         text.push_str(separator);
         match item {
-            Ok(made) => text.push_str(&made.policy),
+            Ok(policy) => text.push_str(&policy.policy),
             Err(error) => {
                 let problem = ItemProblem { problem: Problem::from(error).of_request(&id) };
                 text.push_str(&serde_json::to_string(&problem).map_err(ServiceError::Write)?);

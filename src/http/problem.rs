@@ -33,6 +33,7 @@ pub(super) enum ProblemKind {
     AlreadyRewarded,
     TrialFailed,
     TooLarge,
+    BatchFull,
     UnsupportedMediaType,
     UnsupportedEncoding,
     CompressedStream,
@@ -65,6 +66,7 @@ impl ProblemKind {
             Self::Conflict => ("conflict", "The name is taken", StatusCode::CONFLICT),
             Self::AlreadyRewarded => ("already-rewarded", "The trial has a reward", StatusCode::CONFLICT),
             Self::TrialFailed => ("trial-failed", "The trial has failed", StatusCode::CONFLICT),
+            Self::BatchFull => ("batch-full", "The answer is full", StatusCode::PAYLOAD_TOO_LARGE),
             Self::TooLarge => ("too-large", "The body is too large", StatusCode::PAYLOAD_TOO_LARGE),
             Self::UnsupportedMediaType => {
                 ("unsupported-media-type", "The body must be JSON", StatusCode::UNSUPPORTED_MEDIA_TYPE)
@@ -205,11 +207,14 @@ impl From<ServiceError> for Problem {
                     pointer.map(|pointer| Fault { line: None, pointer: pointer.to_owned(), detail: detail.clone() });
                 Self { errors: fault.into_iter().collect(), ..Self::new(problem, detail) }
             }
+            ServiceError::BatchFull => Self::new(ProblemKind::BatchFull, detail),
             ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),
             ServiceError::UnknownVersion { .. } => Self::new(ProblemKind::UnknownVersion, detail),
             ServiceError::AlreadyRewarded { .. } => Self::new(ProblemKind::AlreadyRewarded, detail),
             ServiceError::TrialFailed { .. } => Self::new(ProblemKind::TrialFailed, detail),
-            ServiceError::Pool(PoolError::Busy) => Self::new(ProblemKind::Busy, detail),
+            ServiceError::Pool(PoolError::Busy) | ServiceError::NoRoom(_) | ServiceError::Compiling { .. } => {
+                Self::new(ProblemKind::Busy, detail)
+            }
             ServiceError::Store(StoreError::Locked | StoreError::Lost) => Self::new(ProblemKind::NotReady, detail),
             ServiceError::Store(StoreError::Closed) | ServiceError::Pool(PoolError::Stopped) => {
                 Self::new(ProblemKind::Stopping, detail)

@@ -86,6 +86,15 @@ impl Definition {
         }
     }
 
+    /// At most how much memory compiling it takes, in bytes: for as many states as it can have within `limits`.
+    #[must_use]
+    pub fn compiling_bytes(&self, limits: Limits) -> usize {
+        match self {
+            Self::Table(table) => table.compiling_bytes(),
+            Self::Wumpus(cave) => cave.compiling_bytes(limits),
+        }
+    }
+
     /// Writes the definition as JSON in canonical form: defaults filled in, actions of transitions by name. Reading it gives
     /// the same definition, and equal content gives equal text.
     ///

@@ -13,7 +13,7 @@
 
 use std::collections::BTreeMap;
 use std::iter::Enumerate;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use futures_util::future::try_join_all;
@@ -31,10 +31,14 @@ use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::{
     Conditions, Demonstration, HeuristicName, Mapper, ObservationDocument, Policy, Request, Stamp, StartReference,
 };
+use crate::memory::{Held, Memory};
 use crate::model::{Model, Origin};
 
 /// Most items of a batch: as large a data set as most, while an answer full of short policies stays at some ten megabytes.
 pub const MAX_BATCH_ITEMS: usize = 10_000;
+
+/// Most bytes of all policies of a batch: as many as the states of a single one may take. Items beyond that are told to be sent again.
+const MAX_ANSWER_BYTES: usize = 64 << 20;
 
 /// How long a batch keeps a thread before it lines up behind those who wait for one. Long beside the change of threads that it
 /// costs, short beside what a client notices.
@@ -50,6 +54,15 @@ const ITEM_FIELDS: [&str; 6] = ["demonstration", "weights", "lookahead", "start"
 /// Options that an item has from its batch unless it has its own; weights are shared attribute by attribute.
 const SHARED_OPTIONS: [&str; 4] = ["lookahead", "start", "heuristic", "max_expansions"];
 
+/// What became of a batch.
+#[derive(Debug)]
+pub struct MadePolicies {
+    /// For each item, in order, its policy or what is wrong with it.
+    pub items: Vec<Result<MadePolicy, ServiceError>>,
+    /// Holds the memory of the items.
+    _batch: Arc<Batch>,
+}
+
 impl Etude {
     /// Makes a policy for every item of the batch in `body` (JSON, cheap to clone), and stores them all at once. Gives for each item,
     /// in order, its policy or what is wrong with it.
@@ -61,15 +74,14 @@ impl Etude {
         self: &Arc<Self>,
         body: impl AsRef<[u8]> + Clone + Send + 'static,
         caller: Caller,
-    ) -> Result<Vec<Result<MadePolicy, ServiceError>>, ServiceError> {
-        let Caller { arrived, now, .. } = caller;
-        let place = self.pool.admit()?;
+    ) -> Result<MadePolicies, ServiceError> {
+        let place = self.pool.admit(caller.client)?;
         let sent = self.read_batch(body.clone(), &place).await?;
-        let (envelope, faults) = Envelope::read(&sent.document, &BATCH_FIELDS, "items");
+        let (envelope, faults) = self.read_envelope(&sent.document, &BATCH_FIELDS, "items");
         let Some(envelope) = envelope else { return Err(faults.into()) };
-        let deadline = envelope.deadline(arrived);
+        let deadline = self.deadline(&envelope, caller.arrived);
         let place = place.with_patience(deadline);
-        let named = self.find(&envelope, faults, &place).await?;
+        let named = self.find(&envelope, faults, &place, deadline).await?;
         let sent = if sent.is_for(&named.mapper) {
             drop(body);
             sent
@@ -77,10 +89,10 @@ impl Etude {
             // Another model was given this name meanwhile.
             SentBatch { document: parse(body, &place).await?, read: None }
         };
-        let batch = place.run(None, move |_| Ok(Batch::read(sent, envelope.model, named))).await??;
-
-        let batch = Arc::new(batch);
-        let runners = (0..self.pool.n_threads()).map(|_| async {
+        let memory = self.memory.clone();
+        let read = move |_: &mut dyn Interrupt| Ok(Batch::read(sent, envelope, named, memory));
+        let batch = Arc::new(place.run(None, read).await??);
+        let runners = (0..self.n_search_threads).map(|_| async {
             let mut made = Vec::new();
             loop {
                 let batch = Arc::clone(&batch);
@@ -97,10 +109,10 @@ impl Etude {
         drop(place);
 
         let (mut rows, mut refinements) = (Vec::new(), Vec::new());
-        let mut answer = Vec::with_capacity(made.len());
+        let mut items = Vec::with_capacity(made.len());
         for (_, searched) in made {
-            answer.push(searched.map(|Searched { policy, row, refinement }| {
-                let row = row.at(now);
+            items.push(searched.map(|Searched { policy, row, refinement }| {
+                let row = row.at(caller.now);
                 let id = row.id.clone();
                 rows.push(row);
                 refinements.extend(refinement);
@@ -114,7 +126,7 @@ impl Etude {
         if are_refined {
             self.refiner.wake();
         }
-        Ok(answer)
+        Ok(MadePolicies { items, _batch: batch })
     }
 
     /// Reads a batch, by its `place` in the pool if it is large.
@@ -124,12 +136,12 @@ impl Etude {
         place: &Admission,
     ) -> Result<SentBatch, ServiceError> {
         let etude = Arc::clone(self);
-        let is_small = body.as_ref().len() <= MAX_INLINE_BYTES;
+        let n_bytes = body.as_ref().len();
         let read = move || {
             let at_hand = |model: &str| etude.mapper_at_hand(model).map(|(_, mapper)| mapper);
             SentBatch::read(body.as_ref(), &at_hand)
         };
-        if is_small { read() } else { place.run_reading(read).await? }
+        if n_bytes <= MAX_INLINE_BYTES { read() } else { place.run_reading(n_bytes, read).await? }
     }
 }
 
@@ -162,6 +174,7 @@ impl SentBatch {
 }
 
 /// An item that waits.
+#[derive(Debug)]
 struct Item {
     document: Value,
     /// If it was read already; then the document has something else in its place.
@@ -175,6 +188,7 @@ impl Item {
 }
 
 /// A batch that was checked, but for its items.
+#[derive(Debug)]
 struct Batch {
     mapper: Arc<Mapper>,
     /// What the policies have in common.
@@ -183,6 +197,9 @@ struct Batch {
     weights: Weights,
     /// What an item has unless it has its own.
     options: Map<String, Value>,
+    memory: Memory,
+    /// What the answer takes.
+    answer: Mutex<Answer>,
     /// The items that wait, with their places in the batch.
     waiting: Mutex<Enumerate<std::vec::IntoIter<Item>>>,
 }
@@ -192,10 +209,10 @@ type Outcome = (usize, Result<Searched, ServiceError>);
 
 impl Batch {
     /// Reads all but the items against the model.
-    fn read(sent: SentBatch, model: String, named: Named) -> Result<Self, Faults> {
+    fn read(sent: SentBatch, envelope: Envelope, named: Named, memory: Memory) -> Result<Self, ServiceError> {
+        let Envelope { model, over_limits: mut faults, .. } = envelope;
         let SentBatch { mut document, read } = sent;
         let Named { learner, model_hash, mapper } = named;
-        let mut faults = Faults::default();
         let root = Place::root(&document);
         let object = root.object(&BATCH_FIELDS, &mut faults);
         let shared = object.and_then(|object| {
@@ -230,7 +247,9 @@ impl Batch {
             weights_version: learner.as_ref().map(|ready| ready.weights.version),
             ..Stamp::default()
         };
-        Ok(Self { mapper, stamp, weights, options, waiting: Mutex::new(items.into_iter().enumerate()) })
+        let answer = Mutex::new(Answer { held: memory.try_take(0)?, n_bytes: 0, is_full: false });
+        let waiting = Mutex::new(items.into_iter().enumerate());
+        Ok(Self { mapper, stamp, weights, options, memory, answer, waiting })
     }
 
     /// Follows items that wait, one after the other, until a slice is over. Nothing if none waits any more.
@@ -240,9 +259,15 @@ impl Batch {
         while slice.is_empty() || started.elapsed() < SLICE {
             let next = self.waiting.lock().unwrap_or_else(PoisonError::into_inner).next();
             let Some((n, item)) = next else { break };
-            slice.push((n, self.follow(n, item, interrupt)?));
+            let searched =
+                if self.answer().is_full { Err(ServiceError::BatchFull) } else { self.follow(n, item, interrupt)? };
+            slice.push((n, searched.and_then(|searched| self.answer().take_in(searched))));
         }
         Ok(slice)
+    }
+
+    fn answer(&self) -> MutexGuard<'_, Answer> {
+        self.answer.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Follows the item at `n`.
@@ -275,7 +300,7 @@ impl Batch {
         };
         let stamp = Stamp { id: Some(Uuid::now_v7().to_string()), ..self.stamp.clone() };
         let place = Path::Member(&path, "demonstration");
-        follow(&self.mapper, &request, (&document, &place), stamp, interrupt)
+        follow(&self.mapper, request, (&document, &place), stamp, Some(&self.memory), interrupt)
     }
 
     /// The item as a request of its own.
@@ -287,6 +312,29 @@ impl Batch {
             }
         }
         item
+    }
+}
+
+/// What the answer to a batch takes.
+#[derive(Debug)]
+struct Answer {
+    /// For the policies as they will be answered, as they will be stored, and as they are put together.
+    held: Held,
+    n_bytes: usize,
+    is_full: bool,
+}
+
+impl Answer {
+    /// Takes in a policy, if the answer has room for it.
+    fn take_in(&mut self, searched: Searched) -> Result<Searched, ServiceError> {
+        const N_COPIES: usize = 3;
+        let n_bytes = self.n_bytes + searched.policy.len();
+        self.is_full |= n_bytes > MAX_ANSWER_BYTES || self.held.grow_to((N_COPIES * n_bytes) as u64).is_err();
+        if self.is_full {
+            return Err(ServiceError::BatchFull);
+        }
+        self.n_bytes = n_bytes;
+        Ok(searched)
     }
 }
 
@@ -420,8 +468,10 @@ mod tests {
         let at_hand = |model: &str| (is_at_hand && model == "figure-4").then(|| Arc::clone(mapper));
         let sent = SentBatch::read(text.as_bytes(), &at_hand).unwrap();
         let is_read = sent.read.is_some();
+        let (envelope, _) = Envelope::read(&sent.document, &BATCH_FIELDS, "items");
+        let Some(envelope) = envelope else { return (Vec::new(), is_read) };
         let named = Named { learner: None, model_hash: "hash".to_owned(), mapper: Arc::clone(mapper) };
-        let batch = match Batch::read(sent, "figure-4".to_owned(), named) {
+        let batch = match Batch::read(sent, envelope, named, Memory::with_room(1 << 30)) {
             Ok(batch) => batch,
             Err(faults) => return (vec![Err(format!("{faults:?}"))], is_read),
         };

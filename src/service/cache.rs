@@ -1,6 +1,7 @@
 //! Models that are ready to be searched, as many as fit.
 
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 
 use quick_cache::sync::{Cache, DefaultLifecycle};
 use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
@@ -55,6 +56,12 @@ impl MapperCache {
         let options = options.build().expect("the sizes are given");
         let cache = Cache::with_options(options, SizeBytes, DefaultHashBuilder::default(), DefaultLifecycle::default());
         Self { cache, oversized: Mutex::default() }
+    }
+
+    /// Lets all models go; those that are searched stay as long as they are.
+    pub(super) fn clear(&self) {
+        self.cache.clear();
+        let _oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
     /// Puts in a model that has just been compiled.
@@ -202,6 +209,7 @@ impl Etude {
         name: &str,
         pointer: &'static str,
         place: &Admission,
+        deadline: Option<Instant>,
     ) -> Result<(String, Arc<Mapper>), ServiceError> {
         // Before anything is read: what changes meanwhile makes what was read outdated.
         let generation = self.store.models_generation();
@@ -209,7 +217,7 @@ impl Etude {
             return Ok(known);
         }
         // On the heap, as every request would carry along what only the first one for a model needs.
-        let (hash, mapper) = Box::pin(self.mapper(name, pointer, Some(place))).await?;
+        let (hash, mapper) = Box::pin(self.mapper(name, pointer, Some(place), deadline)).await?;
         let key = ModelKey { hash: hash.clone(), is_lazy: mapper.model().is_lazy() };
         self.model_names.keys.insert(name.to_owned(), (generation, key));
         Ok((hash, mapper))
@@ -219,7 +227,7 @@ impl Etude {
     pub(super) fn mapper_at_hand(&self, name: &str) -> Option<(String, Arc<Mapper>)> {
         let generation = self.store.models_generation();
         let (_, key) = self.model_names.keys.get(name).filter(|(known, _)| *known == generation)?;
-        let mapper = self.mappers.get(&key)?;
+        let mapper = self.compiler.cache.get(&key)?;
         Some((key.hash, mapper))
     }
 }

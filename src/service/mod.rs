@@ -11,6 +11,7 @@
 mod batch;
 mod cache;
 mod caller;
+mod compiler;
 mod learner_task;
 mod learners;
 mod models;
@@ -26,11 +27,12 @@ mod sessions;
 mod trials;
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::{Timestamp, Unit};
 
-pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS};
+pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS, MadePolicies};
 pub use caller::{Caller, Client};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, ModelText, OpenText, Registered};
@@ -45,10 +47,11 @@ pub use trials::TrialAnswer;
 
 use crate::document::{Faults, ParseError, Quoted};
 use crate::mapping::WriteError;
-use crate::memory::Memory;
+use crate::memory::{Memory, NoRoom};
 use crate::model::Limits;
 use crate::store::{Store, StoreError};
-use cache::{MapperCache, ModelNames};
+use cache::ModelNames;
+use compiler::Compiler;
 use models::Uploads;
 use owners::Owners;
 use refiner::Refiner;
@@ -69,6 +72,28 @@ pub struct Settings {
     pub pool: PoolSettings,
     /// What everything large takes its memory from.
     pub memory: Memory,
+    /// How long things may take.
+    pub time_limits: TimeLimits,
+}
+
+/// How long searches and compilations may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TimeLimits {
+    /// A search whose request does not say, counted from the request's arrival.
+    pub default_deadline: Duration,
+    /// A search whose request says.
+    pub max_deadline: Duration,
+    /// Compiling a model, counted while it is compiled.
+    pub compile: Duration,
+}
+
+impl TimeLimits {
+    /// Ten seconds, ten minutes, and half a minute: a model of a million states takes some three seconds.
+    pub const DEFAULT: Self = Self {
+        default_deadline: Duration::from_secs(10),
+        max_deadline: Duration::from_mins(10),
+        compile: Duration::from_secs(30),
+    };
 }
 
 /// Why the service could not do as asked.
@@ -131,6 +156,18 @@ pub enum ServiceError {
     /// The searches cannot keep up, or the service is shutting down.
     #[error(transparent)]
     Pool(#[from] PoolError),
+    /// The answer to a batch has no room for this item.
+    #[error("the answer to this batch is full; send this item again with the next one")]
+    BatchFull,
+    /// There is no memory for it now, or there never is.
+    #[error(transparent)]
+    NoRoom(#[from] NoRoom),
+    /// The deadline is over, and the model is still being compiled.
+    #[error("model {name:?} is still being compiled; try again shortly")]
+    Compiling {
+        /// The model.
+        name: String,
+    },
     /// The store failed.
     #[error(transparent)]
     Store(#[from] StoreError),
@@ -145,14 +182,16 @@ pub enum ServiceError {
 /// The application.
 #[derive(Debug)]
 pub struct Etude {
-    store: Store,
+    store: Arc<Store>,
     memory: Memory,
     pool: SearchPool,
-    mappers: MapperCache,
+    compiler: Compiler,
     model_names: ModelNames,
     refiner: Refiner,
     owners: Owners,
+    time_limits: TimeLimits,
     session_idle_timeout: Duration,
+    n_search_threads: usize,
     limits: Limits,
     uploads: Uploads,
     trial_numbers: TrialNumbers,
@@ -168,15 +207,19 @@ impl Etude {
     ///
     /// If the database cannot be opened.
     pub async fn open(settings: &Settings, tasks: &TaskTracker, abort: CancellationToken) -> Result<Self, StoreError> {
+        let store = Arc::new(Store::open(&settings.database, tasks).await?);
+        let pool = SearchPool::new(settings.pool, tasks.clone(), abort);
         Ok(Self {
-            store: Store::open(&settings.database, tasks).await?,
+            compiler: Compiler::new(Arc::clone(&store), pool.clone(), settings, tasks.clone()),
+            store,
             memory: settings.memory.clone(),
-            pool: SearchPool::new(settings.pool, tasks.clone(), abort),
-            mappers: MapperCache::new(settings.model_cache_bytes),
+            pool,
+            time_limits: settings.time_limits,
             model_names: ModelNames::new(),
             refiner: Refiner::default(),
             owners: Owners::default(),
             session_idle_timeout: settings.session_idle_timeout,
+            n_search_threads: settings.pool.n_threads.max(1),
             limits: settings.limits,
             uploads: Uploads::default(),
             trial_numbers: TrialNumbers::default(),

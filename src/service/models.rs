@@ -1,19 +1,19 @@
 //! The registry of models.
 
 use std::io::{self, BufRead};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use futures_util::future::OptionFuture;
 use serde_json::value::RawValue;
 use sha2::{Digest, Sha256};
-use tokio::sync::{Semaphore, SemaphorePermit, mpsc};
+use tokio::sync::mpsc;
 
-use super::pool::Admission;
-use super::{Caller, Etude, Name, PipeWriter, PoolError, ServiceError, as_stored, pipe};
+use super::compiler::Compiler;
+use super::pool::Places;
+use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::attribute::AttributeDocument;
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::Mapper;
-use crate::model::{ActionDocument, Definition, Format, Limits, Model, ReadError, hex};
+use crate::model::{ActionDocument, Definition, Format, Limits, ReadError, hex};
 use crate::store::{
     ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, PutModel, StoreError,
     StoredDefinition,
@@ -51,7 +51,12 @@ pub enum ModelText {
 pub type OpenText = Box<dyn FnOnce() -> io::Result<Box<dyn BufRead + Send>> + Send>;
 
 impl ModelText {
-    fn read(self, format: Format, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Definition, ReadError> {
+    pub(super) fn read(
+        self,
+        format: Format,
+        limits: Limits,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Definition, ReadError> {
         match self {
             Self::Whole(text) => Definition::parse(&text, format, limits, interrupt),
             Self::Packed(open) | Self::Arriving(open) => {
@@ -61,27 +66,39 @@ impl ModelText {
     }
 }
 
-/// Whose turn it is to send a model that is read as it comes. One at a time: each may take most of the memory that there is.
+/// Who sends models that are read as they come. A client that sends slowly keeps others from nothing but its own place.
 #[derive(Debug)]
-pub(super) struct Uploads {
-    admitted: Semaphore,
-    turn: Semaphore,
-}
+pub(super) struct Uploads(Mutex<Places>);
 
 impl Uploads {
-    /// Most that are sent or wait for their turn; further ones are refused.
-    const MAX_ADMITTED: usize = 16;
+    /// Most that are sent at the same time, each of which keeps a thread of the operating system; further ones are refused.
+    const MAX_UPLOADS: usize = 64;
 
-    async fn turn(&self) -> Result<(SemaphorePermit<'_>, SemaphorePermit<'_>), PoolError> {
-        let admitted = self.admitted.try_acquire().map_err(|_| PoolError::Busy)?;
-        let turn = self.turn.acquire().await.map_err(|_| PoolError::Stopped)?;
-        Ok((admitted, turn))
+    fn admit(&self, client: Client) -> Result<Upload<'_>, PoolError> {
+        let is_admitted = self.places().take(client);
+        if is_admitted { Ok(Upload { uploads: self, client }) } else { Err(PoolError::Busy) }
+    }
+
+    fn places(&self) -> MutexGuard<'_, Places> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Default for Uploads {
     fn default() -> Self {
-        Self { admitted: Semaphore::new(Self::MAX_ADMITTED), turn: Semaphore::new(1) }
+        Self(Mutex::new(Places::new(Self::MAX_UPLOADS)))
+    }
+}
+
+/// The right to send a model, until it is dropped.
+struct Upload<'u> {
+    uploads: &'u Uploads,
+    client: Client,
+}
+
+impl Drop for Upload<'_> {
+    fn drop(&mut self) {
+        self.uploads.places().give_back(self.client);
     }
 }
 
@@ -108,19 +125,21 @@ impl Etude {
         caller: Caller,
     ) -> Result<(Registered, ModelSummary), ServiceError> {
         let limits = self.limits;
-        // Where something is registered already, nothing is stored; what it is then depends on the hash.
+        // Where something is registered already, nothing is stored or compiled; what it is then depends on the hash.
         let existing = self.store.model_key(name.as_str()).await?;
-        let (writer, pieces) = definition_writer(existing.is_none());
+        let is_new = existing.is_none();
+        let (writer, pieces) = definition_writer(is_new);
+        let compiler = self.compiler.clone();
         let prepare = move |read: Result<Definition, ReadError>, interrupt: &mut dyn Interrupt| {
-            prepare(read?, writer, limits, interrupt)
+            prepare(read?, writer, is_new.then_some(&compiler), limits, interrupt)
         };
         let (prepared, stored) = if let ModelText::Arriving(_) = text {
-            let _turn = self.uploads.turn().await?;
+            let _place = self.uploads.admit(caller.client)?;
             let read = self.pool.run_aside(move |interrupt| Ok(text.read(format, limits, interrupt))).await?;
             let job = move |interrupt: &mut dyn Interrupt| Ok(prepare(read, interrupt));
-            tokio::join!(self.pool.run_patiently(job), self.store_pieces(pieces))
+            tokio::join!(self.pool.run_patiently(caller.client, job), self.store_pieces(pieces))
         } else {
-            let place = self.pool.admit()?;
+            let place = self.pool.admit(caller.client)?;
             let job = move |interrupt: &mut dyn Interrupt| {
                 let read = text.read(format, limits, interrupt);
                 Ok(prepare(read, interrupt))
@@ -129,7 +148,16 @@ impl Etude {
         };
         // If storing has failed, preparing has for that reason.
         let stored = stored?;
-        let Prepared { text, hash, mapper, attributes, actions } = prepared??;
+        let Prepared { text, hash, compiled } = prepared??;
+        let Some(Compiled { mapper, attributes, actions }) = compiled else {
+            // What is there is looked up once more: it may have been deleted meanwhile.
+            let existing = self.store.model(name.as_str()).await?.ok_or(PoolError::Busy)?.summary;
+            return if existing.hash == hash {
+                Ok((Registered::Already, existing))
+            } else {
+                Err(conflict(name, existing.hash))
+            };
+        };
         let model = mapper.model();
         let summary = ModelSummary {
             name: name.to_string(),
@@ -144,30 +172,17 @@ impl Etude {
             created_at: as_stored(caller.now),
         };
         let key = ModelKey { hash: summary.hash.clone(), is_lazy: model.is_lazy() };
-        let put = match (text, stored) {
-            (Some(text), _) => {
-                let definition = NewDefinition::Text(text);
-                self.store.put_model(NewModel { summary, definition }).await?
-            }
-            (None, Some(pieces)) => {
-                let definition = NewDefinition::Pieces(pieces);
-                self.store.put_model(NewModel { summary, definition }).await?
-            }
-            (None, None) => match self.store.model(name.as_str()).await? {
-                Some(existing) if existing.summary.hash == key.hash => PutModel::Unchanged(existing.summary),
-                Some(existing) => PutModel::Conflict { existing_hash: existing.summary.hash },
-                // It was deleted meanwhile.
-                None => return Err(PoolError::Busy.into()),
-            },
+        let definition = match (text, stored) {
+            (Some(text), _) => NewDefinition::Text(text),
+            (None, Some(pieces)) => NewDefinition::Pieces(pieces),
+            (None, None) => return Err(PoolError::Busy.into()),
         };
-        let (registered, summary) = match put {
+        let (registered, summary) = match self.store.put_model(NewModel { summary, definition }).await? {
             PutModel::Created(summary) => (Registered::New, summary),
             PutModel::Unchanged(summary) => (Registered::Already, summary),
-            PutModel::Conflict { existing_hash } => {
-                return Err(ServiceError::Conflict { kind: "model", name: name.to_string(), existing_hash });
-            }
+            PutModel::Conflict { existing_hash } => return Err(conflict(name, existing_hash)),
         };
-        self.mappers.insert(&key, &Arc::new(mapper));
+        self.compiler.cache.insert(&key, &Arc::new(mapper));
         Ok((registered, summary))
     }
 
@@ -227,79 +242,17 @@ impl Etude {
     pub async fn delete_model(&self, name: &Name) -> Result<(), ServiceError> {
         if self.store.delete_model(name.as_str()).await? { Ok(()) } else { Err(unknown(name.as_str(), None)) }
     }
-
-    /// The model called `name`, ready to be searched, and its hash. `pointer` is where a request names it; what must be
-    /// compiled is compiled by its `place` in the pool, if it has one.
-    pub(super) async fn mapper(
-        &self,
-        name: &str,
-        pointer: &'static str,
-        place: Option<&Admission>,
-    ) -> Result<(String, Arc<Mapper>), ServiceError> {
-        let unknown = || unknown(name, Some(pointer));
-        let key = self.store.model_key(name).await?.ok_or_else(unknown)?;
-        let (hash, is_lazy) = (key.hash.clone(), key.is_lazy);
-        let compile = async {
-            // Deleted and registered anew in between, it has another hash; then the next request finds that.
-            let row = self.store.model(name).await?.filter(|row| row.summary.hash == hash).ok_or_else(unknown)?;
-            let (text, feed) = match row.definition {
-                StoredDefinition::Text(text) => (ModelText::Whole(text.into_bytes()), None),
-                StoredDefinition::Pieces(id) => {
-                    let (to_reader, reader) = pipe();
-                    (ModelText::Packed(Box::new(|| Ok(Box::new(reader)))), Some(self.feed(id, to_reader)))
-                }
-            };
-            // What it was found to be when it was registered, whatever the limit is now.
-            let limits = if is_lazy { Limits { max_states: 0, ..Limits::NONE } } else { Limits::NONE };
-            let job = move |interrupt: &mut dyn Interrupt| {
-                let definition = text.read(Format::Json, Limits::NONE, interrupt);
-                Ok(match definition {
-                    Ok(definition) => compile(definition, limits, interrupt),
-                    Err(error) => Err(error.into()),
-                })
-            };
-            let compile = async {
-                match place {
-                    Some(place) => place.run(None, job).await,
-                    None => self.pool.run_patiently(job).await,
-                }
-            };
-            let (mapper, fed) = tokio::join!(compile, OptionFuture::from(feed));
-            match fed {
-                // It was deleted meanwhile.
-                Some(Err(ServiceError::Store(StoreError::Removed))) => return Err(unknown()),
-                Some(Err(error)) => return Err(error),
-                Some(Ok(())) | None => {}
-            }
-            let mapper = match mapper? {
-                Err(ServiceError::Pool(error)) => return Err(error.into()),
-                // What was once accepted is read again without faults.
-                mapper => mapper.map_err(|error| corrupt_definition(error.into()))?,
-            };
-            Ok::<_, ServiceError>(Arc::new(mapper))
-        };
-        let mapper = self.mappers.get_or_compile(&key, compile).await?;
-        Ok((hash, mapper))
-    }
-
-    /// Sends the pieces of a definition to their reader.
-    async fn feed(&self, id: i64, to_reader: PipeWriter<Vec<u8>>) -> Result<(), ServiceError> {
-        for seq in 0.. {
-            let Some(piece) = self.store.piece(id, seq).await? else { break };
-            if !to_reader.send(Ok(piece)).await {
-                return Ok(());
-            }
-        }
-        to_reader.end().await;
-        Ok(())
-    }
 }
 
-fn unknown(name: &str, pointer: Option<&'static str>) -> ServiceError {
+fn conflict(name: &Name, existing_hash: String) -> ServiceError {
+    ServiceError::Conflict { kind: "model", name: name.to_string(), existing_hash }
+}
+
+pub(super) fn unknown(name: &str, pointer: Option<&'static str>) -> ServiceError {
     ServiceError::Unknown { kind: "model", name: name.to_owned(), pointer }
 }
 
-fn corrupt_definition(source: Box<dyn std::error::Error + Send + Sync>) -> ServiceError {
+pub(super) fn corrupt_definition(source: Box<dyn std::error::Error + Send + Sync>) -> ServiceError {
     StoreError::Corrupt { table: "models", column: "definition", source }.into()
 }
 
@@ -319,33 +272,35 @@ struct Prepared {
     /// The canonical text, if it was not sent in pieces.
     text: Option<String>,
     hash: String,
+    /// `None` if that was not asked for.
+    compiled: Option<Compiled>,
+}
+
+struct Compiled {
     mapper: Mapper,
     attributes: Vec<AttributeDocument>,
     actions: Vec<ActionDocument>,
 }
 
-/// Compiles a model, and writes its canonical text.
+/// Writes the canonical text of a model, and compiles it if there is a compiler.
 fn prepare(
     definition: Definition,
     mut writer: DefinitionWriter,
+    compiler: Option<&Compiler>,
     limits: Limits,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Prepared, ServiceError> {
-    let model = Model::compile(&definition, limits, interrupt).map_err(|Cancelled| PoolError::Stopped)?;
     definition.write(&mut writer).map_err(|error| ServiceError::Write(serde_json::Error::io(error)))?;
     let (hash, text) = writer.finish()?;
-    drop(definition);
-    let attributes = model.schema().attributes().iter().map(AttributeDocument::from).collect();
-    let actions = model.actions().iter().map(ActionDocument::from).collect();
-    let mapper = Mapper::new(model, interrupt).map_err(|Cancelled| PoolError::Stopped)?;
-    Ok(Prepared { text, hash, mapper, attributes, actions })
-}
-
-/// Compiles a model.
-fn compile(definition: Definition, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Mapper, ServiceError> {
-    let model = Model::compile(&definition, limits, interrupt).map_err(|Cancelled| PoolError::Stopped)?;
-    drop(definition);
-    Ok(Mapper::new(model, interrupt).map_err(|Cancelled| PoolError::Stopped)?)
+    let compile = |compiler: &Compiler| -> Result<Compiled, ServiceError> {
+        let held = compiler.take(definition.compiling_bytes(limits))?;
+        let mapper = compiler.compile(definition, held, limits, interrupt)?;
+        let model = mapper.model();
+        let attributes = model.schema().attributes().iter().map(AttributeDocument::from).collect();
+        let actions = model.actions().iter().map(ActionDocument::from).collect();
+        Ok(Compiled { mapper, attributes, actions })
+    };
+    Ok(Prepared { text, hash, compiled: compiler.map(compile).transpose()? })
 }
 
 /// A writer of canonical text, and the pieces that come of it: if `is_stored` and it is longer than one.

@@ -43,7 +43,7 @@ impl Names {
             (None, false) => NonZeroU32::new(DEFAULT_LOOKAHEAD),
         };
         let learner = learner.flatten().map(str::to_owned);
-        let envelope = Envelope { model: model?.to_owned(), learner, deadline: None };
+        let envelope = Envelope { model: model?.to_owned(), learner, deadline: None, over_limits: Faults::default() };
         Some(Self { envelope, explores, lookahead })
     }
 }

@@ -17,6 +17,7 @@ use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt, time_until_finish};
 use crate::mapping::{Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
+use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
 
@@ -44,11 +45,9 @@ impl Etude {
         body: impl AsRef<[u8]> + Send + 'static,
         caller: Caller,
     ) -> Result<MadePolicy, ServiceError> {
-        let Caller { arrived, now, .. } = caller;
-        let place = self.pool.admit()?;
         let id = Uuid::now_v7().to_string();
         let quick = if body.as_ref().len() <= MAX_INLINE_BYTES {
-            self.search_quickly(body.as_ref(), &id, &place, arrived).await?
+            self.search_quickly(body.as_ref(), &id, caller.arrived).await?
         } else {
             None
         };
@@ -58,13 +57,11 @@ impl Etude {
                 drop(body);
                 searched
             }
-            None => self.search_at_length(body, &id, &place, arrived).await?,
+            None => self.search_at_length(body, &id, caller).await?,
         };
         let Searched { policy, row, refinement } = searched;
-        // The disk is no concern of those who wait for a thread.
-        drop(place);
         let is_refined = refinement.is_some();
-        self.store.add_policies(vec![row.at(now)], refinement.into_iter().collect()).await?;
+        self.store.add_policies(vec![row.at(caller.now)], refinement.into_iter().collect()).await?;
         if is_refined {
             self.refiner.wake();
         }
@@ -73,21 +70,25 @@ impl Etude {
 
     /// Searches for the policy of a request that is well-formed in all its parts, and for which [`is_quick`]. Nothing for others, of
     /// which it takes a closer look to tell what is wrong.
-    async fn search_quickly(
-        &self,
-        body: &[u8],
-        id: &str,
-        place: &Admission,
-        arrived: Instant,
-    ) -> Result<Option<Searched>, ServiceError> {
+    async fn search_quickly(&self, body: &[u8], id: &str, arrived: Instant) -> Result<Option<Searched>, ServiceError> {
         let at_hand = |model: &str| self.mapper_at_hand(model).map(|(_, mapper)| mapper);
         let Some(outline) = Outline::read(body, &at_hand) else { return Ok(None) };
-        let (Some(envelope), faults) = Envelope::read(&outline.document, &Request::FIELDS, "demonstration") else {
+        let (Some(envelope), faults) = self.read_envelope(&outline.document, &Request::FIELDS, "demonstration") else {
             return Ok(None);
         };
-        let deadline = envelope.deadline(arrived);
-        let place = place.clone().with_patience(deadline);
-        let Ok(named) = self.find(&envelope, faults, &place).await else { return Ok(None) };
+        let is_faultless = faults.is_empty() && envelope.over_limits.is_empty();
+        let Some((model_hash, mapper)) = self.mapper_at_hand(&envelope.model).filter(|_| is_faultless) else {
+            return Ok(None);
+        };
+        let learner = match &envelope.learner {
+            None => None,
+            Some(learner) => match self.ready(learner, None).await {
+                Ok(ready) => Some(ready),
+                Err(_) => return Ok(None),
+            },
+        };
+        let named = Named { learner, model_hash, mapper };
+        let deadline = self.deadline(&envelope, arrived);
         let model = named.mapper.model();
         let read = outline.of(&named.mapper);
         let read = read.filter(|(document, demonstration)| is_quick(model, document, demonstration.len()));
@@ -102,10 +103,10 @@ impl Etude {
                 Request::read_beside(Some(demonstration), model, &object, base, &mut faults)
             });
             let Ok(request) = faults.check(request) else { return Ok(Ok(None)) };
-            let searched = follow(mapper, &request, (&document, &DEMONSTRATION), stamp, interrupt)?;
+            let searched = follow(mapper, request, (&document, &DEMONSTRATION), stamp, None, interrupt)?;
             Ok(searched.map(Some))
         };
-        place.run_here(deadline, job).await?
+        self.pool.run_here(deadline, job)?
     }
 
     /// Searches for the policy of any request, and tells what is wrong with it.
@@ -113,26 +114,47 @@ impl Etude {
         &self,
         body: impl AsRef<[u8]> + Send + 'static,
         id: &str,
-        place: &Admission,
-        arrived: Instant,
+        caller: Caller,
     ) -> Result<Searched, ServiceError> {
+        let place = self.pool.admit_when_needed(caller.client);
         let is_small = body.as_ref().len() <= MAX_INLINE_BYTES;
-        let document = parse(body, place).await?;
-        let (envelope, faults) = Envelope::read(&document, &Request::FIELDS, "demonstration");
+        let document = parse(body, &place).await?;
+        let (envelope, faults) = self.read_envelope(&document, &Request::FIELDS, "demonstration");
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
-        let deadline = envelope.deadline(arrived);
-        let place = place.clone().with_patience(deadline);
-        let named = self.find(&envelope, faults, &place).await?;
+        let deadline = self.deadline(&envelope, caller.arrived);
+        let place = place.with_patience(deadline);
+        let named = self.find(&envelope, faults, &place, deadline).await?;
         let stamp = envelope.stamp(id, &named);
         let Named { learner, mapper, .. } = named;
+        let memory = self.memory.clone();
         let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
         let is_quick = is_small && is_quick(mapper.model(), &document, n_observations);
         let job = move |interrupt: &mut dyn Interrupt| {
             let base = |faults: &mut Faults| base_weights(mapper.model(), learner.as_ref(), faults);
-            search(&mapper, &document, &Request::FIELDS, base, stamp, interrupt)
+            search(&mapper, (&document, &Request::FIELDS, envelope.over_limits), base, stamp, &memory, interrupt)
         };
-        if is_quick { place.run_here(deadline, job).await? } else { place.run(deadline, job).await? }
+        if is_quick { self.pool.run_here(deadline, job)? } else { place.run(deadline, job).await? }
+    }
+
+    /// Reads the envelope of a request, whose deadline must be within the limit.
+    pub(super) fn read_envelope(&self, document: &Value, fields: &[&str], about: &str) -> (Option<Envelope>, Faults) {
+        let (mut envelope, faults) = Envelope::read(document, fields, about);
+        let max_deadline = self.time_limits.max_deadline;
+        if let Some(envelope) = &mut envelope
+            && envelope.deadline.is_some_and(|deadline| deadline > max_deadline)
+        {
+            let most = max_deadline.as_millis();
+            let detail = format!("expected at most {most} ms, the limit of this service (ETUDE_MAX_DEADLINE)");
+            envelope.over_limits = Faults::one("/deadline_ms", detail);
+        }
+        (envelope, faults)
+    }
+
+    /// When the search for a request that came at `arrived` is to finish.
+    pub(super) fn deadline(&self, envelope: &Envelope, arrived: Instant) -> Option<Instant> {
+        let deadline = envelope.deadline.unwrap_or(self.time_limits.default_deadline);
+        arrived.checked_add(time_until_finish(deadline))
     }
 
     /// Finds what the request names. `faults` are those found so far; what is unknown is one more, if there are any others.
@@ -141,12 +163,13 @@ impl Etude {
         envelope: &Envelope,
         mut faults: Faults,
         place: &Admission,
+        deadline: Option<Instant>,
     ) -> Result<Named, ServiceError> {
         let learner = match &envelope.learner {
             Some(learner) => self.ready(learner, Some("/learner")).await.map(Some),
             None => Ok(None),
         };
-        let mapper = self.known_mapper(&envelope.model, "/model", place).await;
+        let mapper = self.known_mapper(&envelope.model, "/model", place, deadline).await;
         let errors = match (learner, mapper) {
             (Ok(learner), Ok((model_hash, mapper))) => return Ok(Named { learner, model_hash, mapper }),
             (Err(error), Ok(_)) | (Ok(_), Err(error)) if faults.is_empty() => return Err(error),
@@ -193,7 +216,7 @@ pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admis
     let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
         document::parse(body.as_ref())
     } else {
-        place.run_reading(move || document::parse(body.as_ref())).await?
+        place.run_reading(body.as_ref().len(), move || document::parse(body.as_ref())).await?
     };
     Ok(document?)
 }
@@ -203,6 +226,8 @@ pub(super) struct Envelope {
     pub(super) model: String,
     pub(super) learner: Option<String>,
     pub(super) deadline: Option<Duration>,
+    /// What is wrong with the request that only the service's settings tell.
+    pub(super) over_limits: Faults,
 }
 
 /// What a request names.
@@ -229,13 +254,9 @@ impl Envelope {
             model: model.to_owned(),
             learner: learner.map(str::to_owned),
             deadline: options.and_then(|options| options.deadline),
+            over_limits: Faults::default(),
         });
         (envelope, faults)
-    }
-
-    /// When the search for a request that came at `arrived` is to finish.
-    pub(super) fn deadline(&self, arrived: Instant) -> Option<Instant> {
-        self.deadline.and_then(|deadline| arrived.checked_add(time_until_finish(deadline)))
     }
 
     /// What the policy `id` is stamped with.
@@ -258,7 +279,7 @@ const MAX_INLINE_WORK: usize = 16_384;
 /// Whether a request with a small body is answered sooner than another thread would have taken it over. Of what may be in a
 /// request, a finite lookahead and the paper's heuristic can take far longer than the size of the problem tells; of a world that is
 /// searched lazily, nobody knows the size.
-fn is_quick(model: &Model, document: &Value, n_observations: usize) -> bool {
+pub(super) fn is_quick(model: &Model, document: &Value, n_observations: usize) -> bool {
     let size = model.graph().n_states() + model.graph().n_transitions();
     !model.is_lazy()
         && document["lookahead"].is_null()
@@ -309,31 +330,36 @@ pub(super) fn write_policy(
     Ok((answer, PolicyText { id: stamp.id.unwrap_or_default(), summary, steps }))
 }
 
-/// Reads the request against its model, with weights from `base` where it names none, searches, and writes the policy.
+/// Reads the request against its model, given its fields and the faults that were found before, with weights from `base` where it names none, searches, and writes the policy.
 pub(super) fn search(
     mapper: &Arc<Mapper>,
-    document: &Value,
-    fields: &[&str],
+    (document, fields, faults): (&Value, &[&str], Faults),
     base: impl FnOnce(&mut Faults) -> Option<Weights>,
     stamp: Stamp,
+    memory: &Memory,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
-    match read_request(mapper.model(), document, fields, base) {
-        Ok(request) => follow(mapper, &request, (document, &DEMONSTRATION), stamp, interrupt),
+    match read_request(mapper.model(), document, fields, faults, base) {
+        Ok(request) => follow(mapper, request, (document, &DEMONSTRATION), stamp, Some(memory), interrupt),
         Err(faults) => Ok(Err(faults.into())),
     }
 }
 
-/// Searches, and writes the policy, unless that is too large. The request was read from the document, its demonstration from the place
-/// there that a fault would name.
+/// Searches with what it needs of `memory` (nothing is counted for a search that is quick), and writes the policy, unless that is too
+/// large. The request was read from the document, its demonstration from the place there that a fault would name.
 pub(super) fn follow(
     mapper: &Arc<Mapper>,
-    request: &Request<'_>,
+    mut request: Request<'_>,
     (document, place): (&Value, &Path<'_>),
     stamp: Stamp,
+    memory: Option<&Memory>,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
     let started = Instant::now();
+    let _held = match memory.map(|memory| take_for_search(mapper, &mut request, memory)).transpose() {
+        Ok(held) => held,
+        Err(no_room) => return Ok(Err(no_room.into())),
+    };
     let mapping = request.solve(mapper, interrupt)?;
     let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
@@ -360,6 +386,20 @@ pub(super) fn follow(
     Ok(written.map(|(policy, row)| Searched { policy, row, refinement }))
 }
 
+/// Takes the memory that a search may need, and lets the search use no more than that. Where there is not so much, it gets half of what
+/// is left, so that others find something too.
+///
+/// # Errors
+///
+/// [`NoRoom`] if hardly anything is left.
+pub(super) fn take_for_search(mapper: &Mapper, request: &mut Request<'_>, memory: &Memory) -> Result<Held, NoRoom> {
+    let wanted = mapper.search_bytes(&request.problem, request.settings) as u64;
+    // With less than what is small, a search would hardly begin.
+    let held = memory.try_take(wanted.min((memory.free_for_large() / 2).max(SMALL_BYTES)))?;
+    request.settings.budget.max_bytes = usize::try_from(held.n_bytes()).unwrap_or(usize::MAX);
+    Ok(held)
+}
+
 /// The weights from which a request starts: the means of its learner, or the model's own.
 pub(super) fn base_weights(model: &Model, learner: Option<&Ready>, faults: &mut Faults) -> Option<Weights> {
     let schema = model.schema();
@@ -373,9 +413,9 @@ fn read_request<'m>(
     model: &'m Model,
     document: &Value,
     fields: &[&str],
+    mut faults: Faults,
     base: impl FnOnce(&mut Faults) -> Option<Weights>,
 ) -> Result<Request<'m>, Faults> {
-    let mut faults = Faults::default();
     let root = Place::root(document);
     let object = root.object(fields, &mut faults);
     let request = object.and_then(|object| Request::read_over(model, &object, base, &mut faults));
@@ -384,7 +424,7 @@ fn read_request<'m>(
 
 /// Reads a request that names all weights.
 pub(super) fn read_weighted_request<'m>(model: &'m Model, document: &Value) -> Result<Request<'m>, Faults> {
-    read_request(model, document, &Request::FIELDS, |_| Some(model.schema().weights()))
+    read_request(model, document, &Request::FIELDS, Faults::default(), |_| Some(model.schema().weights()))
 }
 
 /// Measures and logs what a search gave: in detail, as the policy says as much, and each request has a line of its own.

@@ -18,11 +18,12 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::policies::{PolicyText, as_micros, read_weighted_request, report, write_policy};
+use super::policies::{PolicyText, as_micros, read_weighted_request, report, take_for_search, write_policy};
 use super::{Etude, PoolError, ServiceError};
 use crate::document;
-use crate::interrupt::{Cancelled, Interrupt};
+use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::mapping::{Mapper, Policy, Settings, Stamp, Status};
+use crate::memory::Memory;
 use crate::store::{NewRefinement, RefinementEnd, StoreError};
 
 /// The first pause after a refinement that did not come to its end.
@@ -130,7 +131,7 @@ impl Etude {
         let NewRefinement { policy_id, model_hash, request } = refinement;
         let document = document::parse(request.as_bytes())?;
         let model = document["model"].as_str().unwrap_or_default().to_owned();
-        let (hash, mapper) = self.mapper(&model, "/model", None).await?;
+        let (hash, mapper) = self.mapper(&model, "/model", None, None).await?;
         if hash != model_hash {
             // Another one is there under its name.
             return Err(ServiceError::Unknown { kind: "model", name: model, pointer: None });
@@ -139,7 +140,12 @@ impl Etude {
         let id = Uuid::now_v7().to_string();
         let stamp = Stamp { id: Some(id), model, model_hash, refines: Some(policy_id), ..Stamp::default() };
         let local_cost = local.cost.total;
-        let job = move |interrupt: &mut dyn Interrupt| optimum(&mapper, &document, local_cost, stamp, interrupt);
+        let (memory, limit) = (self.memory.clone(), self.time_limits.max_deadline);
+        let job = move |interrupt: &mut dyn Interrupt| {
+            let began = Instant::now();
+            let mut limited = || if began.elapsed() < limit { interrupt.poll() } else { Signal::Finish };
+            optimum(&mapper, &document, local_cost, stamp, &memory, &mut limited)
+        };
         self.pool.run_to_spare(job).await?
     }
 }
@@ -148,6 +154,7 @@ impl Etude {
 fn is_passing(error: &ServiceError) -> bool {
     match error {
         ServiceError::Pool(error) => *error != PoolError::Panicked,
+        ServiceError::NoRoom(_) => true,
         ServiceError::Store(error) => !matches!(error, StoreError::Corrupt { .. }),
         _ => false,
     }
@@ -160,11 +167,16 @@ fn optimum(
     document: &serde_json::Value,
     local_cost: f64,
     stamp: Stamp,
+    memory: &Memory,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Option<PolicyText>, ServiceError>, Cancelled> {
-    let request = match read_weighted_request(mapper.model(), document) {
+    let mut request = match read_weighted_request(mapper.model(), document) {
         Ok(request) => request,
         Err(faults) => return Ok(Err(faults.into())),
+    };
+    let _held = match take_for_search(mapper, &mut request, memory) {
+        Ok(held) => held,
+        Err(no_room) => return Ok(Err(no_room.into())),
     };
     let started = Instant::now();
     let settings = Settings { upper_bound: Some(local_cost), ..request.settings };
@@ -183,10 +195,9 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::interrupt::{Signal, Uninterrupted};
-    use crate::memory::Memory;
+    use crate::interrupt::Uninterrupted;
     use crate::model::{Format, Limits};
-    use crate::service::{Caller, Client, ModelText, Name, PoolSettings};
+    use crate::service::{Caller, Client, ModelText, Name, PoolSettings, TimeLimits};
     use crate::store::NewPolicy;
 
     const NOW: Timestamp = Timestamp::UNIX_EPOCH;
@@ -202,7 +213,8 @@ mod tests {
             memory: Memory::with_room(1 << 30),
             model_cache_bytes: 1 << 20,
             session_idle_timeout: Duration::MAX,
-            pool: PoolSettings { n_threads: 1, max_waiting: 1 },
+            time_limits: TimeLimits::DEFAULT,
+            pool: PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
         };
         let etude = Etude::open(&settings, &TaskTracker::new(), CancellationToken::new()).await.unwrap();
         let world = ModelText::Whole(br#"{"dynamics": {"kind": "wumpus", "width": 4, "height": 4}}"#.to_vec());
@@ -227,7 +239,7 @@ mod tests {
     async fn what_can_never_be_refined_is_dropped_and_does_not_hold_up_the_others() {
         let directory = tempfile::tempdir().unwrap();
         let etude = etude(directory.path()).await;
-        let (hash, _) = etude.mapper("world", "/model", None).await.unwrap();
+        let (hash, _) = etude.mapper("world", "/model", None, None).await.unwrap();
         for (id, policy, request) in [
             ("unreadable", "{}", request().to_string()),
             ("garbled", "{}", "{".to_owned()),
@@ -254,7 +266,7 @@ mod tests {
         let etude = etude(directory.path()).await;
         let id = made(&etude, &request()).await;
         let mut after = 0;
-        let mut running = Box::pin(etude.pool.run_patiently(|interrupt| {
+        let mut running = Box::pin(etude.pool.run_patiently(Client::LOCAL, |interrupt| {
             while interrupt.poll() != Signal::Cancel {
                 std::thread::yield_now();
             }
@@ -282,9 +294,9 @@ mod tests {
         assert_eq!(read(&etude, &refined_by).await["status"], "optimal");
 
         // What is better, but not proven to be the best, is not it.
-        let (_, mapper) = etude.mapper("world", "/model", None).await.unwrap();
+        let (_, mapper) = etude.mapper("world", "/model", None, None).await.unwrap();
         (request["heuristic"], request["lookahead"]) = (Value::Null, Value::Null);
-        let refined = optimum(&mapper, &request, 1e9, Stamp::default(), &mut Uninterrupted);
+        let refined = optimum(&mapper, &request, 1e9, Stamp::default(), &etude.memory, &mut Uninterrupted);
         assert!(refined.unwrap().unwrap().is_none());
     }
 }

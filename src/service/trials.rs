@@ -10,7 +10,7 @@ use serde_json::value::RawValue;
 use uuid::Uuid;
 
 use super::learners::{Ready, unknown};
-use super::policies::{self, Envelope, Named, Searched};
+use super::policies::{self, Named, Searched};
 use super::{Caller, Etude, Name, ServiceError, as_stored};
 use crate::attribute::{Schema, Weights};
 use crate::document::{Faults, Path, Place, Range};
@@ -47,11 +47,14 @@ impl Etude {
         caller: Caller,
     ) -> Result<TrialAnswer, ServiceError> {
         let Ready { sequence, name, learner, weights } = self.ready(name.as_str(), None).await?;
-        let place = self.pool.admit()?;
+        let place = self.pool.admit_when_needed(caller.client);
+        let is_small = body.as_ref().len() <= policies::MAX_INLINE_BYTES;
         let document = policies::parse(body, &place).await?;
-        let (envelope, faults) = Envelope::read(&document, &TRIAL_FIELDS, "demonstration");
+        let (envelope, faults) = self.read_envelope(&document, &TRIAL_FIELDS, "demonstration");
         let Some(envelope) = envelope else { return Err(faults.into()) };
-        let Named { model_hash, mapper, .. } = self.find(&envelope, faults, &place).await?;
+        let deadline = self.deadline(&envelope, caller.arrived);
+        let place = place.with_patience(deadline);
+        let Named { model_hash, mapper, .. } = self.find(&envelope, faults, &place, deadline).await?;
 
         let numbers = self.trial_numbers.of(sequence, &self.store).await?;
         let id = Uuid::now_v7().to_string();
@@ -65,6 +68,9 @@ impl Etude {
             ..Stamp::default()
         };
         let lease_s = learner.lease_s();
+        let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
+        let is_quick = is_small && policies::is_quick(mapper.model(), &document, n_observations);
+        let memory = self.memory.clone();
         let job = move |interrupt: &mut dyn Interrupt| {
             let mut drawn = None;
             let base = |faults: &mut Faults| {
@@ -82,10 +88,18 @@ impl Etude {
                 drawn = Some((number, policies::write(&learner.by_attribute(weights))));
                 all
             };
-            let searched = policies::search(&mapper, &document, &TRIAL_FIELDS, base, stamp, interrupt)?;
+            let searched = policies::search(
+                &mapper,
+                (&document, &TRIAL_FIELDS, Faults::default()),
+                base,
+                stamp,
+                &memory,
+                interrupt,
+            )?;
             Ok(searched.map(|searched| (searched, drawn)))
         };
-        let (Searched { policy, row, refinement }, drawn) = place.run(None, job).await??;
+        let made = if is_quick { self.pool.run_here(deadline, job)? } else { place.run(deadline, job).await? };
+        let (Searched { policy, row, refinement }, drawn) = made?;
         drop(place);
         let (number, weights) = drawn.ok_or(StoreError::Closed)?;
         let weights = weights?;

@@ -397,9 +397,12 @@ fn ends(error: &SessionError) -> Over {
         SessionError::Service(ServiceError::Pool(PoolError::Stopped) | ServiceError::Store(StoreError::Closed)) => {
             Over::because(Closed::GoingAway, StreamProblem::new("stopping", detail))
         }
-        SessionError::Service(ServiceError::Pool(PoolError::Busy) | ServiceError::Store(StoreError::Locked)) => {
-            Over::because(Closed::Overloaded, StreamProblem::new("overloaded", detail))
-        }
+        SessionError::Service(
+            ServiceError::Pool(PoolError::Busy)
+            | ServiceError::NoRoom(_)
+            | ServiceError::Compiling { .. }
+            | ServiceError::Store(StoreError::Locked),
+        ) => Over::because(Closed::Overloaded, StreamProblem::new("overloaded", detail)),
         SessionError::Service(_) => {
             tracing::error!(error = error as &dyn Error, "a stream failed");
             let problem = StreamProblem::new("internal", "an internal error was logged; resume the session");

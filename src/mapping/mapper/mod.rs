@@ -2,6 +2,7 @@
 
 mod escalation;
 
+use std::any::Any;
 use std::iter::repeat_n;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, ThreadId};
@@ -118,6 +119,9 @@ pub struct Mapper {
     /// last, whose processor may still have it in its cache.
     buffers: Mutex<Vec<(ThreadId, Box<Buffers>)>>,
     patience: Patience,
+    /// See [`Self::keeping`].
+    #[expect(dead_code, reason = "it is kept to be dropped")]
+    kept: Option<Box<dyn Any + Send + Sync>>,
 }
 
 /// Buffers of a search, kept to be used again.
@@ -144,7 +148,14 @@ impl Mapper {
     /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
     pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
         let projections = Projections::new(&model, interrupt)?;
-        Ok(Self { model: Arc::new(model), projections, buffers: Mutex::default(), patience: Patience::DEFAULT })
+        let (model, buffers) = (Arc::new(model), Mutex::default());
+        Ok(Self { model, projections, buffers, patience: Patience::DEFAULT, kept: None })
+    }
+
+    /// The same mapper, which keeps `token` for as long as it lives: what its memory is counted by, for whoever counts that.
+    #[must_use]
+    pub fn keeping(self, token: impl Any + Send + Sync) -> Self {
+        Self { kept: Some(Box::new(token)), ..self }
     }
 
     /// The model.
@@ -161,6 +172,15 @@ impl Mapper {
     #[must_use]
     pub fn size_bytes(&self) -> usize {
         self.model.size_bytes() + self.projections.size_bytes()
+    }
+
+    /// At most how much memory a search for a mapping of `problem` takes, in bytes.
+    #[must_use]
+    pub fn search_bytes(&self, problem: &Problem<'_>, settings: Settings) -> usize {
+        const NODE_BYTES: usize = 64;
+        let n_states = if self.model.is_lazy() { usize::MAX } else { self.model.states().len() as usize };
+        let n_bytes = n_states.saturating_mul(problem.demonstration.len()).saturating_mul(NODE_BYTES);
+        n_bytes.min(settings.budget.max_bytes)
     }
 
     /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the

@@ -75,6 +75,13 @@ impl Table {
         }
     }
 
+    /// The states are shared; transitions are sorted into another list, and back and forth by what is projected.
+    pub(super) fn compiling_bytes(&self) -> usize {
+        const TRANSITION_BYTES: usize = 24;
+        const STATE_BYTES: usize = 16;
+        self.states.size_bytes() + self.states.len() as usize * STATE_BYTES + self.edges.len() * TRANSITION_BYTES
+    }
+
     pub(super) fn schema(&self) -> &Schema {
         &self.schema
     }

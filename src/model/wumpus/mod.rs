@@ -18,7 +18,7 @@ use utoipa::ToSchema;
 pub use reading::{CellDocument, PoseDocument, WumpusDocument};
 
 use super::explored::Explored;
-use super::{Action, Graph, Limits, Model, Space, Start, StateIdx, States};
+use super::{Action, Graph, Limits, Model, Space, Start, StateIdx, States, Transition};
 use crate::attribute::{Attribute, Cycle, Kind, Labels, Schema, Value};
 use crate::interrupt::{Cancelled, Interrupt, Meter};
 
@@ -305,6 +305,20 @@ impl Cave {
         }
         let (states, graph) = explored.into_parts();
         Ok(self.model(states, graph, None))
+    }
+
+    /// See [`Definition::compiling_bytes`](super::Definition::compiling_bytes).
+    pub(super) fn compiling_bytes(&self, limits: Limits) -> usize {
+        /// Of a state: itself, its number, and six ways out of it, all of this twice.
+        const STATE_BYTES: usize = 2 * (2 * size_of::<(CaveState, StateIdx)>() + 6 * size_of::<Transition>());
+        let n_bits = u32::try_from(self.wumpi.len() + self.gold.len()).unwrap_or(u32::MAX);
+        let n_arrows = usize::from(self.arrows) + 1;
+        // Inside and outside.
+        let n_poses = self.is_pit.len() * 4 * 2;
+        let n_states =
+            1_usize.checked_shl(n_bits).unwrap_or(usize::MAX).saturating_mul(n_poses).saturating_mul(n_arrows);
+        let n_states = n_states.min(limits.max_states.saturating_add(1));
+        n_states.saturating_mul(STATE_BYTES + 4 * self.schema().len())
     }
 
     /// The model of which nothing but the start is known.

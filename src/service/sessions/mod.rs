@@ -99,21 +99,21 @@ pub struct Resumed {
 }
 
 impl Etude {
-    /// Opens a session as `request` says: an object with the fields [`Session::OPEN_FIELDS`]. Where as much waits to be searched
-    /// as may, it is refused; once it is open, it waits for its turn.
+    /// Opens a session as `request` says: an object with the fields [`Session::OPEN_FIELDS`].
     ///
     /// # Errors
     ///
     /// If the request has faults or names what is unknown, or the service cannot do it now.
     pub async fn open_session(&self, request: &Value, caller: Caller) -> Result<Session, SessionError> {
         let now = caller.now;
-        let place = self.pool.admit()?;
+        let place = self.pool.admit_when_needed(caller.client);
         let mut faults = Faults::default();
         let object = Place::root(request).object(&Session::OPEN_FIELDS, &mut faults);
         let names = object.as_ref().and_then(|object| Names::read(object, &mut faults));
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(Names { envelope, explores, lookahead }) = names else { return Err(faults.into()) };
-        let Named { learner, model_hash, mapper } = self.find(&envelope, faults.clone(), &place).await?;
+        let deadline = self.deadline(&envelope, caller.arrived);
+        let Named { learner, model_hash, mapper } = self.find(&envelope, faults.clone(), &place, deadline).await?;
         drop(place);
         let opening =
             object.as_ref().and_then(|object| Opening::read(&mapper, learner.as_ref(), lookahead, object, &mut faults));
@@ -167,6 +167,7 @@ impl Etude {
             n_received: 0,
             n_steps: 0,
             online,
+            client: caller.client,
             ownership,
         })
     }
@@ -195,7 +196,7 @@ impl Etude {
         if row.status == SessionStatus::Expired {
             return Err(SessionError::NotOpen);
         }
-        let (hash, mapper) = self.mapper(&row.model, "/model", None).await?;
+        let (hash, mapper) = self.mapper(&row.model, "/model", None, None).await?;
         // Registered anew, the same world may have become too large to be known in full.
         if hash != row.model_hash || mapper.model().is_lazy() {
             let name = format!("{} with hash {}", row.model, row.model_hash);
@@ -215,6 +216,7 @@ impl Etude {
             n_steps: 0,
             online: Some(OnlineMapping::new(&mapper, weights, row.start, lookahead)),
             mapper,
+            client: caller.client,
             ownership,
         };
         let texts = self.store.observations(id).await?;

@@ -17,7 +17,7 @@ use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy
 use crate::model::Origin;
 use crate::service::owners::Ownership;
 use crate::service::policies::{PolicyText, as_micros, report, write_policy};
-use crate::service::{Etude, PoolError, ServiceError};
+use crate::service::{Client, Etude, PoolError, ServiceError};
 use crate::store::{AcceptedReward, NewObservations, NewRefinement, SessionEnd, TrialRow};
 
 /// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
@@ -39,6 +39,8 @@ pub struct Session {
     pub(super) n_steps: usize,
     /// `None` once the session has ended.
     pub(super) online: Option<OnlineMapping>,
+    /// Who drives it.
+    pub(super) client: Client,
     pub(super) ownership: Ownership,
 }
 
@@ -241,7 +243,7 @@ impl Session {
         let (online, steps) = if is_inline {
             job(&mut Uninterrupted).map_err(|_| PoolError::Stopped)?
         } else {
-            etude.pool.run_patiently(job).await?
+            etude.pool.run_patiently(self.client, job).await?
         };
         self.online = Some(online);
         self.n_steps += steps.len();
@@ -280,7 +282,7 @@ impl Session {
             ..Stamp::default()
         };
         let job = move |_: &mut dyn Interrupt| Ok(conclude(online, &mapper, &texts, weights, start, stamp));
-        let (steps, policy, row, refinement) = etude.pool.run_patiently(job).await??;
+        let (steps, policy, row, refinement) = etude.pool.run_patiently(self.client, job).await??;
         let is_refined = refinement.is_some();
         let end = SessionEnd { session_id: self.id.clone(), policy: row.at(now), refinement };
         if !etude.store.end_session(end).await? {

@@ -1,0 +1,219 @@
+//! Models made ready to be searched: read from the store, compiled once, however many ask for them.
+//!
+//! What was begun is finished, also if nobody waits for it any more: whoever asks again finds it.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use futures_util::future::OptionFuture;
+use tokio_util::task::TaskTracker;
+use tracing::Instrument;
+
+use super::cache::MapperCache;
+use super::models::{ModelText, corrupt_definition, unknown};
+use super::pool::Admission;
+use super::{Client, Etude, PipeWriter, PoolError, SearchPool, ServiceError, Settings, pipe};
+use crate::document::Faults;
+use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::mapping::Mapper;
+use crate::memory::{Held, Memory, NoRoom};
+use crate::model::{Definition, Format, Limits, Model};
+use crate::store::{ModelKey, Store, StoreError, StoredDefinition};
+
+/// Makes models ready, and keeps as many as fit.
+#[derive(Clone, Debug)]
+pub(super) struct Compiler {
+    store: Arc<Store>,
+    pool: SearchPool,
+    pub(super) cache: Arc<MapperCache>,
+    memory: Memory,
+    max_time: Duration,
+    tasks: TaskTracker,
+}
+
+impl Compiler {
+    pub(super) fn new(store: Arc<Store>, pool: SearchPool, settings: &Settings, tasks: TaskTracker) -> Self {
+        Self {
+            store,
+            pool,
+            cache: Arc::new(MapperCache::new(settings.model_cache_bytes)),
+            memory: settings.memory.clone(),
+            max_time: settings.time_limits.compile,
+            tasks,
+        }
+    }
+
+    /// Takes so much memory, in place of models that are kept if need be.
+    ///
+    /// # Errors
+    ///
+    /// [`NoRoom`] if there is not so much.
+    pub(super) fn take(&self, n_bytes: usize) -> Result<Held, NoRoom> {
+        let n_bytes = n_bytes as u64;
+        self.memory.try_take(n_bytes).or_else(|_| {
+            self.cache.clear();
+            self.memory.try_take(n_bytes)
+        })
+    }
+
+    /// Compiles `definition`, for which `held` was taken, and takes what the model needs from then on.
+    ///
+    /// # Errors
+    ///
+    /// If the service ends, it takes too long, or there is no memory for it.
+    pub(super) fn compile(
+        &self,
+        definition: Definition,
+        mut held: Held,
+        limits: Limits,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapper, ServiceError> {
+        let mut limited = LimitedTime { inner: interrupt, left: self.max_time, last: Instant::now(), is_over: false };
+        let compiled = Model::compile(&definition, limits, &mut limited).and_then(|model| {
+            drop(definition);
+            Mapper::new(model, &mut limited)
+        });
+        let mapper = match compiled {
+            Ok(mapper) => mapper,
+            Err(Cancelled) if limited.is_over => {
+                let detail = format!(
+                    "compiling it takes longer than {} s, the limit of this service (ETUDE_MAX_COMPILE_TIME)",
+                    self.max_time.as_secs_f64()
+                );
+                return Err(Faults::one("/dynamics", detail).into());
+            }
+            Err(Cancelled) => return Err(PoolError::Stopped.into()),
+        };
+        let n_bytes = mapper.size_bytes() as u64;
+        held.shrink_to(n_bytes);
+        held.grow_to(n_bytes)?;
+        Ok(mapper.keeping(held))
+    }
+
+    /// The model with this name and key, ready to be searched; compiled by its `place` in the pool, if it has one.
+    async fn ready(
+        self,
+        name: String,
+        key: ModelKey,
+        place: Option<Admission>,
+        pointer: &'static str,
+    ) -> Result<Arc<Mapper>, ServiceError> {
+        let unknown = || unknown(&name, Some(pointer));
+        let compile = async {
+            // Deleted and registered anew in between, it has another hash; then the next request finds that.
+            let row = self.store.model(&name).await?.filter(|row| row.summary.hash == key.hash).ok_or_else(unknown)?;
+            let n_attributes = row.summary.attributes.len();
+            let held = self.take(
+                row.summary.size.map_or(0, |size| needed_bytes(size.n_states, size.n_transitions, n_attributes)),
+            )?;
+            let (text, feed) = match row.definition {
+                StoredDefinition::Text(text) => (ModelText::Whole(text.into_bytes()), None),
+                StoredDefinition::Pieces(id) => {
+                    let (to_reader, reader) = pipe();
+                    (ModelText::Packed(Box::new(|| Ok(Box::new(reader)))), Some(feed(&self.store, id, to_reader)))
+                }
+            };
+            // What it was found to be when it was registered, whatever the limit is now.
+            let limits = if key.is_lazy { Limits { max_states: 0, ..Limits::NONE } } else { Limits::NONE };
+            let compiler = self.clone();
+            let job = move |interrupt: &mut dyn Interrupt| {
+                let definition = text.read(Format::Json, Limits::NONE, interrupt);
+                Ok(match definition {
+                    Ok(definition) => compiler.compile(definition, held, limits, interrupt),
+                    Err(error) => Err(error.into()),
+                })
+            };
+            let compile = async {
+                match &place {
+                    Some(place) => place.run(None, job).await,
+                    None => self.pool.run_patiently(Client::LOCAL, job).await,
+                }
+            };
+            let (mapper, fed) = tokio::join!(compile, OptionFuture::from(feed));
+            match fed {
+                // It was deleted meanwhile.
+                Some(Err(ServiceError::Store(StoreError::Removed))) => return Err(unknown()),
+                Some(Err(error)) => return Err(error),
+                Some(Ok(())) | None => {}
+            }
+            match mapper? {
+                Ok(mapper) => Ok(Arc::new(mapper)),
+                // What was once accepted is read again without faults.
+                Err(error @ ServiceError::Parse(_)) => Err(corrupt_definition(error.into())),
+                Err(error) => Err(error),
+            }
+        };
+        self.cache.get_or_compile(&key, compile).await
+    }
+}
+
+/// About how much memory a model takes while it is compiled.
+fn needed_bytes(n_states: u64, n_transitions: u64, n_attributes: usize) -> usize {
+    let n_bytes = n_states * (16 + 4 * n_attributes as u64) + n_transitions * 24;
+    usize::try_from(n_bytes).unwrap_or(usize::MAX)
+}
+
+/// Sends the pieces of a definition to their reader.
+async fn feed(store: &Store, id: i64, to_reader: PipeWriter<Vec<u8>>) -> Result<(), ServiceError> {
+    for seq in 0.. {
+        let Some(piece) = store.piece(id, seq).await? else { break };
+        if !to_reader.send(Ok(piece)).await {
+            return Ok(());
+        }
+    }
+    to_reader.end().await;
+    Ok(())
+}
+
+/// Cancels what takes too long, not counting the time in which it makes way for others.
+struct LimitedTime<'i> {
+    inner: &'i mut dyn Interrupt,
+    left: Duration,
+    last: Instant,
+    is_over: bool,
+}
+
+impl Interrupt for LimitedTime<'_> {
+    fn poll(&mut self) -> Signal {
+        self.left = self.left.saturating_sub(self.last.elapsed());
+        let signal = self.inner.poll();
+        self.last = Instant::now();
+        self.is_over = self.left.is_zero();
+        if self.is_over { Signal::Cancel } else { signal }
+    }
+}
+
+impl Etude {
+    /// The model called `name`, ready to be searched, and its hash. `pointer` is where a request names it; what must be
+    /// compiled is compiled by its `place` in the pool, if it has one, and waited for until `deadline`.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::Unknown`] if there is none, [`ServiceError::Compiling`] if it takes until after `deadline`, or if it cannot be
+    /// compiled now.
+    pub(super) async fn mapper(
+        &self,
+        name: &str,
+        pointer: &'static str,
+        place: Option<&Admission>,
+        deadline: Option<Instant>,
+    ) -> Result<(String, Arc<Mapper>), ServiceError> {
+        let key = self.store.model_key(name).await?.ok_or_else(|| unknown(name, Some(pointer)))?;
+        let hash = key.hash.clone();
+        if let Some(mapper) = self.compiler.cache.get(&key) {
+            return Ok((hash, mapper));
+        }
+        let compiler = self.compiler.clone();
+        let tasks = compiler.tasks.clone();
+        let ready = compiler.ready(name.to_owned(), key, place.cloned(), pointer);
+        let ready = tasks.spawn(ready.instrument(tracing::Span::current()));
+        let ready = match deadline {
+            None => ready.await,
+            Some(deadline) => match tokio::time::timeout_at(deadline.into(), ready).await {
+                Ok(ready) => ready,
+                Err(_) => return Err(ServiceError::Compiling { name: name.to_owned() }),
+            },
+        };
+        Ok((hash, ready.map_err(|_| PoolError::Panicked)??))
+    }
+}

@@ -1,0 +1,479 @@
+//! Whose turn it is to use a thread: the policy of the pool, without threads or clocks.
+//!
+//! A job is *short* until it has run for a moment, and *long* from then on.
+//!
+//! - Short jobs come before long ones. Long ones have all threads but one; the last one is lent to them while nothing short comes.
+//! - Of jobs of a kind, clients take turns: each is served once before one of them is served again. Of a client's jobs, the one that
+//!   has run least is served first (a level is twice as long as the one before it), and of those the first to come.
+//! - A long job makes way for one that has run less, and, once it had its share, for another client's.
+//! - A client may have as many places as it leaves to others: so one that asks for as much as it can leaves half of all, two
+//!   leave a quarter.
+
+use std::collections::{BTreeSet, VecDeque};
+use std::time::{Duration, Instant};
+
+use rustc_hash::FxHashMap;
+
+use crate::service::Client;
+
+/// How long nothing short must have come before long jobs may use all threads.
+pub(super) const LENT_AFTER: Duration = Duration::from_millis(10);
+
+/// How long a job has run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Class {
+    /// Less than a moment.
+    Short,
+    /// Longer.
+    Long,
+}
+
+/// How long a job has run, as the power of two of how many moments: 0 for short ones.
+pub(super) type Level = u32;
+
+/// A job that waits for a thread.
+pub(super) type Ticket = u64;
+
+/// Threads and places, who has them, and who waits for a thread.
+#[derive(Debug)]
+pub(super) struct Turns {
+    n_threads: usize,
+    n_running: usize,
+    n_running_long: usize,
+    short: Places,
+    long: Places,
+    waiting_short: Queue,
+    waiting_long: Queue,
+    next_ticket: Ticket,
+    /// When something short last came.
+    last_short: Option<Instant>,
+}
+
+impl Turns {
+    /// Turns for `n_threads`, at least two of them, and for so many short and so many long jobs, waiting or running.
+    pub(super) fn new(n_threads: usize, n_short: usize, n_long: usize) -> Self {
+        Self {
+            n_threads: n_threads.max(2),
+            n_running: 0,
+            n_running_long: 0,
+            short: Places::new(n_short),
+            long: Places::new(n_long),
+            waiting_short: Queue::default(),
+            waiting_long: Queue::default(),
+            next_ticket: 0,
+            last_short: None,
+        }
+    }
+
+    /// How many jobs have a place.
+    pub(super) fn n_jobs(&self) -> usize {
+        self.short.n_taken + self.long.n_taken
+    }
+
+    /// How many jobs that have a place are long.
+    #[cfg(test)]
+    pub(super) fn n_long(&self) -> usize {
+        self.long.n_taken
+    }
+
+    /// How many jobs have a thread.
+    #[cfg(test)]
+    pub(super) fn n_running(&self) -> usize {
+        self.n_running
+    }
+
+    /// Gives `client` a place among the jobs of a class, if there is one for it.
+    pub(super) fn admit(&mut self, client: Client, class: Class) -> bool {
+        self.places(class).take(client)
+    }
+
+    /// Takes a place back.
+    pub(super) fn leave(&mut self, client: Client, class: Class) {
+        self.places(class).give_back(client);
+    }
+
+    /// Something short came at `now`, whether it needs a thread or not.
+    pub(super) fn note_short(&mut self, now: Instant) {
+        self.last_short = self.last_short.max(Some(now));
+    }
+
+    /// Takes a thread at `now`, if there is one for a job of this class and nobody waits for it.
+    pub(super) fn try_start(&mut self, class: Class, now: Instant) -> bool {
+        if class == Class::Short {
+            self.note_short(now);
+        }
+        let is_first = self.waiting_short.is_empty() && (class == Class::Short || self.waiting_long.is_empty());
+        let starts = is_first && self.has_thread_for(class, now);
+        if starts {
+            self.start(class);
+        }
+        starts
+    }
+
+    /// Takes a thread for a job that nobody waits for, if another one stays free and nobody waits.
+    pub(super) fn try_start_spare(&mut self) -> bool {
+        let starts = self.n_running + 1 < self.n_threads && !self.is_waited_for();
+        if starts {
+            self.start(Class::Long);
+        }
+        starts
+    }
+
+    /// Lines up for a thread.
+    pub(super) fn wait(&mut self, client: Client, class: Class, level: Level) -> Ticket {
+        self.next_ticket += 1;
+        let ticket = self.next_ticket;
+        self.queue(class).push(client, (level, ticket));
+        ticket
+    }
+
+    /// Gives up waiting. Says whether the job still waited; if not, it has its thread.
+    pub(super) fn give_up(&mut self, client: Client, class: Class, ticket: Ticket) -> bool {
+        self.queue(class).remove(client, ticket)
+    }
+
+    /// A job of this class needs its thread no longer.
+    pub(super) fn stop(&mut self, class: Class) {
+        self.n_running -= 1;
+        self.n_running_long -= usize::from(class == Class::Long);
+    }
+
+    /// The next job whose turn it is, which has a thread now; nothing if none waits, or there is no thread for it.
+    pub(super) fn next(&mut self, now: Instant) -> Option<Ticket> {
+        for class in [Class::Short, Class::Long] {
+            if self.has_thread_for(class, now)
+                && let Some(ticket) = self.queue(class).pop()
+            {
+                self.start(class);
+                return Some(ticket);
+            }
+        }
+        None
+    }
+
+    /// A running job has become long. Says whether it may keep its thread.
+    pub(super) fn become_long(&mut self, now: Instant) -> bool {
+        self.n_running_long += 1;
+        !self.is_one_too_many(now)
+    }
+
+    /// Whether a long job that runs should make way.
+    pub(super) fn makes_way(&self, client: Client, level: Level, had_its_share: bool, now: Instant) -> bool {
+        self.is_one_too_many(now)
+            || self.waiting_long.least_level().is_some_and(|least| least < level)
+            || (had_its_share && self.waiting_long.has_others(client))
+    }
+
+    /// Whether anybody waits for a thread.
+    pub(super) fn is_waited_for(&self) -> bool {
+        !(self.waiting_short.is_empty() && self.waiting_long.is_empty())
+    }
+
+    /// Whether all threads are taken.
+    pub(super) fn are_all_taken(&self) -> bool {
+        self.n_running >= self.n_threads
+    }
+
+    /// Whether more long jobs run than may.
+    fn is_one_too_many(&self, now: Instant) -> bool {
+        self.n_running_long >= self.n_threads && !self.is_lent(now)
+    }
+
+    /// Whether long jobs may use the last thread.
+    fn is_lent(&self, now: Instant) -> bool {
+        let is_quiet = self.last_short.is_none_or(|last| now.saturating_duration_since(last) >= LENT_AFTER);
+        is_quiet && self.waiting_short.is_empty()
+    }
+
+    fn has_thread_for(&self, class: Class, now: Instant) -> bool {
+        let is_free = self.n_running < self.n_threads;
+        is_free && (class == Class::Short || self.n_running_long + 1 < self.n_threads || self.is_lent(now))
+    }
+
+    fn start(&mut self, class: Class) {
+        self.n_running += 1;
+        self.n_running_long += usize::from(class == Class::Long);
+    }
+
+    fn places(&mut self, class: Class) -> &mut Places {
+        match class {
+            Class::Short => &mut self.short,
+            Class::Long => &mut self.long,
+        }
+    }
+
+    fn queue(&mut self, class: Class) -> &mut Queue {
+        match class {
+            Class::Short => &mut self.waiting_short,
+            Class::Long => &mut self.waiting_long,
+        }
+    }
+}
+
+/// Places, and how many of them each client has.
+#[derive(Debug)]
+pub(in crate::service) struct Places {
+    n_places: usize,
+    n_taken: usize,
+    by_client: FxHashMap<Client, usize>,
+}
+
+impl Places {
+    pub(in crate::service) fn new(n_places: usize) -> Self {
+        Self { n_places, n_taken: 0, by_client: FxHashMap::default() }
+    }
+
+    /// Gives `client` a place, if there is one for it.
+    pub(in crate::service) fn take(&mut self, client: Client) -> bool {
+        let n_free = self.n_places - self.n_taken;
+        let own = self.by_client.entry(client).or_default();
+        let is_admitted = n_free > 0 && *own <= n_free;
+        if is_admitted {
+            *own += 1;
+            self.n_taken += 1;
+        } else if *own == 0 {
+            self.by_client.remove(&client);
+        }
+        is_admitted
+    }
+
+    /// Takes a place back.
+    pub(in crate::service) fn give_back(&mut self, client: Client) {
+        self.n_taken -= 1;
+        if let Some(own) = self.by_client.get_mut(&client) {
+            *own -= 1;
+            if *own == 0 {
+                self.by_client.remove(&client);
+            }
+        }
+    }
+}
+
+/// Jobs that wait, by client.
+#[derive(Debug, Default)]
+struct Queue {
+    /// Those of whom jobs wait, in the order of their turns.
+    turns: VecDeque<Client>,
+    /// In the order in which they are served; never empty.
+    jobs: FxHashMap<Client, BTreeSet<(Level, Ticket)>>,
+}
+
+impl Queue {
+    fn is_empty(&self) -> bool {
+        self.turns.is_empty()
+    }
+
+    /// Whether jobs of anybody else wait.
+    fn has_others(&self, client: Client) -> bool {
+        self.turns.iter().any(|other| *other != client)
+    }
+
+    /// The level of the job that has run least.
+    fn least_level(&self) -> Option<Level> {
+        self.jobs.values().filter_map(|jobs| Some(jobs.first()?.0)).min()
+    }
+
+    fn push(&mut self, client: Client, job: (Level, Ticket)) {
+        let jobs = self.jobs.entry(client).or_default();
+        if jobs.is_empty() {
+            self.turns.push_back(client);
+        }
+        jobs.insert(job);
+    }
+
+    fn pop(&mut self) -> Option<Ticket> {
+        let client = self.turns.pop_front()?;
+        let jobs = self.jobs.get_mut(&client)?;
+        let next = jobs.pop_first();
+        if jobs.is_empty() {
+            self.jobs.remove(&client);
+        } else {
+            self.turns.push_back(client);
+        }
+        next.map(|(_, ticket)| ticket)
+    }
+
+    fn remove(&mut self, client: Client, ticket: Ticket) -> bool {
+        let Some(jobs) = self.jobs.get_mut(&client) else { return false };
+        let n_before = jobs.len();
+        jobs.retain(|(_, waiting)| *waiting != ticket);
+        let is_removed = jobs.len() < n_before;
+        if jobs.is_empty() {
+            self.jobs.remove(&client);
+            self.turns.retain(|waiting| *waiting != client);
+        }
+        is_removed
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::net::{IpAddr, Ipv4Addr};
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn client(n: u8) -> Client {
+        IpAddr::from(Ipv4Addr::new(10, 0, 0, n)).into()
+    }
+
+    /// All who wait are served, in this order, each when the one before has stopped.
+    fn order(turns: &mut Turns, class: Class, now: Instant) -> Vec<Ticket> {
+        let mut order = Vec::new();
+        turns.stop(class);
+        while let Some(ticket) = turns.next(now) {
+            order.push(ticket);
+            turns.stop(class);
+        }
+        order
+    }
+
+    #[test]
+    fn clients_take_turns_and_a_clients_jobs_keep_their_order() {
+        let now = Instant::now();
+        let mut turns = Turns::new(2, 10, 10);
+        assert!(turns.try_start(Class::Short, now) && turns.try_start(Class::Short, now));
+        let tickets = [0, 0, 0, 1, 1, 2].map(|n| turns.wait(client(n), Class::Short, 0));
+        let [a1, a2, a3, b1, b2, c1] = tickets;
+        assert_eq!(order(&mut turns, Class::Short, now), [a1, b1, c1, a2, b2, a3]);
+    }
+
+    #[test]
+    fn short_jobs_come_before_long_ones_which_leave_them_a_thread() {
+        let now = Instant::now();
+        let mut turns = Turns::new(3, 10, 10);
+        assert!(turns.try_start(Class::Short, now));
+        assert!(turns.become_long(now) && turns.try_start(Class::Long, now));
+        assert!(!turns.try_start(Class::Long, now), "the last thread is for short jobs");
+        let long = turns.wait(client(0), Class::Long, 1);
+        assert!(turns.try_start(Class::Short, now));
+        let short = turns.wait(client(0), Class::Short, 0);
+        turns.stop(Class::Long);
+        assert_eq!((turns.next(now), turns.next(now)), (Some(short), None));
+        turns.stop(Class::Short);
+        assert_eq!((turns.next(now), turns.next(now)), (Some(long), None));
+    }
+
+    #[test]
+    fn the_last_thread_is_lent_while_nothing_short_comes() {
+        let now = Instant::now();
+        let later = now + LENT_AFTER;
+        let mut turns = Turns::new(2, 10, 10);
+        turns.note_short(now);
+        assert!(turns.try_start(Class::Long, now) && !turns.try_start(Class::Long, now));
+        assert!(turns.try_start(Class::Long, later));
+        assert!(!turns.makes_way(client(0), 1, true, later));
+        turns.note_short(later);
+        assert!(turns.makes_way(client(0), 1, false, later));
+        turns.stop(Class::Long);
+        assert!(!turns.makes_way(client(0), 1, true, later));
+        turns.wait(client(1), Class::Long, 1);
+        assert!(turns.makes_way(client(0), 1, true, later) && !turns.makes_way(client(0), 1, false, later));
+        assert!(!turns.makes_way(client(1), 1, true, later), "its own jobs wait for each other");
+    }
+
+    #[test]
+    fn of_a_clients_long_jobs_the_one_that_has_run_least_is_next() {
+        let now = Instant::now();
+        let mut turns = Turns::new(2, 10, 10);
+        turns.note_short(now);
+        assert!(turns.try_start(Class::Long, now));
+        let tickets = [3, 3, 1, 2].map(|level| turns.wait(client(0), Class::Long, level));
+        assert!(turns.makes_way(client(0), 2, false, now) && !turns.makes_way(client(0), 1, false, now));
+        let [third, fourth, first, second] = tickets;
+        assert_eq!(order(&mut turns, Class::Long, now), [first, second, third, fourth]);
+    }
+
+    #[test]
+    fn a_client_may_have_as_many_places_as_it_leaves_to_others() {
+        let mut turns = Turns::new(2, 16, 16);
+        let mut fill = |n| (0..100).filter(|_| turns.admit(client(n), Class::Short)).count();
+        assert_eq!([fill(0), fill(1), fill(2), fill(3), fill(4)], [9, 4, 2, 1, 0]);
+        assert!(turns.admit(client(0), Class::Long));
+        turns.leave(client(0), Class::Short);
+        assert!(turns.admit(client(9), Class::Short));
+    }
+
+    #[derive(Clone, Copy, Debug)]
+    enum Action {
+        Start(u8, bool),
+        BecomeLong,
+        Stop,
+        GiveUp,
+        Pass(u64),
+    }
+
+    fn actions() -> impl Strategy<Value = Vec<Action>> {
+        let action = prop_oneof![
+            6 => (0..4_u8, any::<bool>()).prop_map(|(client, is_long)| Action::Start(client, is_long)),
+            2 => Just(Action::BecomeLong),
+            4 => Just(Action::Stop),
+            1 => Just(Action::GiveUp),
+            1 => (0..15_u64).prop_map(Action::Pass),
+        ];
+        proptest::collection::vec(action, 1..200)
+    }
+
+    proptest! {
+        #[test]
+        fn no_thread_is_lost_or_given_twice_and_none_idles_while_a_short_job_waits(actions in actions(), n_threads in 2..5_usize) {
+            let mut now = Instant::now();
+            let mut turns = Turns::new(n_threads, 10, 10);
+            let mut running = Vec::new();
+            let mut waiting = Vec::new();
+            for action in actions {
+                match action {
+                    Action::Start(n, is_long) => {
+                        let class = if is_long { Class::Long } else { Class::Short };
+                        if turns.try_start(class, now) {
+                            running.push(class);
+                        } else {
+                            waiting.push((turns.wait(client(n), class, 1), client(n), class));
+                        }
+                    }
+                    Action::BecomeLong => {
+                        if let Some(class) = running.iter_mut().find(|class| **class == Class::Short) {
+                            *class = Class::Long;
+                            if !turns.become_long(now) {
+                                turns.stop(Class::Long);
+                                running.remove(running.iter().position(|class| *class == Class::Long).unwrap());
+                            }
+                        }
+                    }
+                    Action::Stop => {
+                        if let Some(class) = running.pop() {
+                            turns.stop(class);
+                        }
+                    }
+                    Action::GiveUp => {
+                        if let Some((ticket, client, class)) = waiting.pop() {
+                            prop_assert!(turns.give_up(client, class, ticket));
+                            prop_assert!(!turns.give_up(client, class, ticket));
+                        }
+                    }
+                    Action::Pass(ms) => now += Duration::from_millis(ms),
+                }
+                while let Some(ticket) = turns.next(now) {
+                    let at = waiting.iter().position(|(waiting, ..)| *waiting == ticket);
+                    prop_assert!(at.is_some(), "nobody waits with this ticket");
+                    running.push(waiting.remove(at.unwrap()).2);
+                }
+                prop_assert!(running.len() <= n_threads);
+                let waits = |wanted| waiting.iter().any(|(.., class)| *class == wanted);
+                prop_assert!(running.len() == n_threads || !waits(Class::Short));
+                let n_long = running.iter().filter(|class| **class == Class::Long).count();
+                prop_assert!(running.len() == n_threads || n_long + 1 >= n_threads || !waits(Class::Long));
+            }
+            // Whoever still waits is served in the end.
+            now += LENT_AFTER;
+            while let Some(class) = running.pop() {
+                turns.stop(class);
+                while let Some(ticket) = turns.next(now) {
+                    running.push(waiting.remove(waiting.iter().position(|(waiting, ..)| *waiting == ticket).unwrap()).2);
+                }
+            }
+            prop_assert!(waiting.is_empty() && turns.n_running == 0 && turns.n_running_long == 0);
+        }
+    }
+}

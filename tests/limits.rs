@@ -1,0 +1,148 @@
+//! What one request may take of the service: time, memory, and the patience of others.
+
+mod service;
+
+use reqwest::Method;
+use serde_json::{Value, json};
+use service::{Service, example, long_way, to_and_fro};
+
+/// A table in which nothing tells the ways apart: searches of it take long.
+fn hard_model(n_states: usize) -> Value {
+    let next = |from: usize, k: usize| (from * 7919 + k * 104_729 + 13) % n_states;
+    json!({
+        "attributes": [{"name": "x", "kind": "number"}, {"name": "y", "kind": "number"}],
+        "actions": [{"name": "a", "cost": 0.3}, {"name": "b", "cost": 0.3}, {"name": "c", "cost": 0.3}],
+        "dynamics": {
+            "kind": "table",
+            "states": (0..n_states).map(|n| json!([n * 31 % 101, n * 17 % 97])).collect::<Vec<_>>(),
+            "transitions": (0..n_states)
+                .flat_map(|from| ["a", "b", "c"].into_iter().enumerate().map(move |(k, name)| json!([from, name, next(from, k)])))
+                .collect::<Vec<_>>(),
+            "start": 0,
+        },
+    })
+}
+
+fn hard_request(n_observations: usize) -> Value {
+    let seen = (0..n_observations).map(|n| json!({"x": n * 37 % 101, "y": n * 53 % 97}));
+    json!({"model": "hard", "demonstration": seen.collect::<Vec<_>>()})
+}
+
+/// A service with the hard model.
+async fn with_hard_model(flags: &[&str]) -> Service {
+    let service = Service::start(flags).await;
+    assert_eq!(service.put("/v1/models/hard", &hard_model(5_000)).await.0, 201);
+    service
+}
+
+#[tokio::test]
+async fn a_request_without_a_deadline_has_that_of_the_service() {
+    let service = with_hard_model(&["--default-deadline", "20ms"]).await;
+    let (status, policy) = service.post("/v1/policies", &hard_request(2_000)).await;
+    assert_eq!((status, &policy["status"]), (201, &json!("bounded")));
+    let batch = json!({"model": "hard", "items": [{"demonstration": hard_request(2_000)["demonstration"]}]});
+    let (status, answer) = service.post("/v1/policies:batch", &batch).await;
+    assert_eq!((status, &answer["items"][0]["status"]), (200, &json!("bounded")));
+    let learner = json!({"attributes": ["x", "y"], "algorithm": {"kind": "srv"}, "mean": 1.0, "sd": 1.0});
+    assert_eq!(service.put("/v1/learners/l", &learner).await.0, 201);
+    let (status, trial) = service.post("/v1/learners/l/trials", &hard_request(2_000)).await;
+    assert_eq!((status, &trial["policy"]["status"]), (201, &json!("bounded")));
+}
+
+#[tokio::test]
+async fn a_longer_deadline_than_the_service_allows_is_a_fault() {
+    let service = with_hard_model(&["--max-deadline", "1s"]).await;
+    let mut request = hard_request(2);
+    request["deadline_ms"] = json!(1000);
+    assert_eq!(service.post("/v1/policies", &request).await.0, 201);
+    request["deadline_ms"] = json!(1001);
+    let (status, problem) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, &problem["errors"][0]["pointer"]), (422, &json!("/deadline_ms")));
+    let batch = json!({"model": "hard", "deadline_ms": 1001, "items": [{"demonstration": [{}]}]});
+    let (status, problem) = service.post("/v1/policies:batch", &batch).await;
+    assert_eq!((status, &problem["errors"][0]["pointer"]), (422, &json!("/deadline_ms")));
+}
+
+#[tokio::test]
+async fn a_deadline_counts_while_a_cold_model_is_compiled_which_goes_on_for_the_next_request() {
+    let service = with_hard_model(&[]).await;
+    let directory = service.stop().await;
+    let service = Service::start_in(directory, &[]).await;
+    let mut request = hard_request(2);
+    request["deadline_ms"] = json!(0);
+    let response = service.send(Method::POST, "/v1/policies", &request).await;
+    assert!(response.headers().contains_key("retry-after"));
+    let (status, problem) = service::answer(response).await;
+    assert_eq!((status, &problem["type"]), (503, &json!("/problems/busy")));
+    assert!(problem["detail"].as_str().unwrap().contains("still being compiled"), "{problem}");
+    // Whoever comes again without waiting finds it ready in the end.
+    while service.post("/v1/policies", &request).await.0 != 201 {
+        tokio::task::yield_now().await;
+    }
+}
+
+#[tokio::test]
+async fn a_model_that_takes_too_long_to_compile_is_refused() {
+    let service = Service::start(&["--max-compile-time", "1ns"]).await;
+    let (status, problem) = service.put("/v1/models/hard", &hard_model(5_000)).await;
+    assert_eq!((status, &problem["errors"][0]["pointer"]), (422, &json!("/dynamics")), "{problem}");
+    assert!(problem["detail"].as_str().unwrap().contains("ETUDE_MAX_COMPILE_TIME"), "{problem}");
+    assert_eq!(service.get("/v1/models").await.1["items"], json!([]));
+}
+
+#[tokio::test]
+async fn a_model_that_is_there_already_is_not_compiled_again() {
+    let model = hard_model(5_000);
+    let service = with_hard_model(&[]).await;
+    let directory = service.stop().await;
+    // Here, it could not be compiled.
+    let service = Service::start_in(directory, &["--max-compile-time", "1ns"]).await;
+    assert_eq!(service.put("/v1/models/hard", &model).await.0, 200);
+    let (status, problem) = service.put("/v1/models/hard", &hard_model(5_001)).await;
+    assert_eq!((status, &problem["type"]), (409, &json!("/problems/conflict")));
+}
+
+#[tokio::test]
+async fn a_small_request_is_answered_while_any_number_of_hard_ones_run() {
+    let service = with_hard_model(&["--default-deadline", "10m"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let hard: Vec<_> = (0..40)
+        .map(|_| tokio::spawn(service.client.post(service.url("/v1/policies")).json(&hard_request(20_000)).send()))
+        .collect();
+    while service.measurement("etude_search_jobs").await < 20.0 {
+        tokio::task::yield_now().await;
+    }
+    assert_eq!(service.post("/v1/policies", &example("figure-4/request.json")).await.0, 201);
+    // Neither does one that another thread takes over wait for all of them.
+    let mut large = example("figure-4/request.json");
+    large["max_expansions"] = json!(10);
+    large["heuristic"] = json!("paper");
+    let (status, policy) = service.post("/v1/policies", &large).await;
+    assert_eq!(status, 201, "{policy}");
+    assert!(service.measurement("etude_search_jobs").await > 0.0, "they still run");
+    hard.iter().for_each(tokio::task::JoinHandle::abort);
+    service.until_idle().await;
+}
+
+#[tokio::test]
+async fn a_batch_says_which_items_its_answer_has_no_room_for() {
+    let service = Service::start(&["--max-memory", "160M"]).await;
+    assert_eq!(service.put("/v1/models/long", &long_way()).await.0, 201);
+    let items: Vec<_> = (0..60).map(|_| json!({"demonstration": to_and_fro(9)})).collect();
+    let (status, answer) = service.post("/v1/policies:batch", &json!({"model": "long", "items": items})).await;
+    assert_eq!(status, 200, "{answer}");
+    let items = answer["items"].as_array().unwrap();
+    let (made, refused): (Vec<_>, Vec<_>) = items.iter().partition(|item| item["id"].is_string());
+    assert!(!made.is_empty() && !refused.is_empty(), "{} of {}", made.len(), items.len());
+    for item in refused {
+        assert_eq!(item["problem"]["type"], "/problems/batch-full");
+    }
+    for item in made {
+        let (status, policy) = service.get(&format!("/v1/policies/{}", item["id"].as_str().unwrap())).await;
+        assert_eq!((status, &policy), (200, item));
+    }
+    let (_, list) = service.get("/v1/policies?limit=1000").await;
+    assert_eq!(list["items"].as_array().unwrap().len(), items.iter().filter(|item| item["id"].is_string()).count());
+    // What it took was given back.
+    assert_eq!(service.post("/v1/policies", &json!({"model": "long", "demonstration": to_and_fro(9)})).await.0, 201);
+}
