@@ -213,19 +213,19 @@ impl Turns {
 /// Places, and how many of them each client has.
 #[derive(Debug)]
 pub(in crate::service) struct Places {
-    n_places: usize,
+    n_all: usize,
     n_taken: usize,
     by_client: FxHashMap<Client, usize>,
 }
 
 impl Places {
-    pub(in crate::service) fn new(n_places: usize) -> Self {
-        Self { n_places, n_taken: 0, by_client: FxHashMap::default() }
+    pub(in crate::service) fn new(n_all: usize) -> Self {
+        Self { n_all, n_taken: 0, by_client: FxHashMap::default() }
     }
 
     /// Gives `client` a place, if there is one for it.
     pub(in crate::service) fn take(&mut self, client: Client) -> bool {
-        let n_free = self.n_places - self.n_taken;
+        let n_free = self.n_all - self.n_taken;
         let own = self.by_client.entry(client).or_default();
         let is_admitted = n_free > 0 && *own <= n_free;
         if is_admitted {
