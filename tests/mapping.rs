@@ -15,7 +15,9 @@ use std::collections::HashMap;
 use etude::attribute::Scalar;
 use etude::document::{Faults, Place};
 use etude::interrupt::{Cancelled, Signal, Uninterrupted};
-use etude::mapping::{Grouping, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status};
+use etude::mapping::{
+    Budget, Grouping, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status, StoppedBy,
+};
 use problems::{cave, close, example, mapper, problem, solve, walked};
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -354,6 +356,32 @@ fn map_until(request: &Value, n: u32, signal: Signal) -> (u32, Result<Mapping, C
     };
     let mapping = mapper.map(&request.problem, request.settings, &mut interrupt);
     (n_polls, mapping)
+}
+
+#[test]
+fn a_policy_that_is_not_optimal_says_what_ran_out_and_one_that_is_says_nothing() {
+    let mapper = mapper(&example("figure-4/model.json"));
+    for (heuristic, n_observations) in [("default", 16), ("default", 200), ("none", 200), ("paper", 200)] {
+        let request = long_request(n_observations, &json!({"heuristic": heuristic}));
+        let mut faults = Faults::default();
+        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
+        let map = |budget, signal: Signal| {
+            let settings = Settings { budget, ..request.settings };
+            let mapping = mapper.map(&request.problem, settings, &mut || signal).unwrap();
+            let policy = Policy::new(Stamp::default(), &request.problem, &mapping);
+            let report = serde_json::to_value(policy.search).unwrap();
+            assert_eq!(report.get("stopped_by"), mapping.stopped_by.map(|by| json!(by.name())).as_ref());
+            (mapping.stopped_by, mapping.status == Status::Optimal)
+        };
+        let whole = map(Budget::DEFAULT, Signal::Continue);
+        assert_eq!(whole, (None, heuristic != "paper"), "{heuristic}");
+        let few = Budget { max_expansions: 10, ..Budget::DEFAULT };
+        assert_eq!(map(few, Signal::Continue), (Some(StoppedBy::MaxExpansions), false), "{heuristic}");
+        assert_eq!(map(Budget::DEFAULT, Signal::Finish), (Some(StoppedBy::Deadline), false), "{heuristic}");
+        let small = Budget { max_bytes: 5000, ..Budget::DEFAULT };
+        assert_eq!(map(small, Signal::Continue), (Some(StoppedBy::Memory), false), "{heuristic}");
+    }
 }
 
 #[test]

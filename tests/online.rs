@@ -10,7 +10,7 @@ use std::sync::Arc;
 
 use etude::document::{Faults, Place};
 use etude::interrupt::{Cancelled, Signal, Uninterrupted};
-use etude::mapping::{CommittedStep, Mapper, Mapping, OnlineMapping, Policy, Request, Stamp, Status};
+use etude::mapping::{CommittedStep, Mapper, Mapping, OnlineMapping, Policy, Request, Stamp, Status, StoppedBy};
 use problems::{close, example, mapper, problem};
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -180,8 +180,9 @@ fn where_time_or_expansions_are_up_what_a_lookahead_has_not_decided_is_followed_
     let request = json!({"model": "corridor", "demonstration": rush(29, 120), "lookahead": 4});
     let request = read(&mapper, &request).unwrap();
     let whole = request.solve(&mapper, &mut Uninterrupted).unwrap();
-    let check = |mapping: &Mapping| {
-        assert_eq!((mapping.status, mapping.lower_bound), (Status::Local, None));
+    assert_eq!(whole.stopped_by, None);
+    let check = |mapping: &Mapping, stopped_by| {
+        assert_eq!((mapping.status, mapping.lower_bound, mapping.stopped_by), (Status::Local, None, Some(stopped_by)));
         assert_eq!(mapping.moves[0], whole.moves[0]);
         assert_eq!(mapping.moves.last().unwrap().observation, 119);
         // As legal as any: it can be followed again.
@@ -200,7 +201,7 @@ fn where_time_or_expansions_are_up_what_a_lookahead_has_not_decided_is_followed_
     for n_polls in 1..=400 {
         let mapping = after(n_polls, Signal::Finish).unwrap();
         // A look before each observation, one in it, and those of repairs.
-        let n_same = check(&mapping);
+        let n_same = check(&mapping, StoppedBy::Deadline);
         assert!(n_same + 6 >= n_polls / 20, "{n_same} of {n_polls}");
         assert_eq!(after(n_polls, Signal::Cancel), Err(Cancelled));
     }
@@ -209,7 +210,7 @@ fn where_time_or_expansions_are_up_what_a_lookahead_has_not_decided_is_followed_
         let request = request.as_mut().unwrap();
         request.settings.budget.max_expansions = max_expansions;
         let mapping = request.solve(&mapper, &mut Uninterrupted).unwrap();
-        check(&mapping);
+        check(&mapping, StoppedBy::MaxExpansions);
         assert!(mapping.n_expanded <= max_expansions, "{} of {max_expansions}", mapping.n_expanded);
     }
 }

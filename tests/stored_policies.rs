@@ -50,7 +50,11 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 200, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_policy_is_read_as_it_was_answered((model, demonstration, weights, start) in problem(), huge in any::<bool>()) {
+    fn a_policy_is_read_as_it_was_answered(
+        (model, demonstration, weights, start) in problem(),
+        huge in any::<bool>(),
+        max_expansions in prop::option::of(0..4_u64),
+    ) {
         let mut model = model;
         if huge && model["attributes"][0]["kind"] == "number" {
             // Neither whole nor short.
@@ -58,7 +62,9 @@ proptest! {
                 state[0] = json!(state[0].as_f64().unwrap() * 1e300 / 3.0);
             }
         }
-        let request = json!({"model": "m", "demonstration": demonstration, "weights": weights, "start": start});
+        let request = json!({
+            "model": "m", "demonstration": demonstration, "weights": weights, "start": start, "max_expansions": max_expansions,
+        });
         let (policy, written) = follow(&mapper(&model), &request, &stamp("p"));
         prop_assert_eq!(&written.answer, &serde_json::to_string(&policy).unwrap());
         prop_assert_eq!(&written.summary, &serde_json::to_string(&PolicySummary::of(&policy)).unwrap());

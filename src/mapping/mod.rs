@@ -53,7 +53,7 @@ pub use cost::Cost;
 pub use demonstration::Demonstration;
 pub(crate) use demonstration::WellFormed;
 pub use heuristic::{Grouping, HeuristicName};
-pub use mapper::{Budget, Mapper, Mapping, Settings, Status};
+pub use mapper::{Budget, Mapper, Mapping, Settings, Status, StoppedBy};
 pub(crate) use online::longest_lookahead;
 pub use online::{CommittedStep, OnlineMapping};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
 use super::cost::{Cost, CostSum};
-use super::{Demonstration, Mapping, Move, MoveKind, Problem, Status};
+use super::{Demonstration, Mapping, Move, MoveKind, Problem, Status, StoppedBy};
 use crate::attribute::{ByAttribute, Scalar};
 use crate::document::{Faults, Place};
 use crate::model::{Model, States};
@@ -186,6 +186,11 @@ pub struct SearchReport {
     pub generated: u64,
     /// Wall-clock time, in microseconds.
     pub elapsed_us: u64,
+    /// What ran out, if that is why the policy is not optimal, or why the end of what a lookahead decided was followed greedily. Left out
+    /// otherwise.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(nullable = false)]
+    pub stopped_by: Option<StoppedBy>,
 }
 
 /// Most bytes of a policy that its states take: 64 MB, 640 for each of the most observations that there can be. The whole is
@@ -276,6 +281,7 @@ impl Policy {
                 expanded: mapping.n_expanded,
                 generated: mapping.n_generated,
                 elapsed_us: stamp.elapsed_us,
+                stopped_by: mapping.stopped_by,
             },
             refines: stamp.refines,
             refined_by: None,
@@ -361,6 +367,7 @@ mod tests {
                 cost: Cost::default(),
                 status: Status::Optimal,
                 lower_bound: None,
+                stopped_by: None,
                 n_expanded: 0,
                 n_generated: 0,
                 states: None,

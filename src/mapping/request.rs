@@ -10,7 +10,7 @@ use utoipa::ToSchema;
 
 use super::{
     Budget, Demonstration, Grouping, HeuristicName, Mapper, Mapping, Move, MoveKind, OnlineMapping, Policy, Problem,
-    Settings, longest_lookahead,
+    Settings, StoppedBy, longest_lookahead,
 };
 use crate::attribute::{Scalar, Weights};
 use crate::document::{Faults, Object, Place};
@@ -115,13 +115,15 @@ impl<'m> Request<'m> {
         let mut online = OnlineMapping::new(mapper, weights, Some(problem.start), self.lookahead);
         for observation in problem.demonstration.iter() {
             let is_spent = online.n_expanded().saturating_add(n_states) > self.settings.budget.max_expansions;
-            match if is_spent { Signal::Finish } else { interrupt.poll() } {
+            let signal = if is_spent { Signal::Finish } else { interrupt.poll() };
+            match signal {
                 Signal::Continue => {}
                 Signal::Finish => {
+                    let stopped_by = if is_spent { StoppedBy::MaxExpansions } else { StoppedBy::Deadline };
                     let spent = (online.n_expanded(), online.n_generated());
                     // The cheapest way to what has come so far.
                     let moves = online.end().map(|(_, mapping)| mapping.moves).unwrap_or_default();
-                    return self.complete(mapper, moves, spent, interrupt);
+                    return self.complete(mapper, moves, stopped_by, spent, interrupt);
                 }
                 Signal::Cancel => return Err(Cancelled),
             }
@@ -138,7 +140,7 @@ impl<'m> Request<'m> {
                 Err(Cancelled) if is_over => {
                     // What is not committed was half changed.
                     let spent = (online.n_expanded(), online.n_generated());
-                    return self.complete(mapper, online.into_moves(), spent, interrupt);
+                    return self.complete(mapper, online.into_moves(), StoppedBy::Deadline, spent, interrupt);
                 }
                 Err(Cancelled) => return Err(Cancelled),
             }
@@ -147,18 +149,20 @@ impl<'m> Request<'m> {
         Ok(mapping)
     }
 
-    /// A mapping that begins with `moves`, for which so many nodes and transitions were looked at, and goes on greedily.
+    /// A mapping that begins with `moves`, for which so many nodes and transitions were looked at, and goes on greedily, as `stopped_by`
+    /// ran out.
     fn complete(
         &self,
         mapper: &Mapper,
         mut moves: Vec<Move>,
+        stopped_by: StoppedBy,
         (n_expanded, n_generated): (u64, u64),
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
         if moves.is_empty() {
             moves.push(Move { kind: MoveKind::Start, action: None, observation: 0, state: self.problem.start });
         }
-        let mapping = mapper.complete(&self.problem, moves, interrupt)?;
+        let mapping = mapper.complete(&self.problem, moves, stopped_by, interrupt)?;
         Ok(Mapping { n_expanded, n_generated, ..mapping })
     }
 

@@ -65,6 +65,7 @@ impl WrittenPolicy {
                 expanded: mapping.n_expanded,
                 generated: mapping.n_generated,
                 elapsed_us: stamp.elapsed_us,
+                stopped_by: mapping.stopped_by,
             },
             refines: stamp.refines.as_deref(),
             refined_by: None,

@@ -90,6 +90,31 @@ impl Status {
     }
 }
 
+/// What a search ran out of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum StoppedBy {
+    /// The expansions that the request allows.
+    MaxExpansions,
+    /// Time.
+    #[serde(rename = "deadline_ms")]
+    Deadline,
+    /// The memory that a search may take.
+    Memory,
+}
+
+impl StoppedBy {
+    /// What it is called in JSON.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::MaxExpansions => "max_expansions",
+            Self::Deadline => "deadline_ms",
+            Self::Memory => "memory",
+        }
+    }
+}
+
 /// The best sequence of imitator states and actions that was found for a demonstration, with its alignment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Mapping {
@@ -101,6 +126,8 @@ pub struct Mapping {
     pub status: Status,
     /// No mapping costs less. Equal to `cost.total` if optimal; `None` if local.
     pub lower_bound: Option<f64>,
+    /// What the search ran out of, if that is why it is not optimal, or why the end of what a lookahead decided was followed greedily.
+    pub stopped_by: Option<StoppedBy>,
     /// Nodes expanded.
     pub n_expanded: u64,
     /// Successors looked at.
@@ -253,7 +280,11 @@ impl Mapper {
                         let least_f = first + projected.cost_to_go(0, space.row(problem.start));
                         conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
                     }
-                    None => conclude(problem, space, &Blind, Found { least_f: first, ..found }, interrupt),
+                    None => {
+                        let stopped_by = found.stopped_by.or(Some(StoppedBy::Deadline));
+                        let found = Found { least_f: first, stopped_by, ..found };
+                        conclude(problem, space, &Blind, found, interrupt)
+                    }
                 }
             }
         }
@@ -315,8 +346,8 @@ impl Mapper {
         assert!(std::ptr::eq(problem.model, &raw const *self.model), "the problem must be of this mapper's model");
     }
 
-    /// A mapping of `problem` that begins with `moves` and goes on greedily; of whole states, as for a lookahead. Nothing is
-    /// proven of it.
+    /// A mapping of `problem` that begins with `moves` and goes on greedily, as `stopped_by` ran out; of whole states, as for a
+    /// lookahead. Nothing is proven of it.
     ///
     /// # Errors
     ///
@@ -325,11 +356,19 @@ impl Mapper {
         &self,
         problem: &Problem<'_>,
         moves: Vec<Move>,
+        stopped_by: StoppedBy,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
-        let found = Found { paths: vec![moves], is_complete: false, least_f: 0.0, n_expanded: 0, n_generated: 0 };
+        let found = Found {
+            paths: vec![moves],
+            is_complete: false,
+            stopped_by: Some(stopped_by),
+            least_f: 0.0,
+            n_expanded: 0,
+            n_generated: 0,
+        };
         let mapping = conclude(problem, &mut Whole::of(&self.model), &Blind, found, interrupt)?;
-        Ok(Mapping { status: Status::Local, lower_bound: None, ..mapping })
+        Ok(Mapping { status: Status::Local, lower_bound: None, stopped_by: Some(stopped_by), ..mapping })
     }
 }
 
@@ -368,7 +407,7 @@ fn conclude<S: Space, H: Heuristic>(
     found: Found,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Mapping, Cancelled> {
-    let Found { paths, is_complete, least_f: lower_bound, n_expanded, n_generated } = found;
+    let Found { paths, is_complete, stopped_by, least_f: lower_bound, n_expanded, n_generated } = found;
     let mut allowance = Allowance::new(interrupt);
     let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };
     let mut best: Option<(Cost, Vec<Move>)> = None;
@@ -386,6 +425,7 @@ fn conclude<S: Space, H: Heuristic>(
         cost,
         status: if is_optimal { Status::Optimal } else { Status::Bounded },
         lower_bound: Some(if is_optimal { cost.total } else { lower_bound }),
+        stopped_by: stopped_by.filter(|_| !is_optimal),
         n_expanded,
         n_generated,
         states: None,

@@ -234,8 +234,16 @@ impl OnlineMapping {
         let status = if self.was_forced { Status::Local } else { Status::Optimal };
         let lower_bound = (status == Status::Optimal).then_some(self.cost.total);
         let (n_expanded, n_generated) = (self.n_expanded(), self.n_generated());
-        let mapping =
-            Mapping { moves: self.moves, cost: self.cost, status, lower_bound, n_expanded, n_generated, states: None };
+        let mapping = Mapping {
+            moves: self.moves,
+            cost: self.cost,
+            status,
+            lower_bound,
+            stopped_by: None,
+            n_expanded,
+            n_generated,
+            states: None,
+        };
         Some((committed, mapping))
     }
 

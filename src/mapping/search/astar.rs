@@ -8,7 +8,7 @@ use rustc_hash::FxHashMap;
 use super::{Found, Move, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::heuristic::Heuristic;
-use crate::mapping::{Budget, Problem};
+use crate::mapping::{Budget, Problem, StoppedBy};
 use crate::model::{ActionIdx, Space, StateIdx};
 
 /// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows, among those of at most `most_f`. If there is
@@ -48,18 +48,24 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
         let (i, state) = (node.observation as usize, node.state);
         if i == last {
             let paths = vec![nodes.path(entry.id)];
-            return Ok(Found { paths, is_complete: true, least_f: f64::INFINITY, n_expanded, n_generated });
+            let least_f = f64::INFINITY;
+            return Ok(Found { paths, is_complete: true, stopped_by: None, least_f, n_expanded, n_generated });
         }
         // Whatever is left of an expansion that is broken off costs at least the `f` of its node.
-        let unfinished = |nodes: &Nodes, farthest: Open, n_expanded, n_generated| {
+        let unfinished = |stopped_by, nodes: &Nodes, farthest: Open, n_expanded, n_generated| {
             let paths = [entry.id, farthest.id, 0].map(|id| nodes.path(id)).to_vec();
-            Ok(Found { paths, is_complete: false, least_f: entry.f, n_expanded, n_generated })
+            let (least_f, stopped_by) = (entry.f, Some(stopped_by));
+            Ok(Found { paths, is_complete: false, stopped_by, least_f, n_expanded, n_generated })
         };
-        let is_spent = n_expanded >= budget.max_expansions || budget.is_full(nodes.size_bytes(), space);
-        match meter.spend(1) {
+        let stopped_by = match meter.spend(1) {
             Signal::Cancel => return Err(Cancelled),
-            Signal::Continue if !is_spent => {}
-            Signal::Continue | Signal::Finish => return unfinished(&nodes, farthest, n_expanded, n_generated),
+            Signal::Finish => Some(StoppedBy::Deadline),
+            Signal::Continue if n_expanded >= budget.max_expansions => Some(StoppedBy::MaxExpansions),
+            Signal::Continue if budget.is_full(nodes.size_bytes(), space) => Some(StoppedBy::Memory),
+            Signal::Continue => None,
+        };
+        if let Some(stopped_by) = stopped_by {
+            return unfinished(stopped_by, &nodes, farthest, n_expanded, n_generated);
         }
         n_expanded += 1;
         if (entry.observation, farthest.f) > (farthest.observation, entry.f) {
@@ -75,7 +81,9 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
         for (i, state, cost, action) in std::iter::once(skip).chain(moves) {
             match meter.spend(heuristic.work(i)) {
                 Signal::Continue => {}
-                Signal::Finish => return unfinished(&nodes, farthest, n_expanded, n_generated),
+                Signal::Finish => {
+                    return unfinished(StoppedBy::Deadline, &nodes, farthest, n_expanded, n_generated);
+                }
                 Signal::Cancel => return Err(Cancelled),
             }
             n_generated += 1;
@@ -93,7 +101,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
     }
     // Whatever is left costs more than `most_f`: there is no such mapping.
     let paths = [farthest.id, 0].map(|id| nodes.path(id)).to_vec();
-    Ok(Found { paths, is_complete: true, least_f: f64::INFINITY, n_expanded, n_generated })
+    Ok(Found { paths, is_complete: true, stopped_by: None, least_f: f64::INFINITY, n_expanded, n_generated })
 }
 
 /// The cheapest way found so far to a node.

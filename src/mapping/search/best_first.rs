@@ -25,7 +25,7 @@ use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{Deepened, Projected};
 use crate::mapping::open_list::CheapestFirst;
-use crate::mapping::{Budget, Problem};
+use crate::mapping::{Budget, Problem, StoppedBy};
 use crate::model::Space;
 
 /// How many times as wide each probe is as the one before.
@@ -33,6 +33,9 @@ const PROBE_WIDENING: u64 = 8;
 
 /// A probe may take this part of the work that was done before it.
 const PROBE_SHARE: u64 = 16;
+
+/// How a search ends that the interrupt said to finish.
+const OUT_OF_TIME: End = End::CutShort(StoppedBy::Deadline);
 
 /// Buffers of a search, kept to be used again.
 #[derive(Debug, Default)]
@@ -153,7 +156,7 @@ impl<S: Space> Search<'_, '_, S> {
         for Reached { id, f, .. } in self.nodes.open().filter(|node| node.f < self.limit) {
             match self.meter.spend(1) {
                 Signal::Continue => {}
-                Signal::Finish => return Ok(End::CutShort),
+                Signal::Finish => return Ok(OUT_OF_TIME),
                 Signal::Cancel => return Err(Cancelled),
             }
             if let Some(last) = last_of.get_mut(self.nodes.step(id).observation as usize) {
@@ -181,7 +184,10 @@ impl<S: Space> Search<'_, '_, S> {
                 }
                 n_left -= 1;
                 let step = self.nodes.step(id);
-                let Some(ways) = self.spend(step.state, buckets)? else { return Ok(End::CutShort) };
+                let ways = match self.spend(step.state, buckets)? {
+                    Ok(ways) => ways,
+                    Err(stopped_by) => return Ok(End::CutShort(stopped_by)),
+                };
                 self.expand(id, g, step, ways, |Reached { id, f, .. }, at| {
                     let found = CheapestFirst { cost: f, id };
                     if at == observation {
@@ -201,11 +207,12 @@ impl<S: Space> Search<'_, '_, S> {
         let probe_at = |width: u64| width.saturating_mul(n_layers).saturating_mul(PROBE_SHARE);
         let mut probe_width = PROBE_WIDENING;
         while self.is_deepening_due() {
-            if self.deepen(open)? == End::CutShort {
-                return Ok(End::CutShort);
+            let end = self.deepen(open)?;
+            if end != End::Done {
+                return Ok(end);
             }
         }
-        let Some(mut bucketed_limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(End::CutShort) };
+        let Some(mut bucketed_limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(OUT_OF_TIME) };
         let mut help_at = self.projected.deepening_due().min(probe_at(probe_width));
         while let Some(Reached { id, g, f }) = open.buckets.pop() {
             // Of a node that was put in more than once, the cheapest way comes out first.
@@ -213,26 +220,33 @@ impl<S: Space> Search<'_, '_, S> {
                 continue;
             }
             let step = self.nodes.step(id);
-            let Some(ways) = self.spend(step.state, &open.buckets)? else { return Ok(End::CutShort) };
+            let ways = match self.spend(step.state, &open.buckets)? {
+                Ok(ways) => ways,
+                Err(stopped_by) => return Ok(End::CutShort(stopped_by)),
+            };
             self.expand(id, g, step, ways, |found, _| open.buckets.push(found));
             if self.n_expanded < help_at && self.limit >= bucketed_limit / 4.0 {
                 continue;
             }
             let is_deepening_due = self.is_deepening_due();
-            if is_deepening_due && self.deepen(open)? == End::CutShort {
-                return Ok(End::CutShort);
+            if is_deepening_due {
+                let end = self.deepen(open)?;
+                if end != End::Done {
+                    return Ok(end);
+                }
             }
             let is_probe_due = self.n_expanded >= probe_at(probe_width);
             if is_probe_due {
                 probe_width *= PROBE_WIDENING;
-                if self.probe(probe_width / PROBE_WIDENING, open)? == End::CutShort {
-                    return Ok(End::CutShort);
+                let end = self.probe(probe_width / PROBE_WIDENING, open)?;
+                if end != End::Done {
+                    return Ok(end);
                 }
             }
             // What a probe found is not in the buckets, and better estimates are for others; and those for a much higher limit
             // are too wide.
             if is_deepening_due || is_probe_due || self.limit < bucketed_limit / 4.0 {
-                let Some(limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(End::CutShort) };
+                let Some(limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(OUT_OF_TIME) };
                 bucketed_limit = limit;
                 help_at = self.projected.deepening_due().min(probe_at(probe_width));
             }
@@ -250,7 +264,7 @@ impl<S: Space> Search<'_, '_, S> {
     #[cold]
     fn deepen(&mut self, open: &mut Open) -> Result<End, Cancelled> {
         match self.projected.deepen(self.limit, self.n_expanded, &mut self.meter)? {
-            Deepened::CutShort => return Ok(End::CutShort),
+            Deepened::CutShort => return Ok(OUT_OF_TIME),
             Deepened::No => return Ok(End::Done),
             Deepened::Yes => {}
         }
@@ -278,24 +292,26 @@ impl<S: Space> Search<'_, '_, S> {
         self.nodes.open().filter(|node| node.f < self.limit)
     }
 
-    /// Counts the expansion of a node of `state` that is about to be done, and gives where the ways out are; `None` if it may not be.
+    /// Counts the expansion of a node of `state` that is about to be done, and gives where the ways out are; what ran out, if it may not
+    /// be.
     #[expect(clippy::inline_always, reason = "it is done for every expansion")]
     #[inline(always)]
-    fn spend(&mut self, state: SeenIdx, buckets: &Buckets) -> Result<Option<Range<usize>>, Cancelled> {
+    fn spend(&mut self, state: SeenIdx, buckets: &Buckets) -> Result<Result<Range<usize>, StoppedBy>, Cancelled> {
         let ways = self
             .seen
             .explored(state)
             .unwrap_or_else(|| self.seen.explore(state, self.space, self.projected, self.problem.model.actions()));
         match self.meter.spend(1 + 2 * ways.len() as u64) {
             Signal::Cancel => Err(Cancelled),
-            Signal::Continue if self.n_expanded < self.unspent_until || !self.is_spent(buckets) => Ok(Some(ways)),
-            Signal::Continue | Signal::Finish => Ok(None),
+            Signal::Finish => Ok(Err(StoppedBy::Deadline)),
+            Signal::Continue if self.n_expanded < self.unspent_until => Ok(Ok(ways)),
+            Signal::Continue => Ok(self.check_budget(buckets).map(|()| ways)),
         }
     }
 
-    /// Whether there are no expansions left, or no memory.
+    /// Looks whether there are expansions left, and memory; gives what there is not.
     #[cold]
-    fn is_spent(&mut self, buckets: &Buckets) -> bool {
+    fn check_budget(&mut self, buckets: &Buckets) -> Result<(), StoppedBy> {
         /// How many expansions may be done between two looks at the memory,
         const LOOK_EVERY: u64 = 16;
         /// and how many ways may be followed: they find as many nodes, and twice as many where blocks begin.
@@ -304,7 +320,13 @@ impl<S: Space> Search<'_, '_, S> {
         let n_actions = self.problem.model.actions().len() as u64;
         let look_every = (N_WAYS / n_actions.max(1)).clamp(1, LOOK_EVERY);
         self.unspent_until = (self.n_expanded + look_every).min(self.budget.max_expansions);
-        self.n_expanded >= self.budget.max_expansions || self.budget.is_full(n_bytes, self.space)
+        if self.n_expanded >= self.budget.max_expansions {
+            Err(StoppedBy::MaxExpansions)
+        } else if self.budget.is_full(n_bytes, self.space) {
+            Err(StoppedBy::Memory)
+        } else {
+            Ok(())
+        }
     }
 
     /// Follows the moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper
@@ -390,6 +412,7 @@ impl<S: Space> Search<'_, '_, S> {
                 .max_by(|node, other| observation(node).cmp(&observation(other)).then(other.f.total_cmp(&node.f)));
             farthest.map(|node| node.id).into_iter().chain([first]).map(path).collect()
         };
-        Found { paths, is_complete, least_f, n_expanded: self.n_expanded, n_generated: self.n_generated }
+        let (n_expanded, n_generated) = (self.n_expanded, self.n_generated);
+        Found { paths, is_complete, stopped_by: end.stopped_by(), least_f, n_expanded, n_generated }
     }
 }

@@ -18,7 +18,7 @@ use super::{End, Found, Move, MoveKind, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{CHUNK_LEN, ChangingColumn, Estimate, Projected};
-use crate::mapping::{Budget, Problem};
+use crate::mapping::{Budget, Problem, StoppedBy};
 use crate::model::{ActionIdx, Model, StateIdx};
 
 /// How many nodes of each layer the beams expand, one beam after the other.
@@ -162,10 +162,13 @@ pub(in crate::mapping) fn search(
         n_generated: 0,
         meter: Meter::new(interrupt, POLL_EVERY),
     };
-    let mut is_complete = true;
+    let mut end = End::Done;
     for width in BEAM_WIDTHS.into_iter().chain([usize::MAX]) {
-        is_complete = is_complete && search.go_through(width)? == End::Done;
+        if end == End::Done {
+            end = search.go_through(width)?;
+        }
     }
+    let is_complete = end == End::Done;
     let least_f = if is_complete { f64::INFINITY } else { search.least_f() };
     let Search { cheapest, n_expanded, n_generated, .. } = search;
     Ok(Found {
@@ -174,6 +177,7 @@ pub(in crate::mapping) fn search(
                 .map_or_else(|| nodes.path(body, 0, problem.start), |state| nodes.path(body, problem.last(), state)),
         ],
         is_complete,
+        stopped_by: end.stopped_by(),
         least_f,
         n_expanded,
         n_generated,
@@ -203,8 +207,9 @@ impl Search<'_> {
     fn go_through(&mut self, width: usize) -> Result<End, Cancelled> {
         for observation in 0..self.last {
             let limit = if width <= WIDEST_BEAM { self.limit_of_beam(observation, width) } else { self.limit };
-            if self.expand(observation, limit, width)? == End::CutShort {
-                return Ok(End::CutShort);
+            let end = self.expand(observation, limit, width)?;
+            if end != End::Done {
+                return Ok(end);
             }
         }
         self.end();
@@ -256,7 +261,8 @@ impl Search<'_> {
             let (first_way, ways) = self.body.ways(state);
             match self.meter.spend(1 + 2 * ways.len() as u64) {
                 Signal::Continue if self.n_expanded < self.budget.max_expansions => {}
-                Signal::Continue | Signal::Finish => return Ok(End::CutShort),
+                Signal::Continue => return Ok(End::CutShort(StoppedBy::MaxExpansions)),
+                Signal::Finish => return Ok(End::CutShort(StoppedBy::Deadline)),
                 Signal::Cancel => return Err(Cancelled),
             }
             n_left -= 1;

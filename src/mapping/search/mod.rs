@@ -20,6 +20,7 @@ pub(super) mod sweep;
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
+use super::StoppedBy;
 use crate::model::{ActionIdx, StateIdx};
 
 /// How a step advances.
@@ -57,6 +58,8 @@ pub(in crate::mapping) struct Found {
     pub(in crate::mapping) paths: Vec<Vec<Move>>,
     /// Whether the search came to its end.
     pub(in crate::mapping) is_complete: bool,
+    /// What ran out, if it did not.
+    pub(in crate::mapping) stopped_by: Option<StoppedBy>,
     /// No mapping costs less than this, or than the cheapest of the paths, if the heuristic is admissible.
     pub(in crate::mapping) least_f: f64,
     /// Nodes expanded, again counted if they were reached more cheaply later.
@@ -70,8 +73,17 @@ pub(in crate::mapping) struct Found {
 enum End {
     /// All is done that was to be done.
     Done,
-    /// The budget was used up, or the interrupt said to finish.
-    CutShort,
+    /// This was used up.
+    CutShort(StoppedBy),
+}
+
+impl End {
+    fn stopped_by(self) -> Option<StoppedBy> {
+        match self {
+            Self::Done => None,
+            Self::CutShort(stopped_by) => Some(stopped_by),
+        }
+    }
 }
 
 /// How many distances are looked at between two looks at the interrupt: less than a millisecond with a few attributes.

@@ -78,6 +78,7 @@ fn in_sections(problem: &Problem<'_>, section_len: usize, meter: Meter<'_>) -> R
         Ok(path) => Ok(Swept::Done(Found {
             paths: vec![path],
             is_complete: true,
+            stopped_by: None,
             least_f: f64::INFINITY,
             n_expanded,
             n_generated,

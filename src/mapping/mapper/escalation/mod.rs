@@ -2,12 +2,12 @@
 
 use super::{Budget, Buffers, Mapper, Mapping, Settings, conclude, within};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::Problem;
 use crate::mapping::cost::SLACK;
 use crate::mapping::heuristic::projected::{MAX_ENTRIES, Projected};
 use crate::mapping::heuristic::{GroupingPatience, Heuristic};
 use crate::mapping::search::sweep::{Layer, Swept, sweep};
 use crate::mapping::search::{Found, best_first};
+use crate::mapping::{Problem, StoppedBy};
 use crate::model::{Space, StateIdx};
 
 impl Mapper {
@@ -66,6 +66,7 @@ impl Mapper {
                         found.least_f = found.least_f.max(bound_of(problem, &projected, &known));
                         found.n_expanded += n_expanded;
                         found.n_generated += n_generated;
+                        found.stopped_by = Some(StoppedBy::Deadline);
                     }
                     Swept::TooLarge => {
                         let max_expansions = budget.max_expansions - found.n_expanded;
@@ -78,11 +79,13 @@ impl Mapper {
             return conclude(problem, space, &projected, within(most_f, found, problem), interrupt);
         }
         if let Some((projected, found)) = before {
+            let found = Found { stopped_by: Some(StoppedBy::Deadline), ..found };
             return conclude(problem, space, &projected, found, interrupt);
         }
         let mut blind = Projected::blind(problem);
         let budget = Budget { max_expansions: 0, ..budget };
         let found = self.search(space, problem, &mut blind, budget, most_f, interrupt)?;
+        let found = Found { stopped_by: Some(StoppedBy::Deadline), ..found };
         conclude(problem, space, &blind, found, interrupt)
     }
 
@@ -131,6 +134,7 @@ fn joined(before: Found, found: Found) -> Found {
         n_expanded: before.n_expanded + found.n_expanded,
         n_generated: before.n_generated + found.n_generated,
         is_complete: found.is_complete,
+        stopped_by: found.stopped_by,
     }
 }
 
