@@ -91,10 +91,16 @@ impl ServeConfig {
     pub fn settings(&self) -> Settings {
         let n_cores = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
         let max_memory = self.max_memory.unwrap_or_else(memory::default_max_bytes);
+        let memory = Memory::new(max_memory);
         Settings {
             database: self.database.clone(),
-            limits: model::Limits { max_states: self.max_states, max_transitions: self.max_transitions },
-            memory: Memory::new(max_memory),
+            limits: model::Limits {
+                max_states: self.max_states,
+                max_transitions: self.max_transitions,
+                max_bytes: usize::try_from(memory.room() / 2).unwrap_or(usize::MAX),
+                ..model::Limits::DEFAULT
+            },
+            memory,
             model_cache_bytes: self.model_cache_bytes.unwrap_or(MAX_MODEL_CACHE_BYTES.min(max_memory / 4)),
             session_idle_timeout: self.session_idle_timeout,
             time_limits: TimeLimits {

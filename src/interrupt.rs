@@ -22,6 +22,26 @@ pub enum Signal {
 #[error("cancelled")]
 pub struct Cancelled;
 
+/// Why a computation has no result that is of no use unless it is finished.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Interrupted {
+    /// It was told to [`Signal::Cancel`].
+    #[error(transparent)]
+    Cancelled(#[from] Cancelled),
+    /// It was told to [`Signal::Finish`] before it had come to its end.
+    #[error("out of time")]
+    OutOfTime,
+}
+
+impl From<Interrupted> for Signal {
+    fn from(interrupted: Interrupted) -> Self {
+        match interrupted {
+            Interrupted::Cancelled(Cancelled) => Self::Cancel,
+            Interrupted::OutOfTime => Self::Finish,
+        }
+    }
+}
+
 /// Asked by a long computation whether to go on. Called often, so it should be cheap.
 pub trait Interrupt {
     /// What to do next.
@@ -97,10 +117,14 @@ impl<'i> Meter<'i> {
     ///
     /// # Errors
     ///
-    /// [`Cancelled`] if the interrupt said so.
+    /// What the interrupt said, if that was not to continue.
     #[inline]
-    pub(crate) fn spend_or_cancel(&mut self, units: u64) -> Result<(), Cancelled> {
-        if self.spend(units) == Signal::Cancel { Err(Cancelled) } else { Ok(()) }
+    pub(crate) fn spend_or_stop(&mut self, units: u64) -> Result<(), Interrupted> {
+        match self.spend(units) {
+            Signal::Continue => Ok(()),
+            Signal::Finish => Err(Interrupted::OutOfTime),
+            Signal::Cancel => Err(Interrupted::Cancelled(Cancelled)),
+        }
     }
 }
 

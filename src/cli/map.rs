@@ -12,7 +12,7 @@ use serde_json::{Map as Members, Value, json};
 
 use super::{CliError, render};
 use crate::document::{self, Faults, Place};
-use crate::interrupt::{Signal, Uninterrupted, time_until_finish};
+use crate::interrupt::{Interrupted, Signal, Uninterrupted, time_until_finish};
 use crate::mapping::{Mapper, Policy, Request, Stamp};
 use crate::model::{CompileError, Definition, Limits, Model, hash_of};
 
@@ -134,6 +134,7 @@ pub(super) fn read_model(path: &Path, limits: Limits) -> Result<(Definition, Mod
     let model_error = |error| match error {
         CompileError::Faults(faults) => CliError::Faults { what: path.display().to_string(), faults },
         CompileError::Cancelled(cancelled) => cancelled.into(),
+        CompileError::OutOfTime => Interrupted::OutOfTime.into(),
     };
     let definition = Definition::read(&read_json(path)?, Limits::NONE, &mut Uninterrupted).map_err(model_error)?;
     let model = Model::compile(&definition, limits, &mut Uninterrupted)?;

@@ -79,6 +79,9 @@ enum CliError {
     /// The search has no answer.
     #[error(transparent)]
     Cancelled(#[from] crate::interrupt::Cancelled),
+    /// A model could not be prepared.
+    #[error(transparent)]
+    Interrupted(#[from] crate::interrupt::Interrupted),
     /// The service did not start or run.
     #[error(transparent)]
     Server(#[from] ServerError),

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use super::{Attempt, Followed, Laboratory, LearnerId, Scene};
 use crate::attribute::Weights;
 use crate::document::{Faults, Place};
-use crate::interrupt::{Cancelled, Uninterrupted};
+use crate::interrupt::{Cancelled, Interrupted, Uninterrupted};
 use crate::learning::{Distribution, Learner, LearnerDocument, MissingAttributes};
 use crate::mapping::{Demonstration, Mapper, Mapping, Problem, Settings};
 use crate::model::{CompileError, Definition, Limits, Model};
@@ -28,6 +28,9 @@ pub enum LocalError {
     /// Never: nothing interrupts it.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
+    /// Never: nothing interrupts it.
+    #[error(transparent)]
+    Interrupted(#[from] Interrupted),
 }
 
 /// Learners and models in memory.

@@ -11,7 +11,7 @@ use super::reading::{Outline, RawStates, RawTransitions, Reader};
 use super::{ActionDocument, Cave, CompileError, Format, Limits, ReadError, TableDocument, WumpusDocument, table};
 use crate::attribute::{AttributeDocument, Schema};
 use crate::document::{Faults, ParseError, Path, Place};
-use crate::interrupt::{Cancelled, Interrupt, Meter};
+use crate::interrupt::{Interrupt, Interrupted, Meter};
 
 /// What a client registers as a model: checked, with defaults filled in, not yet compiled.
 #[derive(Clone, Debug)]
@@ -27,7 +27,8 @@ impl Definition {
     ///
     /// # Errors
     ///
-    /// [`CompileError::Faults`] with all faults of the document, [`CompileError::Cancelled`] if `interrupt` said so.
+    /// [`CompileError::Faults`] with all faults of the document, [`CompileError::Cancelled`] or [`CompileError::OutOfTime`] if
+    /// `interrupt` said so.
     pub fn read(
         document: &serde_json::Value,
         limits: Limits,
@@ -39,6 +40,7 @@ impl Definition {
         definition.map_err(|error| match error {
             ReadError::Faults(faults) | ReadError::Parse(ParseError::Faults(faults)) => faults.into(),
             ReadError::Cancelled(cancelled) => cancelled.into(),
+            ReadError::OutOfTime => CompileError::OutOfTime,
             // Values in memory are neither cut off nor malformed.
             error => Faults::one("", error.to_string()).into(),
         })
@@ -48,8 +50,8 @@ impl Definition {
     ///
     /// # Errors
     ///
-    /// [`ReadError::Parse`] and [`ReadError::Faults`] with all faults of the text, [`ReadError::Cancelled`] if `interrupt`
-    /// said so, [`ReadError::TooLarge`] if what is not in its lists of states and transitions is too much to keep.
+    /// [`ReadError::Parse`] and [`ReadError::Faults`] with all faults of the text, [`ReadError::Cancelled`] or [`ReadError::OutOfTime`] if
+    /// `interrupt` said so, [`ReadError::TooLarge`] if the model takes more memory than `limits` allow.
     pub fn parse(
         text: &[u8],
         format: Format,
@@ -86,9 +88,9 @@ impl Definition {
         }
     }
 
-    /// At most how much memory compiling it takes, in bytes: for as many states as it can have within `limits`.
+    /// About how much memory compiling it takes at most, in bytes: for as many states as it can have within `limits`.
     #[must_use]
-    pub fn compiling_bytes(&self, limits: Limits) -> usize {
+    pub fn compiling_bytes(&self, limits: Limits) -> u64 {
         match self {
             Self::Table(table) => table.compiling_bytes(),
             Self::Wumpus(cave) => cave.compiling_bytes(limits),
@@ -159,7 +161,7 @@ fn read_definition(
     limits: Limits,
     meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Result<Option<Definition>, Cancelled> {
+) -> Result<Option<Definition>, Interrupted> {
     let Some(object) = place.object(&["attributes", "actions", "dynamics"], faults) else { return Ok(None) };
     let dynamics = object.required("dynamics", faults);
     let kind = dynamics.and_then(|dynamics| dynamics.value.get("kind")).and_then(serde_json::Value::as_str);
@@ -254,6 +256,7 @@ mod tests {
     use crate::attribute::MAX_COST;
     use crate::document;
     use crate::interrupt::{Signal, Uninterrupted};
+    use crate::model::Model;
 
     fn read(text: &str) -> Definition {
         let document = document::parse(text.as_bytes()).unwrap();
@@ -409,5 +412,47 @@ mod tests {
             let cancelled = Definition::read(&model, Limits::DEFAULT, &mut cancel);
             assert!(matches!(cancelled, Err(CompileError::Cancelled(_))));
         }
+    }
+
+    /// A line of states in a table, of which each leads on to the next two, and the first ones; the attribute tells all of them apart.
+    fn line(n_states: usize) -> serde_json::Value {
+        let edges = (2..n_states).flat_map(|n| [json!([n - 2, "a", n - 1]), json!([n - 2, "b", n])]);
+        json!({
+            "attributes": [{"name": "x", "kind": "number"}], "actions": [{"name": "a"}, {"name": "b"}],
+            "dynamics": {
+                "kind": "table", "states": (0..n_states).map(|n| [n]).collect::<Vec<_>>(), "transitions": edges.collect::<Vec<_>>(),
+            },
+        })
+    }
+
+    #[test]
+    fn a_text_that_is_not_read_in_time_is_no_model() {
+        let model = two_states();
+        let read = Definition::read(&model, Limits::DEFAULT, &mut || Signal::Finish);
+        assert!(matches!(read, Err(CompileError::OutOfTime)), "{read:?}");
+        let text = model.to_string();
+        let read = Definition::parse(text.as_bytes(), Format::Json, Limits::DEFAULT, &mut || Signal::Finish);
+        assert!(matches!(read, Err(ReadError::OutOfTime)), "{read:?}");
+    }
+
+    #[test]
+    fn a_table_that_would_take_more_memory_than_it_may_is_refused_while_it_is_read() {
+        let text = line(2000).to_string();
+        let read = |max_bytes| {
+            let limits = Limits { max_bytes, ..Limits::NONE };
+            Definition::parse(text.as_bytes(), Format::Json, limits, &mut Uninterrupted)
+        };
+        let definition = read(usize::MAX).unwrap();
+        let model = Model::compile(&definition, Limits::NONE, &mut Uninterrupted).unwrap();
+        let n_bytes = model.size_bytes();
+        assert!(read(6 * n_bytes).is_ok());
+        // Whether its states are too many, or its transitions.
+        for max_bytes in [n_bytes / 8, n_bytes] {
+            let error = read(max_bytes).unwrap_err();
+            assert!(matches!(&error, ReadError::TooLarge(detail) if detail.contains("ETUDE_MAX_MEMORY")), "{error}");
+        }
+        let limits = Limits { max_bytes: n_bytes, ..Limits::NONE };
+        let read = Definition::read(&line(2000), limits, &mut Uninterrupted);
+        assert!(matches!(read, Err(CompileError::Faults(_))), "{read:?}");
     }
 }

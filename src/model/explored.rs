@@ -4,6 +4,7 @@ use rustc_hash::FxHashMap;
 
 use super::wumpus::{Act, Cave, CaveState};
 use super::{ActionIdx, Graph, Space, StateIdx, States, Transition};
+use crate::interrupt::{Interrupted, Meter};
 
 /// The states of a cave that were found, numbered in the order in which they were, and the ways out of those that were explored.
 ///
@@ -44,6 +45,11 @@ impl<'c> Explored<'c> {
         self.found.len()
     }
 
+    /// How many ways out of those that were explored.
+    pub(super) fn n_ways(&self) -> usize {
+        self.ways.len()
+    }
+
     /// How much work it is to explore a state, in successors.
     pub(super) fn n_acts(&self) -> u64 {
         self.acts.len() as u64
@@ -56,15 +62,19 @@ impl<'c> Explored<'c> {
     }
 
     /// What was found: the states, and the transitions between them.
-    pub(super) fn into_parts(self) -> (States, Graph) {
+    ///
+    /// # Errors
+    ///
+    /// What the interrupt of `meter` said, if that was not to continue.
+    pub(super) fn into_parts(self, meter: &mut Meter<'_>) -> Result<(States, Graph), Interrupted> {
         let Self { states, bounds, ways, .. } = self;
         let explored = (0..).zip(&bounds).filter(|(_, bounds)| **bounds != UNEXPLORED);
         let edges = explored.flat_map(|(from, (begin, end))| {
             let ways = &ways[*begin as usize..*end as usize];
             ways.iter().map(move |way| (from, *way))
         });
-        let graph = Graph::new(states.len() as usize, edges);
-        (states, graph)
+        let graph = Graph::new(states.len() as usize, edges, meter)?;
+        Ok((states, graph))
     }
 
     fn number_of(&mut self, state: CaveState) -> StateIdx {

@@ -1,6 +1,7 @@
 //! The state graph that searches run on.
 
 use super::{ActionIdx, Rows, StateIdx};
+use crate::interrupt::{Interrupted, Meter};
 
 /// One way out of a state.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -22,18 +23,29 @@ impl Graph {
     /// A graph of `n_states` states with the transitions that `edges` gives, in any order. It goes through them twice, so that
     /// nothing is kept but the graph. `O(n_states + E log d)`, d the most transitions out of a state.
     ///
+    /// # Errors
+    ///
+    /// What the interrupt of `meter` said, if that was not to continue.
+    ///
     /// # Panics
     ///
     /// If there are 2^32 transitions or more.
-    pub(super) fn new<E>(n_states: usize, edges: E) -> Self
+    pub(super) fn new<E>(n_states: usize, edges: E, meter: &mut Meter<'_>) -> Result<Self, Interrupted>
     where
         E: Iterator<Item = (StateIdx, Transition)> + Clone,
     {
-        let mut transitions = Rows::of_entries(n_states, edges);
+        let mut transitions = Rows::try_of_entries(n_states, edges, || meter.spend_or_stop(1))?;
         for state in 0..n_states {
-            transitions.of_mut(state).sort_unstable_by_key(|transition| (transition.action, transition.to));
+            let out = transitions.of_mut(state);
+            meter.spend_or_stop(1 + out.len() as u64)?;
+            out.sort_unstable_by_key(|transition| (transition.action, transition.to));
         }
-        Self { transitions }
+        Ok(Self { transitions })
+    }
+
+    /// A graph of a single state, which no transition leaves.
+    pub(super) fn of_one_state() -> Self {
+        Self { transitions: Rows::of_entries(1, std::iter::empty()) }
     }
 
     /// The ways out of `state`, in the order of their actions.

@@ -41,7 +41,7 @@ pub use wumpus::{Act, Cave, CaveState, Cell, CellDocument, Heading, PoseDocument
 
 use crate::attribute::{ByAttribute, Scalar, Schema, Value};
 use crate::document::{Faults, Place};
-use crate::interrupt::{Cancelled, Interrupt};
+use crate::interrupt::{Cancelled, Interrupt, Interrupted};
 
 /// What a model may at most be.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,13 +51,22 @@ pub struct Limits {
     pub max_states: usize,
     /// Most transitions of a table.
     pub max_transitions: usize,
+    /// Most values of the states of a wumpus world, one for each state and attribute, as they are reached: to make these takes the time.
+    /// If there are more, they are left to searches.
+    pub max_values: usize,
+    /// About how much memory the model may take while it is compiled, in bytes. A wumpus world that would take more is left to searches; a
+    /// table is refused ([`ReadError::TooLarge`]).
+    pub max_bytes: usize,
 }
 
 impl Limits {
-    /// One million states and ten million transitions: a few hundred MB.
-    pub const DEFAULT: Self = Self { max_states: 1_000_000, max_transitions: 10_000_000 };
+    /// One million states and ten million transitions, which take a few hundred MB, at most 4 GB; and no more values than are made in a
+    /// few seconds.
+    pub const DEFAULT: Self =
+        Self { max_states: 1_000_000, max_transitions: 10_000_000, max_values: 1 << 27, max_bytes: 4 << 30 };
     /// As much as can be told apart by indices.
-    pub const NONE: Self = Self { max_states: usize::MAX, max_transitions: usize::MAX };
+    pub const NONE: Self =
+        Self { max_states: usize::MAX, max_transitions: usize::MAX, max_values: usize::MAX, max_bytes: usize::MAX };
 }
 
 /// Why a definition gives no model.
@@ -69,6 +78,18 @@ pub enum CompileError {
     /// The caller lost interest.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
+    /// It takes longer than there was time.
+    #[error("out of time")]
+    OutOfTime,
+}
+
+impl From<Interrupted> for CompileError {
+    fn from(interrupted: Interrupted) -> Self {
+        match interrupted {
+            Interrupted::Cancelled(cancelled) => Self::Cancelled(cancelled),
+            Interrupted::OutOfTime => Self::OutOfTime,
+        }
+    }
 }
 
 /// Where a request says that the imitator starts.
@@ -120,15 +141,18 @@ pub struct Model {
 }
 
 impl Model {
-    /// Compiles `definition`. A wumpus world of more than `limits.max_states` reachable states becomes a model that is searched
-    /// lazily.
+    /// Compiles `definition`. A wumpus world that is larger than `limits` allow becomes a model that is searched lazily.
     ///
     /// # Errors
     ///
-    /// [`Cancelled`] if `interrupt` said so.
-    pub fn compile(definition: &Definition, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
+    /// What `interrupt` said, if that was not to continue.
+    pub fn compile(
+        definition: &Definition,
+        limits: Limits,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Self, Interrupted> {
         match definition {
-            Definition::Table(table) => Ok(table.compile()),
+            Definition::Table(table) => table.compile(interrupt),
             Definition::Wumpus(cave) => cave.compile(limits, interrupt),
         }
     }
@@ -211,6 +235,23 @@ impl Model {
     pub(crate) fn state_bytes(&self) -> usize {
         let first = || serde_json::to_string(&self.describe(0)).map_or(usize::MAX, |text| text.len());
         *self.state_bytes.get_or_init(first)
+    }
+
+    /// About how much memory it takes to read and compile a model of so many states, transitions and attributes, in bytes: enough for
+    /// most. Where nearly every state has a value of its own in several attributes, or texts are long, it takes more, as
+    /// [`Self::size_bytes`] tells in the end.
+    #[must_use]
+    pub fn compiled_bytes(n_states: u64, n_transitions: u64, n_attributes: u64) -> u64 {
+        /// Besides its row: where its transitions begin, and a value of its own.
+        const STATE_BYTES: u64 = 32;
+        /// Listed, in the graph and in a projection.
+        const TRANSITION_BYTES: u64 = 20;
+        /// Domains, actions and what else there is once.
+        const OTHER_BYTES: u64 = 1 << 16;
+        // Of the rows, some more while they are read.
+        let row_bytes = n_attributes * (size_of::<u32>() as u64) * 3 / 2;
+        let states = n_states.saturating_mul(row_bytes + STATE_BYTES);
+        states.saturating_add(n_transitions.saturating_mul(TRANSITION_BYTES)).saturating_add(OTHER_BYTES)
     }
 
     /// Approximate size in memory, in bytes.

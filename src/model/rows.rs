@@ -1,5 +1,7 @@
 //! Rows of different lengths, side by side in memory.
 
+use std::convert::Infallible;
+
 /// Rows of items in one array (compressed sparse rows).
 #[derive(Clone, Debug)]
 pub(crate) struct Rows<T> {
@@ -22,11 +24,30 @@ impl<T: Copy> Rows<T> {
     ///
     /// If there are 2^32 entries or more.
     pub(crate) fn of_entries(n_rows: usize, entries: impl Iterator<Item = (u32, T)> + Clone) -> Self {
+        let Ok(rows) = Self::try_of_entries(n_rows, entries, || Ok::<_, Infallible>(()));
+        rows
+    }
+
+    /// The same; `go_on` is asked before each look at an entry, of which there are two.
+    ///
+    /// # Errors
+    ///
+    /// What `go_on` said.
+    ///
+    /// # Panics
+    ///
+    /// If there are 2^32 entries or more.
+    pub(crate) fn try_of_entries<E>(
+        n_rows: usize,
+        entries: impl Iterator<Item = (u32, T)> + Clone,
+        mut go_on: impl FnMut() -> Result<(), E>,
+    ) -> Result<Self, E> {
         // First `offsets[n + 1]` is where row `n` begins, and moves on as items are put in; in the end it is where it ends.
         let mut offsets = vec![0u32; n_rows + 1];
         let mut n_entries = 0usize;
         let mut any = None;
         for (row, item) in entries.clone() {
+            go_on()?;
             n_entries += 1;
             any = Some(item);
             if let Some(next) = offsets.get_mut(row as usize + 2) {
@@ -39,11 +60,12 @@ impl<T: Copy> Rows<T> {
         }
         let mut items = any.map_or(Vec::new(), |any| vec![any; n_entries]);
         for (row, item) in entries {
+            go_on()?;
             let next = &mut offsets[row as usize + 1];
             items[*next as usize] = item;
             *next += 1;
         }
-        Self { offsets, items }
+        Ok(Self { offsets, items })
     }
 
     /// Rows of the same lengths.

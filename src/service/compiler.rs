@@ -14,11 +14,11 @@ use super::models::{ModelText, corrupt_definition, unknown};
 use super::pool::Admission;
 use super::{Client, Etude, PipeWriter, PoolError, SearchPool, ServiceError, Settings, pipe};
 use crate::document::Faults;
-use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::interrupt::{Interrupt, Interrupted, Signal};
 use crate::mapping::Mapper;
 use crate::memory::{Held, Memory, NoRoom};
 use crate::model::{Definition, Format, Limits, Model};
-use crate::store::{ModelKey, Store, StoreError, StoredDefinition};
+use crate::store::{ModelKey, ModelSize, Store, StoreError, StoredDefinition};
 
 /// Makes models ready, and keeps as many as fit.
 #[derive(Clone, Debug)]
@@ -48,8 +48,7 @@ impl Compiler {
     /// # Errors
     ///
     /// [`NoRoom`] if there is not so much.
-    pub(super) fn take(&self, n_bytes: usize) -> Result<Held, NoRoom> {
-        let n_bytes = n_bytes as u64;
+    pub(super) fn take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
         self.memory.try_take(n_bytes).or_else(|_| {
             self.cache.clear();
             self.memory.try_take(n_bytes)
@@ -68,22 +67,13 @@ impl Compiler {
         limits: Limits,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapper, ServiceError> {
-        let mut limited = LimitedTime { inner: interrupt, left: self.max_time, last: Instant::now(), is_over: false };
-        let compiled = Model::compile(&definition, limits, &mut limited).and_then(|model| {
-            drop(definition);
-            Mapper::new(model, &mut limited)
-        });
-        let mapper = match compiled {
-            Ok(mapper) => mapper,
-            Err(Cancelled) if limited.is_over => {
-                let detail = format!(
-                    "compiling it takes longer than {} s, the limit of this service (ETUDE_MAX_COMPILE_TIME)",
-                    self.max_time.as_secs_f64()
-                );
-                return Err(Faults::one("/dynamics", detail).into());
-            }
-            Err(Cancelled) => return Err(PoolError::Stopped.into()),
-        };
+        /// What was taken is a good guess, not more.
+        const SLACK_BYTES: u64 = 16 << 20;
+        let max_bytes = usize::try_from(2 * held.n_bytes() + SLACK_BYTES).unwrap_or(usize::MAX);
+        let mut limited = LimitedTime::new(interrupt, self.max_time);
+        let model = Model::compile(&definition, limits, &mut limited)?;
+        drop(definition);
+        let mapper = Mapper::within(model, max_bytes, &mut limited)?;
         let n_bytes = mapper.size_bytes() as u64;
         held.shrink_to(n_bytes);
         held.grow_to(n_bytes)?;
@@ -103,9 +93,9 @@ impl Compiler {
             // Deleted and registered anew in between, it has another hash; then the next request finds that.
             let row = self.store.model(&name).await?.filter(|row| row.summary.hash == key.hash).ok_or_else(unknown)?;
             let n_attributes = row.summary.attributes.len();
-            let held = self.take(
-                row.summary.size.map_or(0, |size| needed_bytes(size.n_states, size.n_transitions, n_attributes)),
-            )?;
+            let needed =
+                |size: ModelSize| Model::compiled_bytes(size.n_states, size.n_transitions, n_attributes as u64);
+            let held = self.take(row.summary.size.map_or(0, needed))?;
             let (text, feed) = match row.definition {
                 StoredDefinition::Text(text) => (ModelText::Whole(text.into_bytes()), None),
                 StoredDefinition::Pieces(id) => {
@@ -147,12 +137,6 @@ impl Compiler {
     }
 }
 
-/// About how much memory a model takes while it is compiled.
-fn needed_bytes(n_states: u64, n_transitions: u64, n_attributes: usize) -> usize {
-    let n_bytes = n_states * (16 + 4 * n_attributes as u64) + n_transitions * 24;
-    usize::try_from(n_bytes).unwrap_or(usize::MAX)
-}
-
 /// Sends the pieces of a definition to their reader.
 async fn feed(store: &Store, id: i64, to_reader: PipeWriter<Vec<u8>>) -> Result<(), ServiceError> {
     for seq in 0.. {
@@ -165,12 +149,17 @@ async fn feed(store: &Store, id: i64, to_reader: PipeWriter<Vec<u8>>) -> Result<
     Ok(())
 }
 
-/// Cancels what takes too long, not counting the time in which it makes way for others.
-struct LimitedTime<'i> {
+/// Ends what takes too long, not counting the time in which it makes way for others.
+pub(super) struct LimitedTime<'i> {
     inner: &'i mut dyn Interrupt,
     left: Duration,
     last: Instant,
-    is_over: bool,
+}
+
+impl<'i> LimitedTime<'i> {
+    pub(super) fn new(inner: &'i mut dyn Interrupt, max_time: Duration) -> Self {
+        Self { inner, left: max_time, last: Instant::now() }
+    }
 }
 
 impl Interrupt for LimitedTime<'_> {
@@ -178,8 +167,19 @@ impl Interrupt for LimitedTime<'_> {
         self.left = self.left.saturating_sub(self.last.elapsed());
         let signal = self.inner.poll();
         self.last = Instant::now();
-        self.is_over = self.left.is_zero();
-        if self.is_over { Signal::Cancel } else { signal }
+        if signal == Signal::Continue && self.left.is_zero() { Signal::Finish } else { signal }
+    }
+}
+
+impl From<Interrupted> for ServiceError {
+    fn from(interrupted: Interrupted) -> Self {
+        match interrupted {
+            Interrupted::Cancelled(_) => PoolError::Stopped.into(),
+            Interrupted::OutOfTime => {
+                let detail = "compiling the model takes longer than this service allows (ETUDE_MAX_COMPILE_TIME)";
+                Faults::one("/dynamics", detail).into()
+            }
+        }
     }
 }
 

@@ -7,11 +7,11 @@ use serde_json::value::RawValue;
 use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 
-use super::compiler::Compiler;
+use super::compiler::{Compiler, LimitedTime};
 use super::pool::Places;
 use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::attribute::AttributeDocument;
-use crate::interrupt::{Cancelled, Interrupt};
+use crate::interrupt::{Interrupt, Interrupted};
 use crate::mapping::Mapper;
 use crate::model::{ActionDocument, Definition, Format, Limits, ReadError, hex};
 use crate::store::{
@@ -140,8 +140,9 @@ impl Etude {
             tokio::join!(self.pool.run_patiently(caller.client, job), self.store_pieces(pieces))
         } else {
             let place = self.pool.admit(caller.client)?;
+            let max_time = self.time_limits.compile;
             let job = move |interrupt: &mut dyn Interrupt| {
-                let read = text.read(format, limits, interrupt);
+                let read = text.read(format, limits, &mut LimitedTime::new(interrupt, max_time));
                 Ok(prepare(read, interrupt))
             };
             tokio::join!(place.run(None, job), self.store_pieces(pieces))
@@ -261,7 +262,8 @@ impl From<ReadError> for ServiceError {
         match error {
             ReadError::Parse(error) => error.into(),
             ReadError::Faults(faults) => faults.into(),
-            ReadError::Cancelled(Cancelled) => PoolError::Stopped.into(),
+            ReadError::Cancelled(cancelled) => Interrupted::from(cancelled).into(),
+            ReadError::OutOfTime => Interrupted::OutOfTime.into(),
             ReadError::TooLarge(detail) => Self::TooLarge(detail),
             ReadError::Read(error) => Self::Body(error),
         }

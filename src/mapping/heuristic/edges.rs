@@ -8,6 +8,8 @@ use crate::model::{ActionIdx, Operator};
 /// The edges of all groups, as they are found.
 pub(super) struct EdgeSets<'g> {
     groups: &'g [Group],
+    /// By an attribute's position: the group that it is in.
+    group_of: FxHashMap<usize, u16>,
     /// By group; `None` for one that is left out.
     pub(super) edges: Vec<Option<FxHashSet<(ClassIdx, ProjectedEdge)>>>,
     n_edges: usize,
@@ -20,12 +22,19 @@ pub(super) struct EdgeSets<'g> {
 impl<'g> EdgeSets<'g> {
     pub(super) fn of(groups: &'g [Group], max_edges: usize) -> Self {
         let edges = vec![Some(FxHashSet::default()); groups.len()];
-        Self { groups, edges, n_edges: 0, max_edges, change_sets: ChangeSets::default(), changed: Vec::new() }
+        let positions =
+            groups.iter().zip(0..).flat_map(|(group, number)| group.positions().map(move |at| (at, number)));
+        let group_of = positions.collect();
+        Self { groups, group_of, edges, n_edges: 0, max_edges, change_sets: ChangeSets::default(), changed: Vec::new() }
     }
 
     /// Adds what a transition between states with these rows changes.
     pub(super) fn add_transition(&mut self, action: ActionIdx, row: &[u32], row_after: &[u32]) {
-        let change_set = self.change_set(|group| group.positions().any(|at| row[at] != row_after[at]));
+        let kept = self.groups.iter().zip(&self.edges).zip(0u16..).filter(|((_, edges), _)| edges.is_some());
+        let changed = kept.filter(|((group, _), _)| group.positions().any(|at| row[at] != row_after[at]));
+        self.changed.clear();
+        self.changed.extend(changed.map(|(_, number)| number));
+        let change_set = self.change_sets.number_of(&self.changed);
         let groups = self.groups;
         for n in 0..self.changed.len() {
             let group = &groups[usize::from(self.changed[n])];
@@ -38,7 +47,12 @@ impl<'g> EdgeSets<'g> {
 
     /// Adds what any transition that is like `operator` may change.
     pub(super) fn add_operator(&mut self, operator: &Operator) {
-        let change_set = self.change_set(|group| operator.changed.iter().any(|(at, _, _)| group.has(*at)));
+        let changed = operator.changed.iter().filter_map(|(at, _, _)| self.group_of.get(at).copied());
+        self.changed.clear();
+        self.changed.extend(changed.filter(|number| self.edges[usize::from(*number)].is_some()));
+        self.changed.sort_unstable();
+        self.changed.dedup();
+        let change_set = self.change_sets.number_of(&self.changed);
         let groups = self.groups;
         for n in 0..self.changed.len() {
             for (from, to) in groups[usize::from(self.changed[n])].classes_of(operator) {
@@ -46,14 +60,6 @@ impl<'g> EdgeSets<'g> {
             }
         }
         self.make_room();
-    }
-
-    /// Finds the groups that change, and numbers the set of them.
-    fn change_set(&mut self, is_changed: impl Fn(&Group) -> bool) -> u32 {
-        let kept = self.groups.iter().zip(&self.edges).zip(0u16..).filter(|((_, edges), _)| edges.is_some());
-        self.changed.clear();
-        self.changed.extend(kept.filter(|((group, _), _)| is_changed(group)).map(|(_, number)| number));
-        self.change_sets.number_of(&self.changed)
     }
 
     /// Adds an edge of the `n`-th group that changes.

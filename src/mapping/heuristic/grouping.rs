@@ -10,7 +10,7 @@ use std::cmp::{Ordering, Reverse};
 
 use rustc_hash::{FxHashMap, FxHashSet};
 
-use crate::interrupt::{Cancelled, Interrupt, Meter};
+use crate::interrupt::{Interrupt, Interrupted, Meter};
 use crate::model::{ActionIdx, Model, StateIdx};
 
 /// A partition of attributes: their positions, ascending in each group.
@@ -28,8 +28,8 @@ const MAX_LOOKS: usize = 1 << 21;
 ///
 /// # Errors
 ///
-/// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
-pub(super) fn choose(model: &Model, interrupt: &mut dyn Interrupt) -> Result<Vec<Partition>, Cancelled> {
+/// What `interrupt` said, if that was not to continue.
+pub(super) fn choose(model: &Model, interrupt: &mut dyn Interrupt) -> Result<Vec<Partition>, Interrupted> {
     let varying: Vec<usize> = (0..model.schema().len()).filter(|at| model.states().domain(*at).len() > 1).collect();
     let restrictions = Restrictions::new(model, interrupt)?;
     let sizes: Vec<usize> = (0..model.schema().len()).map(|at| model.states().domain(at).len()).collect();
@@ -113,7 +113,7 @@ const CHANCE: f64 = 0.01;
 const FEW: f64 = 0.6;
 
 impl Restrictions {
-    fn new(model: &Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
+    fn new(model: &Model, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
         /// How many values are looked at between two looks at the interrupt: about a millisecond.
         const POLL_EVERY: u64 = 1 << 14;
         let n_attributes = model.schema().len();
@@ -124,7 +124,7 @@ impl Restrictions {
         for state in &states {
             let row = model.states().row(*state);
             for transition in model.graph().successors(*state) {
-                meter.spend_or_cancel(n_attributes as u64)?;
+                meter.spend_or_stop(n_attributes as u64)?;
                 n_transitions += 1;
                 let row_after = model.states().row(transition.to);
                 for attribute in (0..n_attributes).filter(|at| row[*at] != row_after[*at]) {
@@ -149,7 +149,7 @@ impl Restrictions {
         for other in 0..n_attributes {
             let mut expected = Expected::new(states.iter().map(|state| model.states().row(*state)[other]));
             for (change, seen) in sightings.iter().filter(|(change, _)| change.attribute != other) {
-                meter.spend_or_cancel(seen.states.len() as u64)?;
+                meter.spend_or_stop(seen.states.len() as u64)?;
                 let values: FxHashSet<u32> =
                     seen.states.iter().map(|state| model.states().row(*state)[other]).collect();
                 #[expect(clippy::cast_precision_loss, reason = "at most `MAX_SIGHTINGS`")]

@@ -29,7 +29,7 @@ use rustc_hash::FxHashMap;
 
 use super::edges::EdgeSets;
 use super::grouping::{self, Partition};
-use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
+use crate::interrupt::{Interrupt, Interrupted, Meter};
 use crate::model::{ActionIdx, Model, Operator, Rows};
 
 /// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
@@ -93,16 +93,19 @@ pub(super) struct ProjectedEdge {
 const MAX_EDGES: usize = 1 << 24;
 
 impl Projections {
-    /// Projects `model` on each of its attributes that varies; a model that is searched lazily, by its operators.
+    /// Projects `model` on each of its attributes that varies; a model that is searched lazily, by its operators. Takes about
+    /// `max_bytes` at most while it does: attributes of which the projections do not fit are left out.
     ///
     /// # Errors
     ///
-    /// [`Cancelled`] if `interrupt` said so.
-    pub(crate) fn new(model: &Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
-        Self::bounded(model, MAX_EDGES, interrupt)
+    /// What `interrupt` said, if that was not to continue.
+    pub(crate) fn new(model: &Model, max_bytes: usize, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
+        /// What an edge takes in a set of them, which is at most half empty just after it has grown, and then in a list and in rows.
+        const EDGE_BYTES: usize = 4 * size_of::<(ClassIdx, ProjectedEdge)>();
+        Self::bounded(model, MAX_EDGES.min(max_bytes / EDGE_BYTES), interrupt)
     }
 
-    fn bounded(model: &Model, max_edges: usize, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
+    fn bounded(model: &Model, max_edges: usize, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
         /// How many classes are looked up between two looks at the interrupt: about a millisecond.
         const POLL_EVERY: u64 = 1 << 14;
         let mut meter = Meter::new(interrupt, POLL_EVERY);
@@ -115,13 +118,13 @@ impl Projections {
         match model.unexplored() {
             None => {
                 for (from, transition) in model.graph().iter() {
-                    meter.spend_or_cancel(groups.len() as u64)?;
+                    meter.spend_or_stop(groups.len() as u64)?;
                     found.add_transition(transition.action, states.row(from), states.row(transition.to));
                 }
             }
             Some(cave) => {
                 for operator in cave.operators() {
-                    meter.spend_or_cancel(groups.len() as u64)?;
+                    meter.spend_or_stop(groups.len() as u64)?;
                     found.add_operator(&operator);
                 }
             }
@@ -151,18 +154,7 @@ impl Projections {
         model: &Model,
         level: usize,
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Option<&[Group]>, Signal> {
-        let mut interrupt = Stopper { interrupt, signal: Signal::Continue };
-        let built = self.level_or_cancelled(model, level, &mut interrupt);
-        built.map_err(|Cancelled| interrupt.signal)
-    }
-
-    fn level_or_cancelled(
-        &self,
-        model: &Model,
-        level: usize,
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<Option<&[Group]>, Cancelled> {
+    ) -> Result<Option<&[Group]>, Interrupted> {
         // Two searches that come at the same time may both do the work, with the same result.
         let levels = if let Some(levels) = self.levels.get() {
             levels
@@ -187,7 +179,7 @@ impl Projections {
         partition: &Partition,
         max_edges: usize,
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Vec<Group>, Cancelled> {
+    ) -> Result<Vec<Group>, Interrupted> {
         /// How many classes are looked up between two looks at the interrupt: about a millisecond.
         const POLL_EVERY: u64 = 1 << 14;
         let mut meter = Meter::new(interrupt, POLL_EVERY);
@@ -199,7 +191,7 @@ impl Projections {
         let mut edges: Vec<Vec<(ClassIdx, ProjectedEdge)>> = vec![Vec::new(); groups.len()];
         let mut changed = Vec::new();
         for (from, transition) in model.graph().iter() {
-            meter.spend_or_cancel((self.groups.len() + groups.len()) as u64)?;
+            meter.spend_or_stop((self.groups.len() + groups.len()) as u64)?;
             let (row, row_after) = (states.row(from), states.row(transition.to));
             let is_changed = |group: &Group| group.positions().any(|at| row[at] != row_after[at]);
             changed.clear();
@@ -242,24 +234,11 @@ impl Projections {
     }
 }
 
-/// Makes every signal but to continue a reason to cancel, and remembers it.
-struct Stopper<'i> {
-    interrupt: &'i mut dyn Interrupt,
-    signal: Signal,
-}
-
-impl Interrupt for Stopper<'_> {
-    fn poll(&mut self) -> Signal {
-        self.signal = self.interrupt.poll();
-        if self.signal == Signal::Continue { Signal::Continue } else { Signal::Cancel }
-    }
-}
-
 #[cfg(test)]
 impl Projections {
     /// As if these partitions had been chosen.
     pub(super) fn with_levels(model: &Model, partitions: impl IntoIterator<Item = Partition>) -> Self {
-        let projections = Self::new(model, &mut crate::interrupt::Uninterrupted).unwrap();
+        let projections = Self::new(model, usize::MAX, &mut crate::interrupt::Uninterrupted).unwrap();
         let levels = partitions.into_iter().map(|partition| Level { partition, groups: OnceLock::new() });
         projections.levels.set(levels.collect()).unwrap();
         projections
@@ -279,11 +258,11 @@ impl Group {
     }
 
     /// Takes the edges, each with the class that it leads to, and sorts them.
-    fn set_edges(&mut self, edges: &[(ClassIdx, ProjectedEdge)], meter: &mut Meter<'_>) -> Result<(), Cancelled> {
+    fn set_edges(&mut self, edges: &[(ClassIdx, ProjectedEdge)], meter: &mut Meter<'_>) -> Result<(), Interrupted> {
         self.edges = Rows::of_entries(self.n_classes, edges.iter().copied());
         for class in 0..self.n_classes {
             let into = self.edges.of_mut(class);
-            meter.spend_or_cancel(1 + into.len() as u64)?;
+            meter.spend_or_stop(1 + into.len() as u64)?;
             into.sort_unstable();
         }
         self.edges.dedup(|edge, other| edge == other);

@@ -19,7 +19,7 @@ use super::heuristic::projected::{self, MAX_ENTRIES, Projected};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
 use super::search::{Found, Move, astar, best_first, layered};
-use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
+use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
 use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
 use escalation::Patience;
 
@@ -172,9 +172,20 @@ impl Mapper {
     ///
     /// # Errors
     ///
-    /// [`Cancelled`] if `interrupt` said so. It is not asked to finish.
-    pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Cancelled> {
-        let projections = Projections::new(&model, interrupt)?;
+    /// What `interrupt` said, if that was not to continue.
+    pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
+        Self::within(model, usize::MAX, interrupt)
+    }
+
+    /// As [`Self::new`], in about `max_bytes` at most, those of the model included: attributes of which the projections do not fit are not
+    /// projected. Searches take longer without, and find the same.
+    ///
+    /// # Errors
+    ///
+    /// What `interrupt` said, if that was not to continue.
+    pub fn within(model: Model, max_bytes: usize, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
+        let left = max_bytes.saturating_sub(model.size_bytes());
+        let projections = Projections::new(&model, left, interrupt)?;
         let (model, buffers) = (Arc::new(model), Mutex::default());
         Ok(Self { model, projections, buffers, patience: Patience::DEFAULT, kept: None })
     }

@@ -3,6 +3,7 @@
 use super::raw::{Distinct, Raw};
 use crate::attribute::Schema;
 use crate::document::{Faults, Path};
+use crate::model::Transition;
 
 /// Most states that can be told apart by an index, with one index to spare.
 pub(super) const MAX_STATES: usize = u32::MAX as usize - 1;
@@ -76,6 +77,14 @@ pub(in crate::model) struct RawStates {
 impl RawStates {
     pub(in crate::model) const NO_ROW: u32 = u32::MAX;
 
+    /// About how much memory they take, in bytes, and will take.
+    pub(super) fn size_bytes(&self) -> usize {
+        /// Where the transitions of a state begin, in two lists.
+        const STATE_BYTES: usize = 2 * size_of::<u32>();
+        let columns: usize = self.columns.iter().map(Distinct::size_bytes).sum();
+        columns + size_of_val(self.cells.as_slice()) + self.n_states * STATE_BYTES
+    }
+
     /// Ends a row of `len` cells, of which the first [`Schema::MAX_ATTRIBUTES`] were added.
     pub(super) fn end_row(&mut self, len: usize) {
         if self.n_states == 0 {
@@ -141,6 +150,13 @@ pub(in crate::model) struct RawTransitions {
 
 impl RawTransitions {
     pub(in crate::model) const NOWHERE: u32 = u32::MAX;
+
+    /// About how much memory they take, in bytes, and will take.
+    pub(super) fn size_bytes(&self) -> usize {
+        /// Listed, and in the graph.
+        const TRANSITION_BYTES: usize = 10 + size_of::<Transition>();
+        self.from.len() * TRANSITION_BYTES
+    }
 
     pub(super) fn add(&mut self, from: RawIndex, reference: u32, to: RawIndex) {
         match (from, u16::try_from(reference), to) {

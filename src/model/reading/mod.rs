@@ -23,7 +23,7 @@ use serde_json::Value;
 
 use super::Limits;
 use crate::document::{self, BEYOND_FLOATS, Faults, ParseError, Path};
-use crate::interrupt::{Cancelled, Meter};
+use crate::interrupt::{Cancelled, Interrupted, Meter};
 
 /// How the text of a model is laid out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,12 +46,24 @@ pub enum ReadError {
     /// The caller lost interest.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
-    /// What must be kept in memory while it is read is too large.
+    /// It was not read to its end in the time that there was.
+    #[error("out of time")]
+    OutOfTime,
+    /// What must be kept in memory is too large.
     #[error("{0}")]
     TooLarge(String),
     /// The text could not be read to its end.
     #[error("the text could not be read")]
     Read(#[source] io::Error),
+}
+
+impl From<Interrupted> for ReadError {
+    fn from(interrupted: Interrupted) -> Self {
+        match interrupted {
+            Interrupted::Cancelled(cancelled) => Self::Cancelled(cancelled),
+            Interrupted::OutOfTime => Self::OutOfTime,
+        }
+    }
 }
 
 /// A model's document without its long lists.
@@ -88,7 +100,7 @@ pub(super) struct Reader<'m, 'i> {
 
 #[derive(Debug)]
 enum Stop {
-    Cancelled,
+    Interrupted(Interrupted),
     TooLarge(String),
 }
 
@@ -111,12 +123,13 @@ impl<'m, 'i> Reader<'m, 'i> {
             limits: Limits {
                 max_states: limits.max_states.min(lists::MAX_STATES),
                 max_transitions: limits.max_transitions.min(lists::MAX_TRANSITIONS),
+                ..limits
             },
             states: None,
             transitions: None,
             line: None,
             n_held_bytes: 0,
-            max_held_bytes: MAX_HELD_BYTES,
+            max_held_bytes: MAX_HELD_BYTES.min(limits.max_bytes),
             twice: Vec::new(),
             stop: None,
             trace: Vec::new(),
@@ -208,7 +221,7 @@ impl<'m, 'i> Reader<'m, 'i> {
     /// What an error means that was raised within a seed.
     fn explain(&mut self, error: serde_json::Error) -> ReadError {
         match self.stop.take() {
-            Some(Stop::Cancelled) => return Cancelled.into(),
+            Some(Stop::Interrupted(interrupted)) => return interrupted.into(),
             Some(Stop::TooLarge(detail)) => return ReadError::TooLarge(detail),
             None => {}
         }

@@ -5,7 +5,7 @@ use std::hash::BuildHasher;
 
 use hashbrown::{DefaultHashBuilder, HashTable};
 
-use crate::attribute::Attribute;
+use crate::attribute::{Attribute, Value};
 use crate::document::{Excerpt, Quoted};
 
 /// A JSON value without what it contains; `T` is a text, borrowed or owned.
@@ -92,12 +92,13 @@ pub(in crate::model) struct Distinct {
     /// Into `values`. Hashed with a seed, as clients choose the values; 5 bytes each.
     numbers: HashTable<u32>,
     hasher: DefaultHashBuilder,
+    n_text_bytes: usize,
 }
 
 impl Distinct {
     /// The number of `found`.
     pub(super) fn number_of(&mut self, found: Raw<&str>) -> u32 {
-        let Self { values, numbers, hasher } = self;
+        let Self { values, numbers, hasher, n_text_bytes } = self;
         let hash = hasher.hash_one(found);
         let is_found = |number: &u32| values[*number as usize].borrowed() == found;
         if let Some(number) = numbers.find(hash, is_found) {
@@ -105,9 +106,20 @@ impl Distinct {
         }
         #[expect(clippy::cast_possible_truncation, reason = "fewer than cells, of which limits allow fewer than 2^32")]
         let number = values.len() as u32;
-        values.push(found.owned());
+        let found = found.owned();
+        if let Raw::Text(text) = &found {
+            *n_text_bytes += text.len();
+        }
+        values.push(found);
         numbers.insert_unique(hash, number, |number| hasher.hash_one(values[*number as usize].borrowed()));
         number
+    }
+
+    /// About how much memory they take, in bytes, and what they are read into: values of an attribute, which also ways between them
+    /// refer to.
+    pub(super) fn size_bytes(&self) -> usize {
+        const VALUE_BYTES: usize = 2 * size_of::<Raw>() + 2 * size_of::<Value>();
+        self.values.len() * VALUE_BYTES + 2 * self.n_text_bytes
     }
 
     /// The values, in the order of their numbers.

@@ -7,7 +7,7 @@ use serde_json::{Map, Value};
 
 use super::lists::{NoTransition, RawIndex, RawStates, RawTransitions};
 use super::raw::{Distinct, Raw};
-use super::{Reader, Step, Stop};
+use super::{Limits, Reader, Step, Stop};
 use crate::attribute::Schema;
 use crate::interrupt::Meter;
 
@@ -196,6 +196,9 @@ impl Reader<'_, '_> {
     }
 
     fn take_states<'de, A: SeqAccess<'de>>(&mut self, mut rows: A, is_in_model: bool) -> Result<Value, A::Error> {
+        /// How many are read between two looks at the memory: less than a megabyte of values.
+        const LOOK_EVERY: usize = 16;
+        let n_other_bytes = self.transitions.as_ref().map_or(0, RawTransitions::size_bytes);
         let Self { meter, limits, states, line, stop, trace, .. } = self;
         if is_in_model {
             *states = None;
@@ -204,6 +207,9 @@ impl Reader<'_, '_> {
         let first = states.n_states;
         loop {
             spend(meter, stop, states.columns.len() as u64)?;
+            if states.n_states.is_multiple_of(LOOK_EVERY) {
+                check_memory(n_other_bytes + states.size_bytes(), *limits, stop)?;
+            }
             let n_before = states.n_states;
             let is_kept = n_before < limits.max_states;
             let row = if is_kept {
@@ -220,6 +226,7 @@ impl Reader<'_, '_> {
     }
 
     fn take_transitions<'de, A: SeqAccess<'de>>(&mut self, mut items: A, is_in_model: bool) -> Result<Value, A::Error> {
+        let n_other_bytes = self.states.as_ref().map_or(0, RawStates::size_bytes);
         let Self { meter, limits, transitions, line, stop, trace, .. } = self;
         if is_in_model {
             *transitions = None;
@@ -228,6 +235,7 @@ impl Reader<'_, '_> {
         let first = transitions.n_transitions;
         loop {
             spend(meter, stop, 1)?;
+            check_memory(n_other_bytes + transitions.size_bytes(), *limits, stop)?;
             let n_before = transitions.n_transitions;
             let is_kept = n_before < limits.max_transitions;
             let item = if is_kept {
@@ -246,10 +254,23 @@ impl Reader<'_, '_> {
 
 /// Counts values that were read.
 fn spend<E: Error>(meter: &mut Meter<'_>, stop: &mut Option<Stop>, n_values: u64) -> Result<(), E> {
-    meter.spend_or_cancel(n_values).map_err(|_| {
-        *stop = Some(Stop::Cancelled);
-        E::custom("cancelled")
+    meter.spend_or_stop(n_values).map_err(|interrupted| {
+        *stop = Some(Stop::Interrupted(interrupted));
+        E::custom("interrupted")
     })
+}
+
+/// Stops where the lists take more memory than they may.
+fn check_memory<E: Error>(n_bytes: usize, limits: Limits, stop: &mut Option<Stop>) -> Result<(), E> {
+    if n_bytes <= limits.max_bytes {
+        return Ok(());
+    }
+    let detail = format!(
+        "the model takes over {} MB once it is compiled, more than there is for one (ETUDE_MAX_MEMORY)",
+        limits.max_bytes >> 20
+    );
+    *stop = Some(Stop::TooLarge(detail));
+    Err(E::custom("too large"))
 }
 
 fn traced<T, E>(trace: &mut Vec<Step>, read: Result<T, E>, step: impl FnOnce() -> Step) -> Result<T, E> {

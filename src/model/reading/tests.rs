@@ -175,6 +175,7 @@ proptest! {
         let expected = outcome(Definition::read(&document, Limits::DEFAULT, &mut Uninterrupted).map_err(|error| match error {
             crate::model::CompileError::Faults(faults) => faults.into(),
             crate::model::CompileError::Cancelled(cancelled) => cancelled.into(),
+            crate::model::CompileError::OutOfTime => crate::model::ReadError::OutOfTime,
         }));
         let text = layout.text(|_| true);
         prop_assert_eq!(&outcome(parse(&text, Format::Json)), &expected);

@@ -10,6 +10,7 @@ pub(super) use reading::read;
 
 use super::{Action, ActionIdx, Graph, Model, Start, StateIdx, States, Transition};
 use crate::attribute::Schema;
+use crate::interrupt::{Interrupt, Interrupted, Meter};
 
 /// Cost of an action that names none.
 pub(super) const DEFAULT_ACTION_COST: f64 = 1.0;
@@ -49,7 +50,14 @@ impl Edges {
 impl Table {
     /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, which
     /// a `skip` does for nothing.
-    pub(super) fn compile(&self) -> Model {
+    ///
+    /// # Errors
+    ///
+    /// What `interrupt` said, if that was not to continue.
+    pub(super) fn compile(&self, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted> {
+        /// How many transitions are looked at between two looks at the interrupt: less than a millisecond.
+        const POLL_EVERY: u64 = 1 << 14;
+        let mut meter = Meter::new(interrupt, POLL_EVERY);
         let n_states = self.states.len() as usize;
         // Where none is, none is noted.
         let n_noted = if self.unsafe_states.is_empty() { 0 } else { n_states };
@@ -60,8 +68,8 @@ impl Table {
         let is_useful = |(from, transition): &(StateIdx, Transition)| {
             *from != transition.to && is_unsafe.get(transition.to as usize) != Some(&true)
         };
-        let graph = Graph::new(n_states, self.edges.iter().filter(is_useful));
-        Model {
+        let graph = Graph::new(n_states, self.edges.iter().filter(is_useful), &mut meter)?;
+        Ok(Model {
             schema: self.schema.clone(),
             actions: self.actions.clone(),
             graph,
@@ -72,14 +80,13 @@ impl Table {
             is_unsafe,
             unexplored: None,
             state_bytes: OnceLock::new(),
-        }
+        })
     }
 
-    /// The states are shared; transitions are sorted into another list, and back and forth by what is projected.
-    pub(super) fn compiling_bytes(&self) -> usize {
-        const TRANSITION_BYTES: usize = 24;
-        const STATE_BYTES: usize = 16;
-        self.states.size_bytes() + self.states.len() as usize * STATE_BYTES + self.edges.len() * TRANSITION_BYTES
+    /// See [`Definition::compiling_bytes`](super::Definition::compiling_bytes).
+    pub(super) fn compiling_bytes(&self) -> u64 {
+        let n_states = u64::from(self.states.len());
+        Model::compiled_bytes(n_states, self.edges.len() as u64, self.schema.len() as u64)
     }
 
     pub(super) fn schema(&self) -> &Schema {

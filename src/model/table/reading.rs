@@ -8,7 +8,7 @@ use hashbrown::{DefaultHashBuilder, HashTable};
 use super::{Edges, Table};
 use crate::attribute::{Attribute, Schema, Value};
 use crate::document::{Faults, Object, Path, Place, index_of};
-use crate::interrupt::{Cancelled, Meter};
+use crate::interrupt::{Interrupted, Meter};
 use crate::model::action::ReadActions;
 use crate::model::reading::{Distinct, NoTransition, Raw, RawIndex, RawStates, RawTransitions};
 use crate::model::{ActionIdx, Limits, Start, StateIdx, States};
@@ -23,7 +23,7 @@ pub(in crate::model) fn read(
     limits: Limits,
     meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Result<Option<Table>, Cancelled> {
+) -> Result<Option<Table>, Interrupted> {
     let Some(object) = place.object(&["kind", "states", "transitions", "start", "unsafe"], faults) else {
         return Ok(None);
     };
@@ -89,7 +89,7 @@ struct Domain {
 impl Domain {
     const NONE: u32 = u32::MAX;
 
-    fn read(column: &[Raw], attribute: &Attribute, meter: &mut Meter<'_>) -> Result<Self, Cancelled> {
+    fn read(column: &[Raw], attribute: &Attribute, meter: &mut Meter<'_>) -> Result<Self, Interrupted> {
         let mut values: Vec<Value> = Vec::with_capacity(column.len());
         // Numbers that are written in several ways, such as 1 and 1.0, are one.
         let mut known: HashTable<u32> = HashTable::with_capacity(column.len());
@@ -97,7 +97,7 @@ impl Domain {
         let mut positions = Vec::with_capacity(column.len());
         let mut ignored = Faults::default();
         for raw in column {
-            meter.spend_or_cancel(1)?;
+            meter.spend_or_stop(1)?;
             let value = raw.scalar().and_then(|json| attribute.read_value(&Place::root(&json), &mut ignored));
             let Some(value) = value else {
                 positions.push(Self::NONE);
@@ -135,7 +135,7 @@ fn read_states(
     attributes: &[Option<Attribute>],
     meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Result<Option<States>, Cancelled> {
+) -> Result<Option<States>, Interrupted> {
     let RawStates { n_states, columns, mut cells, width, lens, no_rows, places } = rows;
     let width_wanted = attributes.len();
     let is_even = lens.is_none() && width == width_wanted;
@@ -157,6 +157,7 @@ fn read_states(
     if is_even && is_faultless {
         for (k, domain) in domains.iter().flatten().enumerate() {
             if !domain.is_as_found() {
+                meter.spend_or_stop(n_states as u64)?;
                 for cell in cells.iter_mut().skip(k).step_by(width) {
                     *cell = domain.positions[*cell as usize];
                 }
@@ -171,7 +172,7 @@ fn read_states(
     let mut no_rows = no_rows.into_iter();
     let mut next_cell = 0;
     for n in 0..n_states {
-        meter.spend_or_cancel(1)?;
+        meter.spend_or_stop(1)?;
         let len = lens.as_ref().map_or(width, |lens| lens[n] as usize);
         if len == RawStates::NO_ROW as usize {
             match no_rows.next() {
@@ -213,7 +214,7 @@ fn read_transitions(
     actions: Option<&ReadActions<'_>>,
     meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Result<Option<Edges>, Cancelled> {
+) -> Result<Option<Edges>, Interrupted> {
     let RawTransitions { n_transitions, from, mut action, to, references, odd, n_odd, places } = items;
     let read_reference = |found: &Raw, path: &Path<'_>, faults: &mut Faults| {
         let actions = actions?;
@@ -251,7 +252,7 @@ fn read_transitions(
             read_index(to, &Path::Item(path, 2), faults);
         };
         for n in 0..n_transitions {
-            meter.spend_or_cancel(1)?;
+            meter.spend_or_stop(1)?;
             if from[n] == RawTransitions::NOWHERE {
                 let Some(odd) = odd.next() else {
                     faults.count_unlisted(1);
@@ -290,7 +291,7 @@ fn find_repeated(
     n_transitions: usize,
     key: impl Fn(usize) -> Option<(StateIdx, ActionIdx)>,
     meter: &mut Meter<'_>,
-) -> Result<Vec<(u32, u32)>, Cancelled> {
+) -> Result<Vec<(u32, u32)>, Interrupted> {
     // Most documents list transitions in order, which makes this simple.
     let mut last = None;
     let is_ascending = (0..n_transitions).all(|n| {
@@ -302,7 +303,7 @@ fn find_repeated(
     }
     let mut keys: Vec<(StateIdx, ActionIdx, u32)> = Vec::with_capacity(n_transitions);
     for (n, number) in (0..n_transitions).zip(0..) {
-        meter.spend_or_cancel(1)?;
+        meter.spend_or_stop(1)?;
         keys.extend(key(n).map(|(from, action)| (from, action, number)));
     }
     keys.sort_unstable();

@@ -20,7 +20,7 @@ pub use reading::{CellDocument, PoseDocument, WumpusDocument};
 use super::explored::Explored;
 use super::{Action, Graph, Limits, Model, Space, Start, StateIdx, States, Transition};
 use crate::attribute::{Attribute, Cycle, Kind, Labels, Schema, Value};
-use crate::interrupt::{Cancelled, Interrupt, Meter};
+use crate::interrupt::{Interrupt, Interrupted, Meter};
 
 /// A direction in the grid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize, ToSchema)]
@@ -204,15 +204,31 @@ impl Cave {
             Act::TurnRight => next.heading = state.heading.turned(3),
             Act::Shoot if state.arrows > 0 => {
                 next.arrows -= 1;
-                let flight = std::iter::successors(Some(state.cell), |cell| self.ahead(*cell, state.heading));
-                let hit = flight.skip(1).find_map(|cell| first_in(&self.wumpi, cell, state.alive));
-                next.alive &= !hit.unwrap_or(0);
+                next.alive &= !self.hit_from(&state).unwrap_or(0);
             }
             Act::Grab => next.lying &= !first_in(&self.gold, state.cell, state.lying).unwrap_or(0),
             Act::Climb => next.outside = state.cell == self.start.0,
             Act::Shoot => {}
         }
         next
+    }
+
+    /// The bit of the wumpus that an arrow hits: the nearest of those alive in line, the first of those in one cell.
+    fn hit_from(&self, state: &CaveState) -> Option<u64> {
+        let (x, y) = state.cell;
+        let ahead = |(to_x, to_y): Cell| {
+            let distance = match state.heading {
+                Heading::East if to_y == y => to_x.checked_sub(x),
+                Heading::North if to_x == x => to_y.checked_sub(y),
+                Heading::West if to_y == y => x.checked_sub(to_x),
+                Heading::South if to_x == x => y.checked_sub(to_y),
+                _ => None,
+            };
+            distance.filter(|distance| *distance > 0)
+        };
+        let alive = self.wumpi.iter().zip(bits()).filter(|(_, bit)| state.alive & bit != 0);
+        let in_line = alive.filter_map(|(wumpus, bit)| Some((ahead(*wumpus)?, bit)));
+        in_line.min_by_key(|(distance, _)| *distance).map(|(_, bit)| bit)
     }
 
     /// Whether the agent is dead in `state`: in a pit, or with a live wumpus.
@@ -287,44 +303,94 @@ impl Cave {
 
     /// Explores, breadth first, every state that the body reaches from the start. States are numbered as they are found. If that are
     /// more than `limits` allow, they are left to searches.
-    pub(super) fn compile(&self, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Cancelled> {
-        /// How many successors are made between two looks at the interrupt. One may take the flight of an arrow past every
-        /// wumpus: tens of microseconds.
-        const POLL_EVERY: u64 = 256;
+    pub(super) fn compile(&self, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted> {
+        /// How many successors, cells or transitions are looked at between two looks at the interrupt: well below a millisecond.
+        const POLL_EVERY: u64 = 1 << 10;
+        /// What a transition takes in the end, beside what is found.
+        const TRANSITION_BYTES: usize = 2 * size_of::<Transition>();
         let mut meter = Meter::new(interrupt, POLL_EVERY);
+        let n_attributes = self.first_row().len();
+        let max_states = limits.max_states.min(limits.max_values / n_attributes);
+        if self.least_states(&mut meter)? > max_states as u64 {
+            return Ok(self.unexplored());
+        }
         let mut explored = Explored::new(self, self.first_state());
         let mut from = 0;
         while from < explored.n_found() {
-            if explored.n_found() > limits.max_states {
+            let n_bytes = explored.found_bytes() + explored.n_ways() * TRANSITION_BYTES;
+            if explored.n_found() > max_states || n_bytes > limits.max_bytes {
                 return Ok(self.unexplored());
             }
-            meter.spend_or_cancel(explored.n_acts())?;
+            meter.spend_or_stop(explored.n_acts())?;
             #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
             explored.explore(from as StateIdx);
             from += 1;
         }
-        let (states, graph) = explored.into_parts();
+        let (states, graph) = explored.into_parts(&mut meter)?;
         Ok(self.model(states, graph, None))
     }
 
     /// See [`Definition::compiling_bytes`](super::Definition::compiling_bytes).
-    pub(super) fn compiling_bytes(&self, limits: Limits) -> usize {
-        /// Of a state: itself, its number, and six ways out of it, all of this twice.
-        const STATE_BYTES: usize = 2 * (2 * size_of::<(CaveState, StateIdx)>() + 6 * size_of::<Transition>());
+    pub(super) fn compiling_bytes(&self, limits: Limits) -> u64 {
+        /// Exploring keeps the states themselves, their numbers, and the ways out of each, beside what is compiled.
+        const EXPLORED_BYTES: u64 = (4 * size_of::<(CaveState, StateIdx)>()) as u64;
         let n_bits = u32::try_from(self.wumpi.len() + self.gold.len()).unwrap_or(u32::MAX);
-        let n_arrows = usize::from(self.arrows) + 1;
-        // Inside and outside.
-        let n_poses = self.is_pit.len() * 4 * 2;
-        let n_states =
-            1_usize.checked_shl(n_bits).unwrap_or(usize::MAX).saturating_mul(n_poses).saturating_mul(n_arrows);
-        let n_states = n_states.min(limits.max_states.saturating_add(1));
-        n_states.saturating_mul(STATE_BYTES + 4 * self.schema().len())
+        // Facing four ways, inside and outside.
+        let n_poses = self.is_pit.len() as u64 * 4 * 2 * (u64::from(self.arrows) + 1);
+        let n_states = 1_u64.checked_shl(n_bits).unwrap_or(u64::MAX).saturating_mul(n_poses);
+        let n_states = n_states.min(limits.max_states as u64);
+        let n_transitions = n_states.saturating_mul(self.actions.len() as u64);
+        let compiled = Model::compiled_bytes(n_states, n_transitions, self.schema().len() as u64);
+        compiled.saturating_add(n_states.saturating_mul(EXPLORED_BYTES)).min(limits.max_bytes as u64)
+    }
+
+    /// How many states the body reaches at least: those with all wumpi alive. A body that goes ahead and turns comes to every pose in the
+    /// cells that are connected, with or without each piece of gold there; of several in one cell, the first is taken first. It may have
+    /// shot any of its arrows before, which opens cells and closes none.
+    fn least_states(&self, meter: &mut Meter<'_>) -> Result<u64, Interrupted> {
+        let has = |act: Act| self.actions.iter().any(|action| Act::named(&action.name) == Some(act));
+        if !has(Act::Forward) || !(has(Act::TurnLeft) || has(Act::TurnRight)) {
+            return Ok(1);
+        }
+        let (start, _) = self.start;
+        let mut is_closed = self.is_pit.clone();
+        for wumpus in &self.wumpi {
+            is_closed[cell_index(*wumpus, self.width)] = true;
+        }
+        is_closed[cell_index(start, self.width)] = true;
+        let mut reached = vec![start];
+        let mut next = 0;
+        while let Some(cell) = reached.get(next).copied() {
+            meter.spend_or_stop(1)?;
+            next += 1;
+            for to in Heading::ALL.into_iter().filter_map(|heading| self.ahead(cell, heading)) {
+                if !std::mem::replace(&mut is_closed[cell_index(to, self.width)], true) {
+                    reached.push(to);
+                }
+            }
+        }
+        let n_arrows = if has(Act::Shoot) { u64::from(self.arrows) } else { 0 };
+        let mut n_states = 4 * reached.len() as u64 * (1 + n_arrows);
+        let is_reached =
+            |cell: Cell| is_closed[cell_index(cell, self.width)] && !self.is_pit(cell) && !self.wumpi.contains(&cell);
+        let heaps =
+            self.gold.iter().enumerate().filter(|(k, cell)| !self.gold[..*k].contains(cell) && is_reached(**cell));
+        for (_, cell) in heaps.filter(|_| has(Act::Grab)) {
+            let n_pieces = self.gold.iter().filter(|other| *other == cell).count() as u64;
+            n_states = n_states.saturating_mul(1 + n_pieces);
+        }
+        Ok(n_states)
+    }
+
+    /// The row of the first state.
+    fn first_row(&self) -> Vec<u32> {
+        self.row(&self.first_state()).collect()
     }
 
     /// The model of which nothing but the start is known.
     fn unexplored(&self) -> Model {
-        let states = States::new(self.domains(), self.row(&self.first_state()).collect());
-        self.model(states, Graph::new(1, std::iter::empty()), Some(self.clone()))
+        let states = States::new(self.domains(), self.first_row());
+        self.model(states, Graph::of_one_state(), Some(self.clone()))
     }
 
     fn model(&self, states: States, graph: Graph, unexplored: Option<Self>) -> Model {
@@ -399,6 +465,14 @@ fn all_set(n_bits: usize) -> u64 {
 
 /// The bit of the first of `things` that is at `cell` and whose bit in `present` is set.
 fn first_in(things: &[Cell], cell: Cell, present: u64) -> Option<u64> {
-    let bits = things.iter().zip(0..).map(|(thing, bit)| (thing, 1u64 << bit));
-    bits.filter(|(thing, bit)| **thing == cell && present & bit != 0).map(|(_, bit)| bit).next()
+    let mut things = things.iter().zip(bits());
+    things.find(|(thing, bit)| **thing == cell && present & bit != 0).map(|(_, bit)| bit)
 }
+
+/// The bits of things, in their order.
+fn bits() -> impl Iterator<Item = u64> {
+    (0..u64::BITS).map(|bit| 1 << bit)
+}
+
+#[cfg(test)]
+mod tests;

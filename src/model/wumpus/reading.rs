@@ -6,7 +6,7 @@ use utoipa::ToSchema;
 use super::{Act, Cave, CaveState, Cell, Heading, cell_index, position};
 use crate::attribute::Schema;
 use crate::document::{Faults, Object, Path, Place, Quoted};
-use crate::interrupt::{Cancelled, Meter};
+use crate::interrupt::{Interrupted, Meter};
 use crate::model::Action;
 
 impl Cave {
@@ -15,7 +15,7 @@ impl Cave {
         place: &Place<'_, '_>,
         meter: &mut Meter<'_>,
         faults: &mut Faults,
-    ) -> Result<Option<Self>, Cancelled> {
+    ) -> Result<Option<Self>, Interrupted> {
         let fields = ["kind", "width", "height", "pits", "wumpi", "gold", "start", "arrows"];
         let Some(object) = place.object(&fields, faults) else { return Ok(None) };
         let side = |name: &str, faults: &mut Faults| {
@@ -130,7 +130,7 @@ fn read_cells(
     most: usize,
     meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Result<Option<Vec<Cell>>, Cancelled> {
+) -> Result<Option<Vec<Cell>>, Interrupted> {
     let Some(place) = object.optional(name) else { return Ok(Some(Vec::new())) };
     let Some(items) = place.array(faults) else { return Ok(None) };
     if items.len() > most {
@@ -138,7 +138,7 @@ fn read_cells(
     }
     let mut cells = Vec::with_capacity(items.len());
     for (n, item) in items.iter().enumerate() {
-        meter.spend_or_cancel(1)?;
+        meter.spend_or_stop(1)?;
         let place = place.item(n, item);
         let Some(parts) = place.array(faults) else { continue };
         let [x, y] = parts else {
@@ -158,11 +158,11 @@ fn note_deadly(
     (x, y): Cell,
     meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Result<(), Cancelled> {
+) -> Result<(), Interrupted> {
     for (name, thing) in [("pits", "pit"), ("wumpi", "wumpus")] {
         let Some(list) = object.optional(name) else { continue };
         for (n, item) in list.value.as_array().into_iter().flatten().enumerate() {
-            meter.spend_or_cancel(1)?;
+            meter.spend_or_stop(1)?;
             let cell = item.as_array().map(Vec::as_slice).unwrap_or_default();
             if !cell.iter().map(serde_json::Value::as_u64).eq([Some(x.into()), Some(y.into())]) {
                 continue;

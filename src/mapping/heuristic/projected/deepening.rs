@@ -176,7 +176,9 @@ impl<'p> Projected<'p> {
         let Deepening { projections, used, level, forward, .. } = deepening;
         let projections: &'p Projections = projections;
         let mut poll = || meter.spend(u64::MAX);
-        let groups = projections.level(self.problem.model, *level, &mut poll).map_err(Unsolved::Interrupted)?;
+        let groups = projections
+            .level(self.problem.model, *level, &mut poll)
+            .map_err(|interrupted| Unsolved::Interrupted(interrupted.into()))?;
         let Some(groups) = groups else { return Ok(None) };
         if forward.is_none() {
             *forward = Some(self.solve_forward(projections, used, meter).map_err(Unsolved::Interrupted)?);

@@ -134,7 +134,7 @@ fn tables_have_no_more_entries_than_allowed_however_short_the_demonstration() {
     });
     let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-    let projections = Projections::new(&model, &mut Uninterrupted).unwrap();
+    let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
     let mut buffers = Buffers::default();
     for n_observations in [1, 2, 8, 9] {
         let request = json!({"model": "m", "demonstration": vec![json!({"a": 50, "b": 3}); n_observations]});
@@ -163,7 +163,7 @@ fn buffers_of_other_problems_change_no_table() {
     });
     let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-    let projections = Projections::new(&model, &mut Uninterrupted).unwrap();
+    let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
     let mut buffers = Buffers::default();
     for (a, b, n_observations) in [(1, 1, 5), (1, 0, 5), (0, 1, 9), (1, 1, 2), (2, 1, 2), (0, 0, 1), (1, 1, 5)] {
         let demonstration: Value = (0..n_observations).map(|i| json!({"a": i % 4, "b": 2})).collect();
