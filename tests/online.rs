@@ -205,6 +205,13 @@ fn where_time_or_expansions_are_up_what_a_lookahead_has_not_decided_is_followed_
         assert!(n_same + 6 >= n_polls / 20, "{n_same} of {n_polls}");
         assert_eq!(after(n_polls, Signal::Cancel), Err(Cancelled));
     }
+    for max_bytes in [0, 100, 1000, 2000, 3000, 4000, 5000, 6000] {
+        let mut request = read(&mapper, &json!({"model": "corridor", "demonstration": rush(29, 120), "lookahead": 4}));
+        let request = request.as_mut().unwrap();
+        request.settings.budget.max_bytes = max_bytes;
+        let mapping = request.solve(&mapper, &mut Uninterrupted).unwrap();
+        check(&mapping, StoppedBy::Memory);
+    }
     for max_expansions in [0, 29, 30, 31, 1000, 2000] {
         let mut request = read(&mapper, &json!({"model": "corridor", "demonstration": rush(29, 120), "lookahead": 4}));
         let request = request.as_mut().unwrap();

@@ -79,6 +79,9 @@ enum CliError {
     /// The search has no answer.
     #[error(transparent)]
     Cancelled(#[from] crate::interrupt::Cancelled),
+    /// An observation could not be mapped.
+    #[error(transparent)]
+    Stopped(#[from] crate::mapping::Stopped),
     /// A model could not be prepared.
     #[error(transparent)]
     Interrupted(#[from] crate::interrupt::Interrupted),

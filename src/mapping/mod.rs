@@ -55,7 +55,7 @@ pub(crate) use demonstration::WellFormed;
 pub use heuristic::{Grouping, HeuristicName};
 pub use mapper::{Budget, Mapper, Mapping, Settings, Status, StoppedBy};
 pub(crate) use online::longest_lookahead;
-pub use online::{CommittedStep, OnlineMapping};
+pub use online::{CommittedStep, OnlineMapping, Stopped};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
 pub use problem::Problem;
 pub(crate) use request::Conditions;

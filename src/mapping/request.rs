@@ -10,7 +10,7 @@ use utoipa::ToSchema;
 
 use super::{
     Budget, Demonstration, Grouping, HeuristicName, Mapper, Mapping, Move, MoveKind, OnlineMapping, Policy, Problem,
-    Settings, StoppedBy, longest_lookahead,
+    Settings, Stopped, StoppedBy, longest_lookahead,
 };
 use crate::attribute::{Scalar, Weights};
 use crate::document::{Faults, Object, Place};
@@ -86,7 +86,7 @@ impl<'m> Request<'m> {
         if let (Some(Options { lookahead: Some(lookahead), .. }), Some(place)) = (options, object.optional("lookahead"))
         {
             let n_observations = demonstration.as_ref().map_or(0, Demonstration::len);
-            Self::check_window(model, lookahead, n_observations, &place, faults);
+            Self::check_window(model, lookahead, n_observations, Budget::DEFAULT.max_bytes, &place, faults);
         }
         let base = base(faults)?;
         let conditions = conditions?;
@@ -112,7 +112,8 @@ impl<'m> Request<'m> {
         }
         let n_states = problem.model.graph().n_states() as u64;
         let weights = problem.weights.clone();
-        let mut online = OnlineMapping::new(mapper, weights, Some(problem.start), self.lookahead);
+        let max_bytes = self.settings.budget.max_bytes;
+        let mut online = OnlineMapping::new(mapper, weights, Some(problem.start), self.lookahead).within(max_bytes);
         for observation in problem.demonstration.iter() {
             let is_spent = online.n_expanded().saturating_add(n_states) > self.settings.budget.max_expansions;
             let signal = if is_spent { Signal::Finish } else { interrupt.poll() };
@@ -121,9 +122,7 @@ impl<'m> Request<'m> {
                 Signal::Finish => {
                     let stopped_by = if is_spent { StoppedBy::MaxExpansions } else { StoppedBy::Deadline };
                     let spent = (online.n_expanded(), online.n_generated());
-                    // The cheapest way to what has come so far.
-                    let moves = online.end().map(|(_, mapping)| mapping.moves).unwrap_or_default();
-                    return self.complete(mapper, moves, stopped_by, spent, interrupt);
+                    return self.complete(mapper, online.into_moves(), stopped_by, spent, interrupt);
                 }
                 Signal::Cancel => return Err(Cancelled),
             }
@@ -135,15 +134,14 @@ impl<'m> Request<'m> {
                 }
                 signal => signal,
             };
-            match online.observe(observation, &mut until_over) {
-                Ok(_) => {}
-                Err(Cancelled) if is_over => {
-                    // What is not committed was half changed.
-                    let spent = (online.n_expanded(), online.n_generated());
-                    return self.complete(mapper, online.into_moves(), StoppedBy::Deadline, spent, interrupt);
-                }
-                Err(Cancelled) => return Err(Cancelled),
-            }
+            let stopped_by = match online.observe(observation, &mut until_over) {
+                Ok(_) => continue,
+                Err(Stopped::Cancelled(_)) if is_over => StoppedBy::Deadline,
+                Err(Stopped::Cancelled(cancelled)) => return Err(cancelled),
+                Err(Stopped::Memory) => StoppedBy::Memory,
+            };
+            let spent = (online.n_expanded(), online.n_generated());
+            return self.complete(mapper, online.into_moves(), stopped_by, spent, interrupt);
         }
         let (_, mapping) = online.end().expect("a demonstration is never empty");
         Ok(mapping)
@@ -173,15 +171,16 @@ impl<'m> Request<'m> {
         }
     }
 
-    /// Notes at `place` a lookahead over so many observations, at most, that would take too much memory.
+    /// Notes at `place` a lookahead over so many observations, at most, that would take more than about `max_bytes`.
     pub(crate) fn check_window(
         model: &Model,
         lookahead: NonZeroU32,
         n_observations: usize,
+        max_bytes: usize,
         place: &Place<'_, '_>,
         faults: &mut Faults,
     ) {
-        let longest = longest_lookahead(model);
+        let longest = longest_lookahead(model, max_bytes);
         let reach = usize::try_from(lookahead.get()).unwrap_or(usize::MAX).min(n_observations.saturating_sub(1));
         if !model.is_lazy() && reach > longest as usize {
             let n_states = model.states().len();

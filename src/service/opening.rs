@@ -6,7 +6,7 @@ use super::learners::Ready;
 use super::policies::{Envelope, base_weights};
 use crate::attribute::Weights;
 use crate::document::{Faults, Object, Path};
-use crate::mapping::{Conditions, Demonstration, Mapper, Request, read_lookahead};
+use crate::mapping::{Budget, Conditions, Demonstration, Mapper, Request, read_lookahead};
 use crate::model::Origin;
 
 /// Lookahead of a session that names none.
@@ -70,7 +70,8 @@ impl Opening {
         let base = base_weights(model, learner, faults);
         let conditions = Conditions::read(model, object, faults);
         if let (Some(lookahead), Some(place)) = (lookahead, object.optional("lookahead")) {
-            Request::check_window(model, lookahead, Demonstration::MAX_OBSERVATIONS, &place, faults);
+            let max_bytes = Budget::DEFAULT.max_bytes;
+            Request::check_window(model, lookahead, Demonstration::MAX_OBSERVATIONS, max_bytes, &place, faults);
         }
         let (base, conditions) = base.zip(conditions)?;
         Some(Self { weights: conditions.weights_over(base), start: conditions.start.and_then(Origin::state) })

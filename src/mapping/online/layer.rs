@@ -51,6 +51,9 @@ impl Node {
     }
 }
 
+/// How much memory a state takes in a layer that is whole, in bytes.
+pub(super) const NODE_BYTES: usize = size_of::<f64>() + size_of::<Node>();
+
 /// The cheapest ways to every state at one observation.
 #[derive(Debug)]
 pub(super) struct Layer {
@@ -239,7 +242,7 @@ impl Sweep {
 
     /// Approximate size in memory, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
-        self.distances.len() * size_of::<f64>()
+        (self.distances.len() + self.action_costs.len()) * size_of::<f64>() + self.open.size_bytes()
     }
 
     /// The layer of the root, which costs `cost`: extras lead on from there (Dijkstra's algorithm). They lead to none but

@@ -60,7 +60,7 @@ use super::{Mapper, Mapping, Move, MoveKind, Status};
 use crate::attribute::{Value, Weights};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::model::{Model, StateIdx};
-use layer::{Layer, Sweep};
+use layer::{Layer, Node, Sweep};
 use repair::{Predecessors, Repair, Repaired};
 use window::{Place, Window};
 
@@ -74,6 +74,17 @@ pub struct CommittedStep {
     pub is_proven: bool,
     /// How many observations had come when it was committed.
     pub after: u32,
+}
+
+/// Why an observation was not taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Stopped {
+    /// The caller lost interest.
+    #[error(transparent)]
+    Cancelled(#[from] Cancelled),
+    /// It would take more memory than the mapping may.
+    #[error("what may still turn out to be the cheapest mapping takes more memory than there is for it")]
+    Memory,
 }
 
 /// A mapping in the making.
@@ -97,6 +108,11 @@ pub struct OnlineMapping {
     moves: Vec<Move>,
     cost: Cost,
     was_forced: bool,
+    /// How many terms of distances an observation has, one for each value of an attribute that weighs something.
+    n_terms: usize,
+    max_bytes: usize,
+    /// Whether the survivors' ways are what they should be: not while an observation is taken, nor after one that was broken off.
+    is_whole: bool,
 }
 
 /// Where more than one survivor in this many has lost its way, sweeping all layers takes less time than a repair.
@@ -106,13 +122,10 @@ const SWEEPS_FROM: usize = 8;
 /// 8 bytes each. Together 48 MB.
 const MAX_KEPT: u64 = 1 << 21;
 
-/// Most nodes of a window, kept whole or not: 1 GB if all are alive, as when nothing tells the ways apart.
-const MAX_WINDOW: u64 = 1 << 27;
-
-/// The longest lookahead that is allowed with `model`: the window that it decides on, of one layer more, has at most 134 million
-/// nodes, which take 1 GB at worst. 0 if not even the shortest one is.
-pub(crate) fn longest_lookahead(model: &Model) -> u32 {
-    let n_layers = MAX_WINDOW / u64::from(model.states().len()).max(1);
+/// The longest lookahead whose window takes about `max_bytes` with `model` if all of its nodes are alive, as when nothing tells the ways
+/// apart: that has one layer more, and 8 bytes a node. With 1 GB it has at most 134 million nodes. 0 if not even the shortest one fits.
+pub(crate) fn longest_lookahead(model: &Model, max_bytes: usize) -> u32 {
+    let n_layers = max_bytes / size_of::<Node>() / (model.states().len() as usize).max(1);
     u32::try_from(n_layers.saturating_sub(1)).unwrap_or(u32::MAX)
 }
 
@@ -127,11 +140,8 @@ impl OnlineMapping {
     pub fn new(mapper: &Mapper, weights: Weights, start: Option<StateIdx>, lookahead: Option<NonZeroU32>) -> Self {
         let model = mapper.shared_model();
         assert!(!model.is_lazy(), "each layer needs all states");
-        let n_layers = lookahead.map_or(u64::MAX, |lookahead| 1 + u64::from(lookahead.get()));
-        let weighted = weights.as_slice().iter().enumerate().filter(|(_, weight)| **weight > 0.0);
-        let n_terms: usize = weighted.map(|(position, _)| model.states().domain(position).len()).sum();
-        let n_each = u64::from(model.states().len()).max(n_terms as u64);
-        let keeps = n_layers.saturating_mul(n_each) <= MAX_KEPT;
+        let n_terms = n_terms(&model, |position| weights.as_slice()[position] > 0.0);
+        let keeps = keeps(model.graph().n_states(), n_terms, lookahead);
         let sweep = Sweep::new(&model);
         let window = Window::new(model.states().len(), keeps);
         Self {
@@ -150,7 +160,41 @@ impl OnlineMapping {
             moves: Vec::new(),
             cost: Cost::default(),
             was_forced: false,
+            n_terms,
+            max_bytes: usize::MAX,
+            is_whole: true,
         }
+    }
+
+    /// The same, in about `max_bytes` at most: an observation that would take more is not taken.
+    #[must_use]
+    pub fn within(self, max_bytes: usize) -> Self {
+        Self { max_bytes, ..self }
+    }
+
+    /// About how much memory a mapping of so many observations takes at most, in bytes, also while it takes one: if all ways to all states
+    /// are alive, as when nothing tells them apart.
+    #[must_use]
+    pub fn most_bytes(model: &Model, lookahead: Option<NonZeroU32>, n_observations: usize) -> usize {
+        /// How many entries of the open list there are for each state, about.
+        const OPEN: usize = 4;
+        let n_states = model.graph().n_states();
+        let n_terms = n_terms(model, |_| true);
+        let reach = lookahead.map_or(usize::MAX, |lookahead| lookahead.get() as usize);
+        let n_layers = n_observations.min(reach.saturating_add(1));
+        let keeps = keeps(n_states, n_terms, lookahead);
+        let each = if keeps {
+            n_states * (layer::NODE_BYTES + repair::NODE_BYTES) + n_terms * size_of::<f64>()
+        } else {
+            n_states * size_of::<Node>()
+        };
+        let each = each + size_of::<Layer>() + model.schema().len() * OBSERVED_BYTES;
+        let once = n_states
+            * (size_of::<f64>() + size_of::<StateIdx>() + OPEN * size_of::<(u64, StateIdx)>() + 3 * layer::NODE_BYTES)
+            + n_terms * size_of::<f64>()
+            + Predecessors::bytes_for(model.graph());
+        let moves = n_observations.saturating_mul(MOVES_PER_OBSERVATION * size_of::<Move>());
+        n_layers.saturating_mul(each).saturating_add(once).saturating_add(moves)
     }
 
     /// How many observations have come.
@@ -171,10 +215,27 @@ impl OnlineMapping {
         self.window.n_alive()
     }
 
-    /// Approximate size in memory, in bytes, without the model and the committed steps.
+    /// Approximate size in memory, in bytes, without the model. Looks at no layer.
     #[must_use]
     pub fn size_bytes(&self) -> usize {
-        self.window.size_bytes() + self.sweep.size_bytes()
+        let predecessors = self.predecessors.as_ref().map_or(0, Predecessors::size_bytes);
+        let moves = self.moves.capacity() * size_of::<Move>();
+        size_of::<Self>() + self.window.size_bytes() + self.sweep.size_bytes() + predecessors + moves
+    }
+
+    /// Checks that there is memory for so many bytes more.
+    fn check_memory(&self, n_bytes: usize) -> Result<(), Stopped> {
+        if self.max_bytes == usize::MAX || self.size_bytes().saturating_add(n_bytes) <= self.max_bytes {
+            Ok(())
+        } else {
+            Err(Stopped::Memory)
+        }
+    }
+
+    /// How much memory the next layer takes, in bytes.
+    fn next_layer_bytes(&self) -> usize {
+        let observed = self.n_terms * size_of::<f64>() + self.weights.as_slice().len() * OBSERVED_BYTES;
+        self.window.layer_bytes(self.model.graph().n_states()) + observed
     }
 
     /// How many nodes were looked at: every state once for each layer that was swept.
@@ -187,21 +248,34 @@ impl OnlineMapping {
         self.n_swept * self.model.graph().n_transitions() as u64
     }
 
-    /// The committed steps, also of a mapping that was cancelled.
+    /// The cheapest way to what has come; where an observation was broken off, the committed steps.
     pub(super) fn into_moves(self) -> Vec<Move> {
-        self.moves
+        if self.is_whole { self.end().map(|(_, mapping)| mapping.moves).unwrap_or_default() } else { self.moves }
     }
 
     /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits.
     ///
     /// # Errors
     ///
-    /// [`Cancelled`] if `interrupt` said so; the mapping is then of no more use. It is not asked to finish.
+    /// [`Stopped::Cancelled`] if `interrupt` said so; it is not asked to finish. [`Stopped::Memory`] if the mapping would come to take
+    /// more than it [may](Self::within). The mapping is then of no more use.
     pub fn observe(
         &mut self,
         observation: &[Option<Value>],
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Vec<CommittedStep>, Cancelled> {
+    ) -> Result<Vec<CommittedStep>, Stopped> {
+        self.check_memory(self.next_layer_bytes())?;
+        self.is_whole = false;
+        let committed = self.take(observation, interrupt)?;
+        self.is_whole = true;
+        Ok(committed)
+    }
+
+    fn take(
+        &mut self,
+        observation: &[Option<Value>],
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Vec<CommittedStep>, Stopped> {
         let mut committed = Vec::new();
         let model = &*Arc::clone(&self.model);
         let observed = ObservedDistances::new(model, observation, &self.weights);
@@ -298,10 +372,12 @@ impl OnlineMapping {
     }
 
     /// Gives survivors that have lost their way the cheapest one that is left.
-    fn restore(&mut self, interrupt: &mut dyn Interrupt) -> Result<(), Cancelled> {
+    fn restore(&mut self, interrupt: &mut dyn Interrupt) -> Result<(), Stopped> {
         let model = &*Arc::clone(&self.model);
         let n_survivors = self.window.layers.back().map_or(0, Layer::n_alive);
         if self.window.keeps() {
+            let made = if self.predecessors.is_none() { Predecessors::bytes_for(model.graph()) } else { 0 };
+            self.check_memory(made + self.window.layers.len() * model.graph().n_states() * repair::NODE_BYTES)?;
             let predecessors = self.predecessors.get_or_insert_with(|| Predecessors::new(model.graph()));
             let repair = Repair::new(&mut self.window, model, predecessors, &mut self.sweep);
             let most = n_survivors.checked_div(self.sweeps_from).unwrap_or(usize::MAX);
@@ -341,16 +417,35 @@ impl OnlineMapping {
     }
 
     /// The layer of the observation after the newest.
-    fn follow(&mut self, observed: ObservedDistances, interrupt: &mut dyn Interrupt) -> Result<Layer, Cancelled> {
+    fn follow(&mut self, observed: ObservedDistances, interrupt: &mut dyn Interrupt) -> Result<Layer, Stopped> {
         if interrupt.poll() == Signal::Cancel {
-            return Err(Cancelled);
+            return Err(Cancelled.into());
         }
+        self.check_memory(self.window.layer_bytes(self.model.graph().n_states()))?;
         self.n_swept += 1;
         let spare = self.window.spare();
         let before = self.window.layers.back().expect("the first observation's layer begins a window");
         Ok(self.sweep.follow(&self.model, &before.costs, &self.window.reached, observed, spare))
     }
 }
+
+/// How many terms of distances an observation has, for each value of the attributes at these positions.
+fn n_terms(model: &Model, weighs: impl Fn(usize) -> bool) -> usize {
+    let weighing = (0..model.schema().len()).filter(|position| weighs(*position));
+    weighing.map(|position| model.states().domain(position).len()).sum()
+}
+
+/// Whether the layers of a window are kept whole.
+fn keeps(n_states: usize, n_terms: usize, lookahead: Option<NonZeroU32>) -> bool {
+    let n_layers = lookahead.map_or(u64::MAX, |lookahead| 1 + u64::from(lookahead.get()));
+    n_layers.saturating_mul(n_states.max(n_terms) as u64) <= MAX_KEPT
+}
+
+/// What an observed attribute takes, besides its terms.
+const OBSERVED_BYTES: usize = 64;
+
+/// About how many steps an observation has at most, with the room for more: bodies that need more are rare.
+const MOVES_PER_OBSERVATION: usize = 4;
 
 #[cfg(test)]
 mod tests {
@@ -419,6 +514,42 @@ mod tests {
         assert!(per_observation < 2048, "{per_observation} bytes, where distances would take {}", 301 * 8 * 8);
         let (_, mapping) = online.end().unwrap();
         assert_eq!((mapping.status, mapping.moves.len()), (Status::Optimal, 901));
+    }
+
+    #[test]
+    fn an_observation_that_would_take_more_memory_than_there_is_is_not_taken_and_what_came_before_can_be_ended() {
+        let mapper = loops(150, 8);
+        let weights = mapper.model().schema().weights();
+        let observe = |online: &mut OnlineMapping, n: u32| {
+            let observation = vec![Some(Value::Number(f64::from(1 + n % 150))); 8];
+            online.observe(&observation, &mut Uninterrupted)
+        };
+        // Window of layers that are thinned, kept whole, and thinned again.
+        for lookahead in [None, Some(100), Some(10_000)] {
+            let lookahead = lookahead.and_then(NonZeroU32::new);
+            let new = || OnlineMapping::new(&mapper, weights.clone(), None, lookahead);
+            let mut unbounded = new();
+            let mut most = 0;
+            for n in 0..300 {
+                observe(&mut unbounded, n).unwrap();
+                most = most.max(unbounded.size_bytes());
+            }
+            let foretold = OnlineMapping::most_bytes(mapper.model(), lookahead, 300);
+            assert!(most <= foretold, "{most} of {foretold}");
+            for max_bytes in [0, 10_000, most / 4, most / 2, most - 1] {
+                let mut online = new().within(max_bytes);
+                let stopped = (0..300).find_map(|n| {
+                    let stopped = observe(&mut online, n).err();
+                    assert!(n == 0 || stopped.is_some() || online.size_bytes() <= max_bytes);
+                    stopped
+                });
+                assert_eq!(stopped, Some(Stopped::Memory), "{max_bytes} of {most}");
+                let n_observed = online.n_observed();
+                assert_eq!(n_observed > 0, max_bytes > 100_000, "{n_observed} in {max_bytes} of {most}");
+                let moves = online.into_moves();
+                assert!(n_observed == 0 || !moves.is_empty());
+            }
+        }
     }
 
     proptest! {

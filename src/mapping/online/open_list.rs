@@ -19,6 +19,12 @@ impl OpenList {
         Self { buckets: vec![Vec::new(); 65], is_filled: 0, last: 0 }
     }
 
+    /// Size in memory, in bytes: what it once held there is room for.
+    pub(super) fn size_bytes(&self) -> usize {
+        let n_slots: usize = self.buckets.iter().map(Vec::capacity).sum();
+        n_slots * size_of::<(u64, StateIdx)>() + self.buckets.len() * size_of::<Vec<(u64, StateIdx)>>()
+    }
+
     /// Adds a state at its cost: at least 0, and at least what was taken last, until the list has been empty.
     #[inline]
     pub(super) fn push(&mut self, cost: f64, state: StateIdx) {

@@ -26,6 +26,16 @@ impl Predecessors {
         Self(Rows::of_entries(graph.n_states(), ways))
     }
 
+    /// Size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        self.0.size_bytes()
+    }
+
+    /// The same, before they are made.
+    pub(super) fn bytes_for(graph: &Graph) -> usize {
+        graph.n_states() * size_of::<u32>() + graph.n_transitions() * size_of::<(StateIdx, ActionIdx)>()
+    }
+
     fn of(&self, state: StateIdx) -> &[(StateIdx, ActionIdx)] {
         self.0.of(state as usize)
     }
@@ -38,6 +48,9 @@ pub(super) enum Repaired {
     /// None, as too many had lost theirs.
     TooMany,
 }
+
+/// How much memory a repair takes for a node of the window, in bytes: its standing, and some are wanted.
+pub(super) const NODE_BYTES: usize = size_of::<Standing>() + size_of::<StateIdx>();
 
 /// What is known of a node's way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use super::layer::{Layer, Source, Spare};
+use super::layer::{Layer, NODE_BYTES, Source, Spare};
 use crate::mapping::distances::ObservedDistances;
 use crate::mapping::{Move, MoveKind};
 use crate::model::{ActionIdx, Model, StateIdx};
@@ -52,6 +52,12 @@ impl Window {
 
     pub(super) fn keeps(&self) -> bool {
         self.keeps
+    }
+
+    /// How much memory a layer takes that is made now, in bytes, besides its distances.
+    pub(super) fn layer_bytes(&self, n_states: usize) -> usize {
+        let has_spare = self.spare.last().is_some_and(|spare| spare.size_bytes() >= n_states * NODE_BYTES);
+        size_of::<Layer>() + if has_spare { 0 } else { n_states * NODE_BYTES }
     }
 
     /// Arrays to be filled.

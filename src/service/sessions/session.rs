@@ -12,7 +12,7 @@ use uuid::Uuid;
 use super::{SessionError, read_stored};
 use crate::attribute::{ByAttribute, Weights};
 use crate::document::{Faults, Place};
-use crate::interrupt::{Interrupt, Uninterrupted};
+use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
 use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status};
 use crate::model::Origin;
 use crate::service::owners::Ownership;
@@ -236,7 +236,8 @@ impl Session {
         let job = move |interrupt: &mut dyn Interrupt| {
             let mut steps = Vec::new();
             for observation in &observations {
-                steps.extend(online.observe(observation, interrupt)?);
+                // It may take as much memory as it does.
+                steps.extend(online.observe(observation, interrupt).map_err(|_| Cancelled)?);
             }
             Ok((online, steps))
         };
