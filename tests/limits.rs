@@ -2,9 +2,17 @@
 
 mod service;
 
+use std::time::Instant;
+
+use etude::memory::SMALL_BYTES;
+use etude::model::Format;
+use etude::service::{Caller, Client, Etude, ModelText, Name, Registered, ServiceError};
+use jiff::Timestamp;
 use reqwest::Method;
 use serde_json::{Value, json};
 use service::{Service, example, long_way, to_and_fro};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
 
 /// A table in which nothing tells the ways apart: searches of it take long.
 fn hard_model(n_states: usize) -> Value {
@@ -40,6 +48,7 @@ async fn a_request_without_a_deadline_has_that_of_the_service() {
     let service = with_hard_model(&["--default-deadline", "20ms"]).await;
     let (status, policy) = service.post("/v1/policies", &hard_request(2_000)).await;
     assert_eq!((status, &policy["status"]), (201, &json!("bounded")));
+    assert_eq!(policy["search"]["stopped_by"], "deadline_ms");
     let batch = json!({"model": "hard", "items": [{"demonstration": hard_request(2_000)["demonstration"]}]});
     let (status, answer) = service.post("/v1/policies:batch", &batch).await;
     assert_eq!((status, &answer["items"][0]["status"]), (200, &json!("bounded")));
@@ -92,14 +101,25 @@ async fn a_model_that_takes_too_long_to_compile_is_refused() {
 
 #[tokio::test]
 async fn a_model_that_is_there_already_is_not_compiled_again() {
-    let model = hard_model(5_000);
-    let service = with_hard_model(&[]).await;
-    let directory = service.stop().await;
-    // Here, it could not be compiled.
-    let service = Service::start_in(directory, &["--max-compile-time", "1ns"]).await;
-    assert_eq!(service.put("/v1/models/hard", &model).await.0, 200);
-    let (status, problem) = service.put("/v1/models/hard", &hard_model(5_001)).await;
-    assert_eq!((status, &problem["type"]), (409, &json!("/problems/conflict")));
+    let directory = with_hard_model(&[]).await.stop().await;
+    let database = directory.path().join("etude.db");
+    let flags = service::flags(&["--database", database.to_str().unwrap()]);
+    let etude = Etude::open(&flags.settings(), &TaskTracker::new(), CancellationToken::new()).await.unwrap();
+    // Without memory, nothing can be compiled.
+    let memory = etude.memory();
+    let mut taken = vec![memory.try_take(memory.free_for_large()).unwrap()];
+    taken.extend(std::iter::from_fn(|| memory.try_take(SMALL_BYTES).or_else(|_| memory.try_take(4096)).ok()));
+    let put = async |name: &str, n_states: usize| {
+        let text = ModelText::Whole(hard_model(n_states).to_string().into_bytes());
+        let caller = Caller { client: Client::LOCAL, arrived: Instant::now(), now: Timestamp::UNIX_EPOCH };
+        etude.put_model(&Name::new(name).unwrap(), text, Format::Json, caller).await.map(|(registered, _)| registered)
+    };
+    assert_eq!(put("hard", 5_000).await.unwrap(), Registered::Already);
+    assert!(matches!(put("hard", 5_001).await, Err(ServiceError::Conflict { .. })));
+    assert!(matches!(put("other", 5_000).await, Err(ServiceError::NoRoom(_))));
+    drop(taken);
+    assert_eq!(put("other", 5_000).await.unwrap(), Registered::New);
+    etude.close().await;
 }
 
 #[tokio::test]

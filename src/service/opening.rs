@@ -6,7 +6,7 @@ use super::learners::Ready;
 use super::policies::{Envelope, base_weights};
 use crate::attribute::Weights;
 use crate::document::{Faults, Object, Path};
-use crate::mapping::{Budget, Conditions, Demonstration, Mapper, Request, read_lookahead};
+use crate::mapping::{Conditions, Demonstration, Mapper, Request, read_lookahead};
 use crate::model::Origin;
 
 /// Lookahead of a session that names none.
@@ -55,11 +55,13 @@ pub(super) struct Opening {
 }
 
 impl Opening {
+    /// Reads what needs the model; the session's window may take about `max_bytes`.
     pub(super) fn read(
         mapper: &Mapper,
         learner: Option<&Ready>,
         lookahead: Option<NonZeroU32>,
         object: &Object<'_, '_>,
+        max_bytes: usize,
         faults: &mut Faults,
     ) -> Option<Self> {
         let model = mapper.model();
@@ -70,7 +72,6 @@ impl Opening {
         let base = base_weights(model, learner, faults);
         let conditions = Conditions::read(model, object, faults);
         if let (Some(lookahead), Some(place)) = (lookahead, object.optional("lookahead")) {
-            let max_bytes = Budget::DEFAULT.max_bytes;
             Request::check_window(model, lookahead, Demonstration::MAX_OBSERVATIONS, max_bytes, &place, faults);
         }
         let (base, conditions) = base.zip(conditions)?;

@@ -22,7 +22,7 @@ use super::policies::Named;
 use super::{Caller, Etude, PoolError, ServiceError};
 use crate::attribute::{Schema, Weights};
 use crate::document::{self, Faults, Place};
-use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, TooManySteps};
+use crate::mapping::{Budget, CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, TooManySteps};
 use crate::store::{NewSession, Page, SessionRow, SessionStatus, SessionWeights, StoreError};
 
 /// Why a session could not do as told.
@@ -115,8 +115,11 @@ impl Etude {
         let deadline = self.deadline(&envelope, caller.arrived);
         let Named { learner, model_hash, mapper } = self.find(&envelope, faults.clone(), &place, deadline).await?;
         drop(place);
-        let opening =
-            object.as_ref().and_then(|object| Opening::read(&mapper, learner.as_ref(), lookahead, object, &mut faults));
+        // As much as a search may take.
+        let max_bytes = usize::try_from(self.memory.room() / 2).unwrap_or(usize::MAX).min(Budget::DEFAULT.max_bytes);
+        let opening = object
+            .as_ref()
+            .and_then(|object| Opening::read(&mapper, learner.as_ref(), lookahead, object, max_bytes, &mut faults));
         let Opening { mut weights, start } = faults.check(opening)?;
         let model = envelope.model;
 
@@ -167,6 +170,7 @@ impl Etude {
             n_received: 0,
             n_steps: 0,
             online,
+            held: self.memory.try_take(0).map_err(ServiceError::from)?,
             client: caller.client,
             ownership,
         })
@@ -216,6 +220,7 @@ impl Etude {
             n_steps: 0,
             online: Some(OnlineMapping::new(&mapper, weights, row.start, lookahead)),
             mapper,
+            held: self.memory.try_take(0).map_err(ServiceError::from)?,
             client: caller.client,
             ownership,
         };

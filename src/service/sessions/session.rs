@@ -12,8 +12,9 @@ use uuid::Uuid;
 use super::{SessionError, read_stored};
 use crate::attribute::{ByAttribute, Weights};
 use crate::document::{Faults, Place};
-use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
-use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status};
+use crate::interrupt::{Interrupt, Uninterrupted};
+use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, Stopped};
+use crate::memory::{Held, NoRoom, SMALL_BYTES};
 use crate::model::Origin;
 use crate::service::owners::Ownership;
 use crate::service::policies::{PolicyText, as_micros, report, write_policy};
@@ -39,6 +40,8 @@ pub struct Session {
     pub(super) n_steps: usize,
     /// `None` once the session has ended.
     pub(super) online: Option<OnlineMapping>,
+    /// What the mapping takes.
+    pub(super) held: Held,
     /// Who drives it.
     pub(super) client: Client,
     pub(super) ownership: Ownership,
@@ -225,30 +228,49 @@ impl Session {
     ///
     /// # Errors
     ///
-    /// If the service ends; the session is then to be resumed.
+    /// If the service ends, or there is no memory for them; the session is then to be resumed.
     pub async fn advance(
         &mut self,
         etude: &Etude,
         observations: Vec<Observation>,
     ) -> Result<Vec<CommittedStep>, SessionError> {
-        let mut online = self.online.take().ok_or(SessionError::NotOpen)?;
+        let online = self.online.take().ok_or(SessionError::NotOpen)?;
+        // Others find something too. What it really takes is counted afterwards.
+        let free = (etude.memory.free_for_large() / 4).max(SMALL_BYTES);
+        let most_bytes = usize::try_from(self.held.n_bytes() + free).unwrap_or(usize::MAX);
+        let mut online = online.within(most_bytes);
         let is_inline = self.is_inline(observations.len());
         let job = move |interrupt: &mut dyn Interrupt| {
             let mut steps = Vec::new();
             for observation in &observations {
-                // It may take as much memory as it does.
-                steps.extend(online.observe(observation, interrupt).map_err(|_| Cancelled)?);
+                match online.observe(observation, interrupt) {
+                    Ok(committed) => steps.extend(committed),
+                    Err(Stopped::Cancelled(cancelled)) => return Err(cancelled),
+                    Err(Stopped::Memory) => return Ok(None),
+                }
             }
-            Ok((online, steps))
+            Ok(Some((online, steps)))
         };
-        let (online, steps) = if is_inline {
+        let advanced = if is_inline {
             job(&mut Uninterrupted).map_err(|_| PoolError::Stopped)?
         } else {
             etude.pool.run_patiently(self.client, job).await?
         };
+        let no_room = || NoRoom { wanted: most_bytes as u64, room: etude.memory.room() };
+        let (online, steps) = advanced.ok_or_else(no_room).map_err(ServiceError::from)?;
+        self.hold(online.size_bytes() as u64)?;
         self.online = Some(online);
         self.n_steps += steps.len();
         Ok(steps)
+    }
+
+    /// Counts what the mapping takes.
+    fn hold(&mut self, n_bytes: u64) -> Result<(), SessionError> {
+        // Most windows grow and shrink a little all the time.
+        if n_bytes < self.held.n_bytes() / 2 {
+            self.held.shrink_to(n_bytes);
+        }
+        self.held.grow_to(n_bytes).map_err(|no_room| ServiceError::from(no_room).into())
     }
 
     /// Ends the demonstration, which must have `seq` observations, and stores its policy.
