@@ -99,7 +99,7 @@ impl From<WeightsAnswer> for WeightsBody {
 /// Register a learner under a name.
 #[utoipa::path(
     put, path = "/v1/learners/{learner}", tag = "learners",
-    params(("learner" = String, Path, description = "Its name: 1 to 64 of `a-z A-Z 0-9 . _ -`")),
+    params(("learner" = String, Path, description = "Its name: 1 to 64 of `a-z A-Z 0-9 . _ -`, other than `.` and `..`")),
     request_body = LearnerDocument,
     responses(
         (status = 201, description = "It is new; its weights have version 0", body = LearnerBody),

@@ -2,13 +2,13 @@
 
 use std::fmt;
 
-/// A name: 1 to 64 of `a-z A-Z 0-9 . _ -`.
+/// A name: 1 to 64 of `a-z A-Z 0-9 . _ -`, but neither `.` nor `..`, which clients take out of paths.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Name(String);
 
 /// A text is not a [`Name`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("expected a name of 1 to 64 of a-z A-Z 0-9 . _ -")]
+#[error("expected a name of 1 to 64 of a-z A-Z 0-9 . _ -, other than . and ..")]
 pub struct InvalidName;
 
 impl Name {
@@ -19,11 +19,12 @@ impl Name {
     ///
     /// # Errors
     ///
-    /// [`InvalidName`] if `text` is empty, longer than [`Self::MAX_CHARS`], or has other characters.
+    /// [`InvalidName`] if `text` is empty, longer than [`Self::MAX_CHARS`], `.` or `..`, or has other characters.
     pub fn new(text: impl Into<String>) -> Result<Self, InvalidName> {
         let text = text.into();
         let is_allowed = |byte: u8| byte.is_ascii_alphanumeric() || b"._-".contains(&byte);
-        let is_valid = (1..=Self::MAX_CHARS).contains(&text.len()) && text.bytes().all(is_allowed);
+        let is_valid =
+            (1..=Self::MAX_CHARS).contains(&text.len()) && text.bytes().all(is_allowed) && text != "." && text != "..";
         if is_valid { Ok(Self(text)) } else { Err(InvalidName) }
     }
 
@@ -45,11 +46,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn names_have_one_to_64_plain_characters() {
-        for name in ["a", "A.b_c-9", "..", &"x".repeat(64)] {
+    fn names_have_one_to_64_plain_characters_and_are_no_steps_in_a_path() {
+        for name in ["a", "A.b_c-9", "...", ".a", &"x".repeat(64)] {
             assert!(Name::new(name).is_ok(), "{name}");
         }
-        for name in ["", "a b", "a/b", "é", &"x".repeat(65)] {
+        for name in ["", ".", "..", "a b", "a/b", "é", &"x".repeat(65)] {
             assert!(Name::new(name).is_err(), "{name}");
         }
     }
