@@ -9,6 +9,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
@@ -78,7 +79,7 @@ impl Server {
         let metrics = telemetry::measurements()?;
         let not_usable = |source| ServerError::Store { database: config.database.display().to_string(), source };
         let etude = Etude::open(&config.settings(), &tasks, abort.clone()).await.map_err(not_usable)?;
-        etude.sweep_left_behind().await.map_err(not_usable)?;
+        etude.begin(Timestamp::now()).await.map_err(not_usable)?;
         let listen = |source| ServerError::Listen { listen: config.listen, source };
         let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
@@ -150,6 +151,10 @@ impl Server {
         }
         abort.cancel();
         stopping.cancel();
+        let noted = tokio::time::timeout(ABORT_GRACE, etude.note_alive(Timestamp::now())).await;
+        if !matches!(noted, Ok(Ok(()))) {
+            tracing::warn!("when the service ended could not be noted");
+        }
         etude.close().await;
         tasks.close();
         // A search that does not look up would keep the process; it ends without it.

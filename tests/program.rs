@@ -163,8 +163,9 @@ fn sigterm_and_sigint_end_the_service_cleanly() {
         assert_eq!(gone.status.code(), Some(1));
         assert!(text(&gone.stderr).contains("cannot ask http://"), "{}", text(&gone.stderr));
     }
-    let left: Vec<_> = std::fs::read_dir(directory.path()).unwrap().map(|file| file.unwrap().file_name()).collect();
-    assert_eq!(left, ["etude.db"]);
+    let mut left: Vec<_> = std::fs::read_dir(directory.path()).unwrap().map(|file| file.unwrap().file_name()).collect();
+    left.sort();
+    assert_eq!(left, ["etude.db", "etude.db-lock"]);
 }
 
 #[test]

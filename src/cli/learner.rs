@@ -65,7 +65,7 @@ enum Command {
 /// Where a learner is.
 #[derive(Args, Debug)]
 struct Location {
-    /// SQLite database of a service.
+    /// SQLite database of a service, which must not run if it is written to.
     #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_name = "FILE")]
     database: PathBuf,
     /// A running service, such as `http://127.0.0.1:8080`, instead of a database.
@@ -114,7 +114,7 @@ impl LearnerCommand {
 async fn replay(name: &str, database: &Path, out: &mut impl Write) -> Result<(), CliError> {
     let name = checked(name)?;
     let Replay { n_rewards, n_versions, first_difference } =
-        with_database(database, async |etude| Ok(etude.replay(&name).await?)).await?;
+        with_database(database, Use::Read, async |etude| Ok(etude.replay(&name).await?)).await?;
     match first_difference {
         None => {
             writeln!(out, "{name}: {n_rewards} rewards give all {n_versions} versions of the weights, bit for bit")?;
@@ -140,7 +140,7 @@ async fn export(name: &str, place: &Location) -> Result<Exported, CliError> {
     };
     let Some(url) = &place.server else {
         let learned = async |etude: &Etude| Ok(etude.learned(&name).await?);
-        let (definition, weights) = with_database(&place.database, learned).await?;
+        let (definition, weights) = with_database(&place.database, Use::Read, learned).await?;
         return Ok(exported(definition, weights.version, weights.n_trials));
     };
     let client = Client::new(url)?;
@@ -164,7 +164,7 @@ async fn import(name: &str, definition: &LearnerDocument, place: &Location) -> R
         return Ok(());
     }
     let text = definition.text();
-    with_database(&place.database, async |etude| {
+    with_database(&place.database, Use::Write, async |etude| {
         etude.put_learner(&name, text.as_bytes(), Timestamp::now()).await?;
         Ok(())
     })
@@ -193,9 +193,19 @@ fn checked(name: &str) -> Result<Name, CliError> {
     Name::new(name).map_err(|error| CliError::Option(format!("{name:?}: {error}")))
 }
 
-/// Does something with the database of a service, which may be running.
+/// What a database is used for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Use {
+    /// To be read, also beside a running service.
+    Read,
+    /// To be written to, by nobody else.
+    Write,
+}
+
+/// Does something with the database of a service.
 async fn with_database<T>(
     database: &Path,
+    usage: Use,
     work: impl AsyncFnOnce(&Etude) -> Result<T, CliError>,
 ) -> Result<T, CliError> {
     if !database.exists() {
@@ -212,7 +222,10 @@ async fn with_database<T>(
         time_limits: TimeLimits::DEFAULT,
     };
     let tasks = TaskTracker::new();
-    let etude = Etude::open(&settings, &tasks, CancellationToken::new()).await;
+    let etude = match usage {
+        Use::Read => Etude::open_to_read(&settings, &tasks).await,
+        Use::Write => Etude::open(&settings, &tasks, CancellationToken::new()).await,
+    };
     let etude = etude.map_err(crate::service::ServiceError::from)?;
     let done = work(&etude).await;
     etude.close().await;

@@ -144,10 +144,18 @@ pub fn openapi() -> String {
         .description("`internal`: what went wrong was logged under the request's id")
         .content("application/problem+json", Content::new(Some(Ref::from_schema_name("Problem"))))
         .build();
+    // Nor this one, which any write may meet.
+    let full = ResponseBuilder::new()
+        .description("`storage-full`: no room is left for the database; what is there can be read")
+        .content("application/problem+json", Content::new(Some(Ref::from_schema_name("Problem"))))
+        .build();
     let paths = description.paths.paths.iter_mut().filter(|(path, _)| path.starts_with("/v1/"));
     for (_, path) in paths {
         for operation in [&mut path.get, &mut path.put, &mut path.post, &mut path.delete].into_iter().flatten() {
             operation.responses.responses.insert("500".to_owned(), internal.clone().into());
+        }
+        for operation in [&mut path.put, &mut path.post, &mut path.delete].into_iter().flatten() {
+            operation.responses.responses.insert("507".to_owned(), full.clone().into());
         }
     }
     description.to_yaml().expect("every description can be written as YAML")

@@ -21,7 +21,7 @@ use super::path::PathName;
 use super::problem::Problem;
 use crate::attribute::AttributeDocument;
 use crate::model::{ActionDocument, DefinitionDocument};
-use crate::service::{Caller, Etude, ModelAnswer, ModelDefinition, Registered, ServiceError};
+use crate::service::{Caller, DefinitionReader, Etude, ModelAnswer, ModelDefinition, Registered, ServiceError};
 use crate::store::ModelSummary;
 
 /// A registered model.
@@ -101,7 +101,7 @@ struct WholeModelBody {
 #[utoipa::path(
     put, path = "/v1/models/{model}", tag = "models",
     params(
-        ("model" = String, Path, description = "Its name: 1 to 64 of `a-z A-Z 0-9 . _ -`"),
+        ("model" = String, Path, description = "Its name: 1 to 64 of `a-z A-Z 0-9 . _ -`, other than `.` and `..`"),
         ("content-encoding" = Option<String>, Header, description = "`gzip`, `zstd` or `identity`"),
     ),
     request_body(content(
@@ -160,7 +160,7 @@ pub(super) async fn get_model(
     let summary = summary.into();
     match definition {
         ModelDefinition::Text(definition) => Ok(json(StatusCode::OK, &WholeModelBody { summary, definition })),
-        ModelDefinition::Pieces(id) => Ok(json_stream(whole_model(Arc::clone(&context.etude), &summary, id)?)),
+        ModelDefinition::Pieces(pieces) => Ok(json_stream(whole_model(Arc::clone(&context.etude), &summary, pieces)?)),
     }
 }
 
@@ -168,14 +168,14 @@ pub(super) async fn get_model(
 fn whole_model(
     etude: Arc<Etude>,
     summary: &ModelBody,
-    id: i64,
+    pieces: DefinitionReader,
 ) -> Result<impl Stream<Item = Result<Vec<u8>, ServiceError>> + use<>, ServiceError> {
     let mut head = serde_json::to_vec(summary).map_err(ServiceError::Write)?;
     head.pop();
     head.extend_from_slice(b",\"definition\":");
-    let pieces = stream::try_unfold(0, move |seq| {
+    let pieces = stream::try_unfold(pieces, move |mut pieces| {
         let etude = Arc::clone(&etude);
-        async move { Ok(etude.definition_piece(id, seq).await?.map(|piece| (piece, seq + 1))) }
+        async move { Ok(pieces.next(&etude).await?.map(|piece| (piece, pieces))) }
     });
     let of = |bytes| stream::once(future::ready(Ok(bytes)));
     Ok(of(head).chain(pieces).chain(of(b"}".to_vec())))

@@ -6,10 +6,12 @@ use axum::Router;
 use axum::extract::State;
 use axum::http::header::CONTENT_TYPE;
 use axum::response::IntoResponse;
+use jiff::Timestamp;
 use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use super::SharedContext;
 use super::problem::{Problem, ProblemKind};
+use crate::store::StoreError;
 
 /// Whether the process is alive.
 #[utoipa::path(
@@ -20,21 +22,25 @@ pub(super) async fn livez() -> &'static str {
     "alive\n"
 }
 
-/// Whether requests should be sent here: the database answers, writes are taken, and no shutdown has begun.
+/// Whether requests should be sent here: something could be written to the database within the last second, and no shutdown has begun.
 #[utoipa::path(
     get, path = "/readyz", tag = "operation",
     responses(
         (status = 200, description = "They should", body = String, content_type = "text/plain"),
-        (status = 503, description = "`not-ready`: the database does not answer, or nothing can be written to it; `stopping`", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "`not-ready`: nothing can be written to the database, which is locked, read-only, gone, failing or too slow; `stopping`", body = Problem, content_type = "application/problem+json"),
+        (status = 507, description = "`storage-full`: nothing can be written to the database, as its disk is full; what is there can be read", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn readyz(State(context): State<SharedContext>) -> Result<&'static str, Problem> {
     if context.stopping.is_cancelled() {
         return Err(Problem::new(ProblemKind::Stopping, "the service is shutting down"));
     }
-    context.etude.check().await.map_err(|error| {
+    context.etude.check(Timestamp::now()).await.map_err(|error| {
         tracing::warn!(error = &error as &dyn std::error::Error, "not ready");
-        Problem::new(ProblemKind::NotReady, "the database does not answer, or nothing can be written to it")
+        match error {
+            StoreError::Unavailable(_) => error.into(),
+            _ => Problem::new(ProblemKind::NotReady, "the database does not answer, or nothing can be written to it"),
+        }
     })?;
     Ok("ready\n")
 }

@@ -13,7 +13,7 @@ use crate::store::Page;
 #[derive(Clone, Debug, PartialEq, Eq, IntoParams)]
 #[into_params(parameter_in = Query)]
 pub(super) struct Paging {
-    /// Most items: 1 to 1000.
+    /// Most items: 1 to 1000. A page of large ones has fewer.
     #[param(minimum = 1, maximum = 1000, default = 100, required = false)]
     pub(super) limit: u32,
     /// The `next` of the page before; left out for the first page.
@@ -87,14 +87,15 @@ pub(super) struct List<T> {
     items: Vec<T>,
     /// What to give as `after` for the next page; `null` on the last page.
     next: Option<String>,
+    /// Names or ids of what belongs here but cannot be read, as what is stored of it is damaged. Left out if there is none.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schema(required = false)]
+    unreadable: Vec<String>,
 }
 
 impl<T> List<T> {
-    pub(super) fn of<U>(page: Page<U>, item: impl Fn(U) -> T) -> Self {
-        Self { items: page.items.into_iter().map(item).collect(), next: page.next }
-    }
-
-    pub(super) fn try_of<U, E>(page: Page<U>, item: impl Fn(U) -> Result<T, E>) -> Result<Self, E> {
-        Ok(Self { items: page.items.into_iter().map(item).collect::<Result<_, _>>()?, next: page.next })
+    pub(super) fn of<U>(page: Page<U>, item: impl FnMut(U) -> T) -> Self {
+        let Page { items, unreadable, next } = page.map(item);
+        Self { items, next, unreadable }
     }
 }

@@ -12,7 +12,7 @@ use super::encoding::Encoding;
 use super::observe::RequestId;
 use crate::document::{Fault, Faults, ParseError};
 use crate::service::{self, PoolError, ServiceError};
-use crate::store::StoreError;
+use crate::store::{StoreError, Unavailable};
 
 /// What kind of problem it is: its `type`, title and status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,6 +43,7 @@ pub(super) enum ProblemKind {
     Busy,
     NotReady,
     Stopping,
+    StorageFull,
 }
 
 impl ProblemKind {
@@ -83,6 +84,7 @@ impl ProblemKind {
             Self::Busy => ("busy", "Too many requests are waiting", StatusCode::SERVICE_UNAVAILABLE),
             Self::NotReady => ("not-ready", "The database cannot be used now", StatusCode::SERVICE_UNAVAILABLE),
             Self::Stopping => ("stopping", "The service is shutting down", StatusCode::SERVICE_UNAVAILABLE),
+            Self::StorageFull => ("storage-full", "No room is left for the database", StatusCode::INSUFFICIENT_STORAGE),
         }
     }
 }
@@ -187,6 +189,12 @@ impl From<Faults> for Problem {
     }
 }
 
+impl From<StoreError> for Problem {
+    fn from(error: StoreError) -> Self {
+        ServiceError::from(error).into()
+    }
+}
+
 impl From<ServiceError> for Problem {
     fn from(error: ServiceError) -> Self {
         let detail = error.to_string();
@@ -215,7 +223,12 @@ impl From<ServiceError> for Problem {
             ServiceError::Pool(PoolError::Busy) | ServiceError::NoRoom(_) | ServiceError::Compiling { .. } => {
                 Self::new(ProblemKind::Busy, detail)
             }
-            ServiceError::Store(StoreError::Locked | StoreError::Lost) => Self::new(ProblemKind::NotReady, detail),
+            ServiceError::Store(StoreError::Unavailable(Unavailable::Full)) => {
+                Self::new(ProblemKind::StorageFull, detail)
+            }
+            ServiceError::Store(StoreError::Unavailable(_) | StoreError::Lost) => {
+                Self::new(ProblemKind::NotReady, detail)
+            }
             ServiceError::Store(StoreError::Closed) | ServiceError::Pool(PoolError::Stopped) => {
                 Self::new(ProblemKind::Stopping, detail)
             }

@@ -16,7 +16,7 @@ use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
 use super::problem::Problem;
 use crate::mapping::{ObservationDocument, Policy, StartReference};
-use crate::service::{Caller, ServiceError, TrialAnswer};
+use crate::service::{Caller, TrialAnswer};
 use crate::store::{StoreError, TrialStatus};
 
 /// A request for a trial.
@@ -79,16 +79,16 @@ pub(super) struct TrialBody {
 }
 
 impl TrialBody {
-    fn of(answer: TrialAnswer) -> Result<Self, ServiceError> {
+    fn of(answer: TrialAnswer) -> Result<Self, StoreError> {
         let TrialAnswer { row, status, policy } = answer;
-        let corrupt =
-            |error: serde_json::Error| StoreError::Corrupt { table: "trials", column: "weights", source: error.into() };
+        let weights = RawValue::from_string(row.weights);
+        let weights = weights.map_err(|error| StoreError::corrupt("trials", "weights", &row.id, error))?;
         Ok(Self {
             id: row.id,
             learner: row.learner,
             number: row.number,
             status: status.name(),
-            weights: RawValue::from_string(row.weights).map_err(corrupt)?,
+            weights,
             weights_version: row.weights_version,
             reward: row.reward.map(|accepted| accepted.reward),
             reward_order: row.reward.map(|accepted| accepted.reward_order),
@@ -199,7 +199,8 @@ pub(super) async fn list_trials(
 ) -> Result<Response, Problem> {
     let after = paging.after_number()?.unwrap_or(0);
     let page = context.etude.trials(&name, which.status, Timestamp::now(), after, paging.limit).await?;
-    Ok(json(StatusCode::OK, &List::try_of(page, TrialBody::of)?))
+    let page = page.try_map(|answer| &answer.row.id, TrialBody::of)?;
+    Ok(json(StatusCode::OK, &List::of(page, |trial| trial)))
 }
 
 /// A trial, with its policy.

@@ -6,19 +6,20 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use futures_util::future::OptionFuture;
+use sha2::{Digest, Sha256};
 use tokio_util::task::TaskTracker;
 use tracing::Instrument;
 
 use super::cache::MapperCache;
-use super::models::{ModelText, corrupt_definition, unknown};
+use super::models::{DefinitionReader, ModelText, check_hash, corrupt_definition, unknown};
 use super::pool::Admission;
 use super::{Client, Etude, PipeWriter, PoolError, SearchPool, ServiceError, Settings, pipe};
 use crate::document::Faults;
 use crate::interrupt::{Interrupt, Interrupted, Signal};
 use crate::mapping::Mapper;
 use crate::memory::{Held, Memory, NoRoom};
-use crate::model::{Definition, Format, Limits, Model};
-use crate::store::{ModelKey, ModelSize, Store, StoreError, StoredDefinition};
+use crate::model::{Definition, Format, Limits, Model, ReadError, hex};
+use crate::store::{ModelKey, ModelSize, ModelSummary, Store, StoreError, StoredDefinition};
 
 /// Makes models ready, and keeps as many as fit.
 #[derive(Clone, Debug)]
@@ -100,17 +101,27 @@ impl Compiler {
                 StoredDefinition::Text(text) => (ModelText::Whole(text.into_bytes()), None),
                 StoredDefinition::Pieces(id) => {
                     let (to_reader, reader) = pipe();
-                    (ModelText::Packed(Box::new(|| Ok(Box::new(reader)))), Some(feed(&self.store, id, to_reader)))
+                    let pieces = DefinitionReader::new(&row.summary, id);
+                    (ModelText::Packed(Box::new(|| Ok(Box::new(reader)))), Some(feed(&self.store, pieces, to_reader)))
                 }
             };
             // What it was found to be when it was registered, whatever the limit is now.
             let limits = if key.is_lazy { Limits { max_states: 0, ..Limits::NONE } } else { Limits::NONE };
             let compiler = self.clone();
+            let ModelSummary { name: model, hash: expected, .. } = row.summary;
             let job = move |interrupt: &mut dyn Interrupt| {
+                // That of pieces is checked as they come.
+                if let ModelText::Whole(text) = &text
+                    && let Err(error) = check_hash(&model, &hex(&Sha256::digest(text)), &expected)
+                {
+                    return Ok(Err(error.into()));
+                }
                 let definition = text.read(Format::Json, Limits::NONE, interrupt);
                 Ok(match definition {
                     Ok(definition) => compiler.compile(definition, held, limits, interrupt),
-                    Err(error) => Err(error.into()),
+                    // What was once accepted is read again without faults.
+                    Err(ReadError::Cancelled(_)) => Err(PoolError::Stopped.into()),
+                    Err(error) => Err(corrupt_definition(&model, error.into())),
                 })
             };
             let compile = async {
@@ -126,21 +137,15 @@ impl Compiler {
                 Some(Err(error)) => return Err(error),
                 Some(Ok(())) | None => {}
             }
-            match mapper? {
-                Ok(mapper) => Ok(Arc::new(mapper)),
-                // What was once accepted is read again without faults.
-                Err(error @ ServiceError::Parse(_)) => Err(corrupt_definition(error.into())),
-                Err(error) => Err(error),
-            }
+            Ok(Arc::new(mapper??))
         };
         self.cache.get_or_compile(&key, compile).await
     }
 }
 
 /// Sends the pieces of a definition to their reader.
-async fn feed(store: &Store, id: i64, to_reader: PipeWriter<Vec<u8>>) -> Result<(), ServiceError> {
-    for seq in 0.. {
-        let Some(piece) = store.piece(id, seq).await? else { break };
+async fn feed(store: &Store, mut pieces: DefinitionReader, to_reader: PipeWriter<Vec<u8>>) -> Result<(), ServiceError> {
+    while let Some(piece) = pieces.next_in(store).await? {
         if !to_reader.send(Ok(piece)).await {
             return Ok(());
         }

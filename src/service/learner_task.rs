@@ -12,6 +12,7 @@ use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
 use super::{Etude, ServiceError};
+use crate::store::StoreError;
 
 impl Etude {
     /// Folds pending rewards into the weights of their learners, `every` so often, until `stopping` is cancelled.
@@ -28,8 +29,10 @@ impl Etude {
                 _ = ticks.tick() => {}
                 () = stopping.cancelled() => return,
             }
-            if let Err(error) = self.learn_all(Timestamp::now()).await {
-                tracing::error!(error = &error as &dyn std::error::Error, "learning failed");
+            match self.learn_all(Timestamp::now()).await {
+                // The writer has told of it, once.
+                Ok(()) | Err(ServiceError::Store(StoreError::Unavailable(_))) => {}
+                Err(error) => tracing::error!(error = &error as &dyn std::error::Error, "learning failed"),
             }
         }
     }
@@ -40,6 +43,8 @@ impl Etude {
             match self.learn(&name, now).await {
                 // Deleted since.
                 Ok(_) | Err(ServiceError::Unknown { .. }) => {}
+                // The others would fare no better.
+                Err(error @ ServiceError::Store(StoreError::Unavailable(_))) => return Err(error),
                 // What is wrong with one learner is no concern of the others. What is pending stays pending, and is tried again.
                 Err(error) => {
                     tracing::error!(

@@ -117,7 +117,7 @@ impl Etude {
     ///
     /// If there is none.
     pub async fn learner(&self, name: &Name) -> Result<LearnerAnswer, ServiceError> {
-        answer(self.learner_row(name).await?)
+        Ok(answer(self.learner_row(name).await?)?)
     }
 
     /// At most `limit` learners in the order of their names, from the first after `after`.
@@ -126,8 +126,8 @@ impl Etude {
     ///
     /// If the store failed.
     pub async fn learners(&self, after: Option<&str>, limit: u32) -> Result<Page<LearnerAnswer>, ServiceError> {
-        let Page { items, next } = self.store.learners(after, limit).await?;
-        Ok(Page { items: items.into_iter().map(answer).collect::<Result<_, _>>()?, next })
+        let page = self.store.learners(after, limit).await?;
+        Ok(page.try_map(|row| &row.name, answer)?)
     }
 
     /// Deletes the learner called `name`, with its weights and trials. Policies made with it stay.
@@ -172,9 +172,8 @@ impl Etude {
     ) -> Result<Page<WeightsAnswer>, ServiceError> {
         let row = self.learner_row(name).await?;
         let learner = read_definition(&row)?;
-        let Page { items, next } = self.store.weights_history(row.sequence, after, limit).await?;
-        let items = items.into_iter().map(|weights| weights_answer(name.as_str(), &learner, weights)).collect();
-        Ok(Page { items, next })
+        let page = self.store.weights_history(row.sequence, after, limit).await?;
+        Ok(page.map(|weights| weights_answer(name.as_str(), &learner, weights)))
     }
 
     /// Folds the rewards of a learner that are not folded in yet into a new version of its weights, if there are any.
@@ -229,10 +228,13 @@ impl Etude {
         let mut after = None;
         loop {
             let page = self.store.weights_history(row.sequence, after, Self::REPLAY_PAGE).await?;
-            after = page.items.last().map(|weights| weights.version);
+            if let Some(version) = page.unreadable.into_iter().next() {
+                return Err(StoreError::corrupt("weights", "value", version, "it cannot be read").into());
+            }
             versions.extend(page.items);
-            if page.next.is_none() {
-                break;
+            match page.next {
+                Some(next) => after = next.parse().ok(),
+                None => break,
             }
         }
         let mut versions = versions.into_iter().peekable();
@@ -294,18 +296,24 @@ pub(super) fn unknown(name: &str, pointer: Option<&'static str>) -> ServiceError
     ServiceError::Unknown { kind: "learner", name: name.to_owned(), pointer }
 }
 
-fn corrupt_definition(source: Box<dyn std::error::Error + Send + Sync>) -> ServiceError {
-    StoreError::Corrupt { table: "learners", column: "definition", source }.into()
+/// The text of a definition, if it is the one that was accepted.
+fn checked_definition(row: &LearnerRow) -> Result<&str, StoreError> {
+    if hash_of(&row.definition) == row.hash {
+        return Ok(&row.definition);
+    }
+    Err(StoreError::corrupt("learners", "definition", &row.name, "it is not what its hash is of"))
 }
 
 /// What was once accepted is read again without faults.
-fn read_definition(row: &LearnerRow) -> Result<Learner, ServiceError> {
-    let document = document::parse(row.definition.as_bytes()).map_err(|error| corrupt_definition(error.into()))?;
-    Learner::read(&document).map_err(|faults| corrupt_definition(faults.into()))
+fn read_definition(row: &LearnerRow) -> Result<Learner, StoreError> {
+    let corrupt = |error| StoreError::corrupt("learners", "definition", &row.name, error);
+    let document = document::parse(checked_definition(row)?.as_bytes()).map_err(|error| corrupt(error.to_string()))?;
+    Learner::read(&document).map_err(|faults| corrupt(faults.to_string()))
 }
 
-fn answer(row: LearnerRow) -> Result<LearnerAnswer, ServiceError> {
-    let definition = serde_json::from_str(&row.definition).map_err(|error| corrupt_definition(error.into()))?;
+fn answer(row: LearnerRow) -> Result<LearnerAnswer, StoreError> {
+    let definition = serde_json::from_str(checked_definition(&row)?);
+    let definition = definition.map_err(|error| StoreError::corrupt("learners", "definition", &row.name, error))?;
     Ok(LearnerAnswer { name: row.name, hash: row.hash, definition, created_at: row.created_at })
 }
 

@@ -35,7 +35,7 @@ use jiff::{Timestamp, Unit};
 pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS, MadePolicies};
 pub use caller::{Caller, Client};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
-pub use models::{ModelAnswer, ModelDefinition, ModelText, OpenText, Registered};
+pub use models::{DefinitionReader, ModelAnswer, ModelDefinition, ModelText, OpenText, Registered};
 pub use name::{InvalidName, Name};
 pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
@@ -200,16 +200,30 @@ pub struct Etude {
 }
 
 impl Etude {
-    /// Opens the database and gets ready. Whatever runs in the background runs in `tasks`; searches end when `abort` is
-    /// cancelled.
+    /// Opens the database for this process alone, and gets ready. Whatever runs in the background runs in `tasks`; searches end when
+    /// `abort` is cancelled.
     ///
     /// # Errors
     ///
     /// If the database cannot be opened.
     pub async fn open(settings: &Settings, tasks: &TaskTracker, abort: CancellationToken) -> Result<Self, StoreError> {
-        let store = Arc::new(Store::open(&settings.database, tasks).await?);
+        Ok(Self::with(Store::open_alone(&settings.database, tasks).await?, settings, tasks, abort))
+    }
+
+    /// Opens the database to read it, whoever works with it.
+    ///
+    /// # Errors
+    ///
+    /// If the database cannot be opened, or has the schema of an earlier version.
+    pub async fn open_to_read(settings: &Settings, tasks: &TaskTracker) -> Result<Self, StoreError> {
+        let store = Store::open_to_read(&settings.database, tasks).await?;
+        Ok(Self::with(store, settings, tasks, CancellationToken::new()))
+    }
+
+    fn with(store: Store, settings: &Settings, tasks: &TaskTracker, abort: CancellationToken) -> Self {
+        let store = Arc::new(store);
         let pool = SearchPool::new(settings.pool, tasks.clone(), abort);
-        Ok(Self {
+        Self {
             compiler: Compiler::new(Arc::clone(&store), pool.clone(), settings, tasks.clone()),
             store,
             memory: settings.memory.clone(),
@@ -224,25 +238,39 @@ impl Etude {
             uploads: Uploads::default(),
             trial_numbers: TrialNumbers::default(),
             learning: tokio::sync::Mutex::new(()),
-        })
+        }
     }
 
-    /// Whether the service can do its work.
+    /// Whether the service can do its work at `now`: whether something can be written.
     ///
     /// # Errors
     ///
-    /// If the database does not answer.
-    pub async fn check(&self) -> Result<(), StoreError> {
-        self.store.check().await
+    /// If not.
+    pub async fn check(&self, now: Timestamp) -> Result<(), StoreError> {
+        self.store.check(now, self.alive_every()).await
     }
 
-    /// Removes what a killed service has left behind. Only a service may, when it starts.
+    /// Begins to serve at `now`: time since the service was last alive does not count for open sessions, and what a killed service has
+    /// left behind is removed. Where nothing can be written, that is done once it can be.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn sweep_left_behind(&self) -> Result<(), StoreError> {
-        self.store.sweep_left_behind().await
+    pub async fn begin(&self, now: Timestamp) -> Result<(), StoreError> {
+        match self.note_alive(now).await {
+            Ok(()) => self.store.sweep_left_behind().await,
+            Err(StoreError::Unavailable(_)) => Ok(()),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Notes that the service is alive at `now`.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be written.
+    pub async fn note_alive(&self, now: Timestamp) -> Result<(), StoreError> {
+        self.store.note_alive(now, self.alive_every()).await
     }
 
     /// Closes the store. Whoever still asks for something gets an error.

@@ -13,10 +13,10 @@ use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::attribute::AttributeDocument;
 use crate::interrupt::{Interrupt, Interrupted};
 use crate::mapping::Mapper;
-use crate::model::{ActionDocument, Definition, Format, Limits, ReadError, hex};
+use crate::model::{ActionDocument, Definition, Format, Limits, ReadError, hash_of, hex};
 use crate::store::{
-    ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, PutModel, StoreError,
-    StoredDefinition,
+    ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, PutModel, Store,
+    StoreError, StoredDefinition,
 };
 
 /// A model and its definition, as registered.
@@ -33,8 +33,52 @@ pub struct ModelAnswer {
 pub enum ModelDefinition {
     /// JSON.
     Text(Box<RawValue>),
-    /// Too large to be held: to be read with [`Etude::definition_piece`], by this id.
-    Pieces(i64),
+    /// Too large to be held: to be read with this.
+    Pieces(DefinitionReader),
+}
+
+/// Reads a definition piece by piece, and tells at its end whether that was the one that was registered.
+#[derive(Debug)]
+pub struct DefinitionReader {
+    model: String,
+    expected: String,
+    id: i64,
+    seq: i64,
+    hash: Sha256,
+}
+
+impl DefinitionReader {
+    pub(super) fn new(summary: &ModelSummary, id: i64) -> Self {
+        Self { model: summary.name.clone(), expected: summary.hash.clone(), id, seq: 0, hash: Sha256::new() }
+    }
+
+    /// The next piece of the canonical text; `None` after the last one.
+    ///
+    /// # Errors
+    ///
+    /// If the model was deleted, the pieces are not what was registered, or the store failed.
+    pub async fn next(&mut self, etude: &Etude) -> Result<Option<Vec<u8>>, ServiceError> {
+        self.next_in(&etude.store).await
+    }
+
+    pub(super) async fn next_in(&mut self, store: &Store) -> Result<Option<Vec<u8>>, ServiceError> {
+        let Some(piece) = store.piece(self.id, self.seq).await? else {
+            let hash = std::mem::take(&mut self.hash);
+            check_hash(&self.model, &hex(&hash.finalize()), &self.expected)?;
+            return Ok(None);
+        };
+        self.seq += 1;
+        self.hash.update(&piece);
+        Ok(Some(piece))
+    }
+}
+
+/// Makes sure that what is stored of a definition is what was registered.
+pub(super) fn check_hash(model: &str, hash: &str, expected: &str) -> Result<(), StoreError> {
+    if hash == expected {
+        return Ok(());
+    }
+    Err(StoreError::corrupt("models", "definition", model, "it is not what its hash is of"))
 }
 
 /// The text of a model on its way in.
@@ -210,20 +254,13 @@ impl Etude {
         let row = self.store.model(name.as_str()).await?.ok_or_else(|| unknown(name.as_str(), None))?;
         let definition = match row.definition {
             StoredDefinition::Text(text) => {
-                ModelDefinition::Text(RawValue::from_string(text).map_err(|error| corrupt_definition(error.into()))?)
+                check_hash(name.as_str(), &hash_of(&text), &row.summary.hash)?;
+                let text = RawValue::from_string(text);
+                ModelDefinition::Text(text.map_err(|error| corrupt_definition(name.as_str(), error.into()))?)
             }
-            StoredDefinition::Pieces(id) => ModelDefinition::Pieces(id),
+            StoredDefinition::Pieces(id) => ModelDefinition::Pieces(DefinitionReader::new(&row.summary, id)),
         };
         Ok(ModelAnswer { summary: row.summary, definition })
-    }
-
-    /// The piece `seq` of the canonical text of a definition; `None` after the last one.
-    ///
-    /// # Errors
-    ///
-    /// If the model was deleted, or the store failed.
-    pub async fn definition_piece(&self, id: i64, seq: i64) -> Result<Option<Vec<u8>>, ServiceError> {
-        Ok(self.store.piece(id, seq).await?)
     }
 
     /// At most `limit` models in the order of their names, from the first after `after`.
@@ -253,8 +290,8 @@ pub(super) fn unknown(name: &str, pointer: Option<&'static str>) -> ServiceError
     ServiceError::Unknown { kind: "model", name: name.to_owned(), pointer }
 }
 
-pub(super) fn corrupt_definition(source: Box<dyn std::error::Error + Send + Sync>) -> ServiceError {
-    StoreError::Corrupt { table: "models", column: "definition", source }.into()
+pub(super) fn corrupt_definition(model: &str, source: Box<dyn std::error::Error + Send + Sync>) -> ServiceError {
+    StoreError::corrupt("models", "definition", model, source).into()
 }
 
 impl From<ReadError> for ServiceError {
@@ -346,7 +383,8 @@ impl DefinitionWriter {
     fn finish(mut self) -> Result<(String, Option<String>), ServiceError> {
         if self.is_whole {
             self.hash.update(&self.piece);
-            let text = String::from_utf8(self.piece).map_err(|error| corrupt_definition(error.into()))?;
+            let text = String::from_utf8(self.piece)
+                .map_err(|error| ServiceError::Write(serde_json::Error::io(io::Error::other(error))))?;
             return Ok((hex(&self.hash.finalize()), Some(text)));
         }
         if !self.piece.is_empty() {

@@ -19,7 +19,7 @@ use crate::interrupt::{Cancelled, Interrupt, time_until_finish};
 use crate::mapping::{Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::model::Model;
-use crate::store::{NewPolicy, NewRefinement, Page, StoreError};
+use crate::store::{NewPolicy, NewRefinement, Page, PolicySummaryRow, StoreError};
 
 /// Bodies up to this size are parsed where they arrive, which takes less than a millisecond; larger ones in the pool. Likewise
 /// for the states of an answer.
@@ -199,15 +199,12 @@ impl Etude {
     ///
     /// If the store failed.
     pub async fn policies(&self, after: i64, limit: u32) -> Result<Page<Box<RawValue>>, ServiceError> {
-        let Page { items, next } = self.store.policies(after, limit).await?;
-        let read = |row: crate::store::PolicySummaryRow| {
-            RawValue::from_string(row.summary).map_err(|error| StoreError::Corrupt {
-                table: "policies",
-                column: "summary",
-                source: error.into(),
-            })
+        let page = self.store.policies(after, limit).await?;
+        let read = |row: PolicySummaryRow| {
+            RawValue::from_string(row.summary)
+                .map_err(|error| StoreError::corrupt("policies", "summary", row.id, error))
         };
-        Ok(Page { items: items.into_iter().map(read).collect::<Result<_, _>>()?, next })
+        Ok(page.try_map(|row| &row.id, read)?)
     }
 }
 

@@ -8,7 +8,8 @@
 //!  +--pause--+---> somebody needs the thread, database locked: later, after the others; every pause is longer than the last
 //! ```
 //!
-//! A search that made way begins anew. So while all threads are needed all the time, policies stay what they are.
+//! Each attempt is counted before it begins, durably, and one that ends is taken back or the last: so what ends the process is given up
+//! after some times. A search that made way begins anew. So while all threads are needed all the time, policies stay what they are.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -24,7 +25,7 @@ use crate::document;
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::mapping::{Mapper, Policy, Settings, Stamp, Status};
 use crate::memory::Memory;
-use crate::store::{NewRefinement, RefinementEnd, StoreError};
+use crate::store::{MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError};
 
 /// The first pause after a refinement that did not come to its end.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
@@ -58,11 +59,18 @@ impl Etude {
     /// Refines whatever waits to be refined, until `stopping` is cancelled.
     pub async fn refine_until(self: Arc<Self>, stopping: CancellationToken) {
         let mut after = 0;
+        let mut begun = None;
         let mut pause = FIRST_PAUSE;
         loop {
             let outcome = tokio::select! {
-                outcome = self.refine_next(&mut after) => outcome,
-                () = stopping.cancelled() => return,
+                outcome = self.refine_next(&mut after, &mut begun) => outcome,
+                () = stopping.cancelled() => {
+                    // Being stopped is no fault of what was being refined.
+                    if let Some(policy_id) = begun {
+                        self.return_refinement(&policy_id).await;
+                    }
+                    return;
+                }
             };
             match outcome {
                 Ok(Some(Outcome::Ended)) => {
@@ -88,8 +96,8 @@ impl Etude {
     }
 
     /// Refines the policy that has waited longest of those after the sequence number `after`, which becomes its; of all, if there is
-    /// none. Nothing if none waits.
-    async fn refine_next(&self, after: &mut i64) -> Result<Option<Outcome>, StoreError> {
+    /// none. Nothing if none waits. Meanwhile `begun` is the policy that an attempt is counted for.
+    async fn refine_next(&self, after: &mut i64, begun: &mut Option<String>) -> Result<Option<Outcome>, StoreError> {
         let next = match self.store.next_refinement(*after).await? {
             None => self.store.next_refinement(0).await?,
             next => next,
@@ -97,7 +105,21 @@ impl Etude {
         let Some((sequence, refinement)) = next else { return Ok(None) };
         *after = sequence;
         let policy_id = refinement.policy_id.clone();
-        let refined = match self.refine(refinement).await {
+        *begun = Some(policy_id.clone());
+        let may_begin = self.store.begin_refinement(&policy_id).await;
+        if !matches!(may_begin, Ok(true)) {
+            *begun = None;
+        }
+        if !may_begin? {
+            tracing::error!(
+                policy_id,
+                "not refined: the process has ended each of the {MAX_ATTEMPTS} times that it was tried"
+            );
+            return Ok(Some(Outcome::Ended));
+        }
+        let refined = self.refine(refinement).await;
+        *begun = None;
+        let refined = match refined {
             Ok(Some(refined)) => Some(refined),
             Ok(None) => {
                 tracing::info!(policy_id, "not refined: the search has spent its budget");
@@ -105,10 +127,12 @@ impl Etude {
             }
             Err(ServiceError::Pool(PoolError::Busy)) => {
                 tracing::debug!(policy_id, "not refined yet: no thread to spare");
+                self.return_refinement(&policy_id).await;
                 return Ok(Some(Outcome::Later));
             }
             Err(error) if is_passing(&error) => {
                 tracing::warn!(error = &error as &dyn std::error::Error, policy_id, "not refined yet");
+                self.return_refinement(&policy_id).await;
                 return Ok(Some(Outcome::Later));
             }
             // Without its model, the policy stays what it is.
@@ -122,8 +146,23 @@ impl Etude {
             }
         };
         let refined = refined.map(|refined| refined.at(Timestamp::now()));
-        self.store.end_refinement(RefinementEnd { policy_id, refined }).await?;
+        let end = RefinementEnd { policy_id: policy_id.clone(), refined };
+        if let Err(error) = self.store.end_refinement(end).await {
+            self.return_refinement(&policy_id).await;
+            return Err(error);
+        }
         Ok(Some(Outcome::Ended))
+    }
+
+    /// Takes back an attempt that has not come to its end. Where that cannot be noted, it counts.
+    async fn return_refinement(&self, policy_id: &str) {
+        if let Err(error) = self.store.return_refinement(policy_id).await {
+            tracing::warn!(
+                error = &error as &dyn std::error::Error,
+                policy_id,
+                "an attempt counts that made way for others"
+            );
+        }
     }
 
     /// The refined policy; `None` if the budget does not suffice to find it.
@@ -252,7 +291,7 @@ mod tests {
         }
         let good = made(&etude, &request()).await;
         let mut after = 0;
-        while let Some(outcome) = etude.refine_next(&mut after).await.unwrap() {
+        while let Some(outcome) = etude.refine_next(&mut after, &mut None).await.unwrap() {
             assert_eq!(outcome, Outcome::Ended);
         }
         assert!(etude.policy("unreadable").await.is_err(), "it stays what it is");
@@ -273,9 +312,9 @@ mod tests {
             Ok(())
         }));
         assert!(futures_util::poll!(&mut running).is_pending());
-        assert_eq!(etude.refine_next(&mut after).await.unwrap(), Some(Outcome::Later));
+        assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), Some(Outcome::Later));
         drop(running);
-        while etude.refine_next(&mut after).await.unwrap() == Some(Outcome::Later) {
+        while etude.refine_next(&mut after, &mut None).await.unwrap() == Some(Outcome::Later) {
             tokio::task::yield_now().await;
         }
         assert!(read(&etude, &id).await["refined_by"].is_string());
@@ -289,7 +328,7 @@ mod tests {
         (request["heuristic"], request["max_expansions"]) = ("paper".into(), 0.into());
         let id = made(&etude, &request).await;
         let mut after = 0;
-        assert_eq!(etude.refine_next(&mut after).await.unwrap(), Some(Outcome::Ended));
+        assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), Some(Outcome::Ended));
         let refined_by = read(&etude, &id).await["refined_by"].as_str().unwrap().to_owned();
         assert_eq!(read(&etude, &refined_by).await["status"], "optimal");
 

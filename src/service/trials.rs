@@ -139,7 +139,8 @@ impl Etude {
             reward: None,
             learned_version: None,
         };
-        Ok(TrialAnswer { row, status: TrialStatus::Active, policy: Some(read_policy(policy)?) })
+        let policy = Some(read_policy(policy, &row.policy_id)?);
+        Ok(TrialAnswer { row, status: TrialStatus::Active, policy })
     }
 
     /// Draws a trial for a policy that is still in the making. The caller stores it.
@@ -174,7 +175,8 @@ impl Etude {
     /// If there is none.
     pub async fn trial(&self, id: &str, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
         let row = self.store.trial(id).await?.ok_or_else(|| unknown_trial(id))?;
-        let policy = self.store.policy(&row.policy_id).await?.map(read_policy).transpose()?;
+        let policy = self.store.policy(&row.policy_id).await?;
+        let policy = policy.map(|policy| read_policy(policy, &row.policy_id)).transpose()?;
         Ok(TrialAnswer { status: row.status(now), row, policy })
     }
 
@@ -193,9 +195,8 @@ impl Etude {
         limit: u32,
     ) -> Result<Page<TrialAnswer>, ServiceError> {
         let learner = self.learner_row(name).await?.sequence;
-        let Page { items, next } = self.store.trials(learner, status, now, after, limit).await?;
-        let answer = |row: TrialRow| TrialAnswer { status: row.status(now), row, policy: None };
-        Ok(Page { items: items.into_iter().map(answer).collect(), next })
+        let page = self.store.trials(learner, status, now, after, limit).await?;
+        Ok(page.map(|row| TrialAnswer { status: row.status(now), row, policy: None }))
     }
 
     /// Accepts the reward in `body` (JSON) for a trial; durable when this returns. The same reward again changes nothing.
@@ -302,8 +303,7 @@ fn unknown_trial(id: &str) -> ServiceError {
     ServiceError::Unknown { kind: "trial", name: id.to_owned(), pointer: None }
 }
 
-fn read_policy(policy: String) -> Result<Box<RawValue>, ServiceError> {
-    let corrupt =
-        |error: serde_json::Error| StoreError::Corrupt { table: "policies", column: "policy", source: error.into() };
-    Ok(RawValue::from_string(policy).map_err(corrupt)?)
+fn read_policy(policy: String, id: &str) -> Result<Box<RawValue>, ServiceError> {
+    let read = RawValue::from_string(policy);
+    Ok(read.map_err(|error| StoreError::corrupt("policies", "policy", id, error))?)
 }

@@ -17,7 +17,7 @@ use std::fmt::Write;
 
 use serde::Deserialize;
 use serde_json::value::RawValue;
-use sqlx::SqliteConnection;
+use sqlx::{SqliteConnection, SqlitePool};
 
 use super::sessions::{self, NewObservations};
 use super::{StoreError, corrupt};
@@ -177,6 +177,12 @@ impl Arrivals {
     }
 }
 
+/// What has arrived and is not settled, by session.
+pub(super) async fn read(readers: &SqlitePool) -> Result<BTreeMap<String, NewObservations>, StoreError> {
+    let query = sqlx::query_scalar("SELECT observations FROM arrivals ORDER BY sequence");
+    together(&query.fetch_all(readers).await?)
+}
+
 /// Changes when another connection has written.
 async fn data_version(connection: &mut SqliteConnection) -> Result<i64, StoreError> {
     Ok(sqlx::query_scalar("SELECT data_version FROM pragma_data_version").fetch_one(connection).await?)
@@ -222,6 +228,8 @@ fn refused(session_id: &str, seq: u32) {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use jiff::Timestamp;
     use proptest::prelude::*;
     use tokio_util::task::TaskTracker;
@@ -280,7 +288,7 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(24))]
 
-        /// As when a process is started while the one before still ends.
+        /// No two services do, but a foreign hand may.
         #[test]
         fn two_processes_on_one_database_accept_what_is_next_and_lose_and_double_nothing(actions in actions()) {
             let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
@@ -291,6 +299,7 @@ mod tests {
                 let stores = [Store::open(&path, &tasks).await.unwrap(), Store::open(&path, &tasks).await.unwrap()];
                 let ids = ["a", "b"];
                 for (store, id) in stores.iter().zip(ids) {
+                    store.note_alive(Timestamp::UNIX_EPOCH, Duration::MAX).await.unwrap();
                     assert!(store.open_session(session(id)).await.unwrap());
                 }
                 let mut expected = [Vec::new(), Vec::new()];
@@ -315,11 +324,14 @@ mod tests {
                         }
                         // Few sessions expire in the middle of something, so this is the end of both or of none.
                         Action::Expire if n_expected > 20 => {
-                            store.expire_sessions(Timestamp::MAX).await.unwrap();
+                            store.expire_sessions(Timestamp::MAX, Duration::ZERO, Duration::MAX).await.unwrap();
                             is_open = false;
                             break;
                         }
-                        Action::Expire => store.expire_sessions(Timestamp::UNIX_EPOCH).await.unwrap(),
+                        Action::Expire => {
+                            let expired = store.expire_sessions(Timestamp::UNIX_EPOCH, Duration::ZERO, Duration::MAX);
+                            assert_eq!(expired.await.unwrap(), []);
+                        }
                     }
                 }
                 // Dropped, not closed: whoever comes next finds all of it.

@@ -5,8 +5,9 @@ use jiff::Timestamp;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
+use super::page::{Rest, Rows};
 use super::writer::{Write, Written};
-use super::{Page, Store, StoreError, as_integer, corrupt, count, timestamp};
+use super::{Page, Store, StoreError, as_integer, corrupt, count, page, timestamp};
 use crate::attribute::ByAttribute;
 use crate::learning::Distribution;
 
@@ -124,7 +125,7 @@ impl Store {
     /// If the database failed.
     pub async fn learner(&self, name: &str) -> Result<Option<LearnerRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM learners WHERE name = $1").bind(name);
-        query.fetch_optional(&self.readers).await?.map(|row| read_learner(&row)).transpose()
+        query.fetch_optional(self.readers()).await?.map(|row| read_learner(&row)).transpose()
     }
 
     /// The learner called `name`, and the last version of its weights.
@@ -138,7 +139,7 @@ impl Store {
              FROM learners l JOIN weights w ON w.learner = l.sequence
              WHERE l.name = $1 ORDER BY w.version DESC LIMIT 1",
         );
-        let row = query.bind(name).fetch_optional(&self.readers).await?;
+        let row = query.bind(name).fetch_optional(self.readers()).await?;
         row.map(|row| Ok((read_learner(&row)?, read_weights(&row)?))).transpose()
     }
 
@@ -148,11 +149,15 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn learners(&self, after: Option<&str>, limit: u32) -> Result<Page<LearnerRow>, StoreError> {
+        // Definitions may be so long that even a few of them are not read ahead.
+        let sizes = "SELECT octet_length(definition) FROM learners WHERE name > $1 ORDER BY name LIMIT $2";
+        let sizes = sqlx::query_scalar(sizes).bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
+        let (n_rows, rest) = page::fitting(&sizes.fetch_all(self.readers()).await?, limit);
         let query = sqlx::query("SELECT * FROM learners WHERE name > $1 ORDER BY name LIMIT $2");
-        let query = query.bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
-        let rows = query.fetch_all(&self.readers).await?;
-        let learners = rows.iter().map(read_learner).collect::<Result<Vec<_>, _>>()?;
-        Ok(Page::of(learners, limit, |learner| learner.name.clone()))
+        let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(self.readers());
+        Rows { table: "learners", key: "name", name: "name", long: &["definition"], read: read_learner }
+            .page(rows, n_rows, rest)
+            .await
     }
 
     /// Names of learners with rewards that no version has folded in.
@@ -161,12 +166,7 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn learners_behind(&self) -> Result<Vec<String>, StoreError> {
-        let query = sqlx::query_scalar(
-            "SELECT l.name FROM learners l
-             WHERE (SELECT MAX(reward_order) FROM rewards r WHERE r.learner = l.sequence)
-                 > (SELECT MAX(reward_order) FROM weights w WHERE w.learner = l.sequence)",
-        );
-        Ok(query.fetch_all(&self.readers).await?)
+        Ok(sqlx::query_scalar(BEHIND).fetch_all(self.readers()).await?)
     }
 
     /// A version of the weights of a learner.
@@ -177,7 +177,7 @@ impl Store {
     pub async fn weights(&self, learner: i64, version: u64) -> Result<Option<WeightsRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version = $2");
         let query = query.bind(learner).bind(as_integer(version));
-        query.fetch_optional(&self.readers).await?.map(|row| read_weights(&row)).transpose()
+        query.fetch_optional(self.readers()).await?.map(|row| read_weights(&row)).transpose()
     }
 
     /// At most `limit` versions of the weights of a learner, from the first after `after` on; `None`: from version 0.
@@ -193,9 +193,10 @@ impl Store {
     ) -> Result<Page<WeightsRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version > $2 ORDER BY version LIMIT $3");
         let query = query.bind(learner).bind(after.map_or(-1, as_integer)).bind(i64::from(limit) + 1);
-        let rows = query.fetch_all(&self.readers).await?;
-        let weights = rows.iter().map(read_weights).collect::<Result<Vec<_>, _>>()?;
-        Ok(Page::of(weights, limit, |weights| weights.version.to_string()))
+        let rows = query.fetch(self.readers());
+        Rows { table: "weights", key: "version", name: "version", long: &["mean", "sd"], read: read_weights }
+            .page(rows, limit, Rest::IsNone)
+            .await
     }
 
     /// Gives each accepted reward of a learner after the one with order `after` to `each`, in order.
@@ -213,7 +214,7 @@ impl Store {
             "SELECT r.reward_order, r.reward, t.weights FROM rewards r JOIN trials t ON t.sequence = r.trial
              WHERE r.learner = $1 AND r.reward_order > $2 ORDER BY r.reward_order",
         );
-        let mut rows = query.bind(learner).bind(as_integer(after)).fetch(&self.readers);
+        let mut rows = query.bind(learner).bind(as_integer(after)).fetch(self.readers());
         while let Some(row) = rows.try_next().await? {
             each(RewardRow {
                 reward_order: count(&row, "rewards", "reward_order")?,
@@ -224,6 +225,9 @@ impl Store {
         Ok(())
     }
 }
+
+/// Looked for every second, however many learners there are: only those that have something to fold are in the index.
+const BEHIND: &str = "SELECT name FROM learners WHERE has_pending = 1 ORDER BY sequence";
 
 fn read_learner(row: &SqliteRow) -> Result<LearnerRow, StoreError> {
     Ok(LearnerRow {
@@ -299,7 +303,22 @@ pub(super) async fn add_weights(
         return Ok(false);
     }
     insert_weights(connection, learner, weights).await?;
+    let folded = sqlx::query(
+        "UPDATE learners SET has_pending = EXISTS (SELECT 1 FROM rewards WHERE learner = $1 AND reward_order > $2)
+         WHERE sequence = $1",
+    );
+    folded.bind(learner).bind(as_integer(weights.reward_order)).execute(connection).await?;
     Ok(true)
+}
+
+/// Marks learners (JSON: an array of sequence numbers) as having rewards to fold.
+pub(super) async fn mark_pending(connection: &mut SqliteConnection, learners: &str) -> Result<(), StoreError> {
+    let marked = sqlx::query(
+        "UPDATE learners SET has_pending = 1
+         WHERE has_pending = 0 AND sequence IN (SELECT value FROM json_each($1))",
+    );
+    marked.bind(learners).execute(connection).await?;
+    Ok(())
 }
 
 async fn insert_weights(

@@ -11,10 +11,14 @@
 //! documents are JSON text, in compressed pieces where it is long. Of a policy, what could be told from the rest is left out, and
 //! put back when it is read.
 
+mod alive;
 mod arrivals;
+mod database;
 mod definitions;
+mod error;
 mod learners;
 mod models;
+mod page;
 mod policies;
 mod refinements;
 mod sessions;
@@ -22,122 +26,96 @@ mod trials;
 mod writer;
 
 use std::path::Path;
-use std::time::Duration;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
 
+use alive::Alive;
+use database::{Database, Locking, Readers};
 use definitions::Sweeper;
 pub use definitions::{NewPieces, PIECE_BYTES};
+pub use error::{StoreError, Unavailable};
+use jiff::Timestamp;
 pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
 pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
+pub use page::Page;
 pub use policies::{NewPolicy, PolicySummaryRow};
-pub use refinements::{NewRefinement, RefinementEnd};
-pub use sessions::{NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus, SessionWeights};
-use sqlx::migrate::{Migration, MigrationType, Migrator};
-use sqlx::sqlite::{SqliteConnectOptions, SqliteJournalMode, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection};
+pub use refinements::{MAX_ATTEMPTS, NewRefinement, RefinementEnd};
+pub use sessions::{
+    ExpiredSession, MAX_EXPIRED_AT_ONCE, NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus,
+    SessionWeights,
+};
+use sqlx::SqlitePool;
 use tokio_util::task::TaskTracker;
 pub use trials::{AcceptedReward, FailTrial, Failure, NewReward, NewTrial, PutReward, TrialRow, TrialStatus};
-use writer::Writer;
-
-/// Earlier ones can corrupt a database in WAL mode.
-const LEAST_SQLITE_VERSION: (u32, u32, u32) = (3, 51, 3);
-
-/// How long a connection waits for another process's lock.
-const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// Readers at the same time. Reads are short, and there are few cores.
-const N_READERS: u32 = 4;
-
-/// Statements that a connection keeps prepared: all that there are, those with a number of rows as often as there are numbers.
-const N_STATEMENTS: usize = 256;
-
-/// Why the store could not do as told.
-#[derive(Debug, thiserror::Error)]
-pub enum StoreError {
-    /// The database failed.
-    #[error("the database failed")]
-    Database(#[source] sqlx::Error),
-    /// Another process has held the database for too long; later it may go through.
-    #[error("the database is locked by another process")]
-    Locked,
-    /// The database could not be brought to this version's schema.
-    #[error("the database could not be migrated")]
-    Migrate(#[from] sqlx::migrate::MigrateError),
-    /// The SQLite that this program was linked with is too old.
-    #[error("SQLite {found} can corrupt a database in WAL mode; {}.{}.{} is needed", needed.0, needed.1, needed.2)]
-    Version {
-        /// Its version.
-        found: String,
-        /// The oldest that will do.
-        needed: (u32, u32, u32),
-    },
-    /// A row holds what this program never writes.
-    #[error("table {table} holds an invalid {column}")]
-    Corrupt {
-        /// Where.
-        table: &'static str,
-        /// In which column.
-        column: &'static str,
-        /// What is wrong with it.
-        #[source]
-        source: Box<dyn std::error::Error + Send + Sync>,
-    },
-    /// What is read was removed while it was.
-    #[error("it was removed while it was read")]
-    Removed,
-    /// Another process has removed some of what was to be registered; sent once more, it may go through.
-    #[error("another service on the same database has removed what was stored so far; send it again")]
-    Lost,
-    /// The store is shutting down.
-    #[error("the store takes no more writes")]
-    Closed,
-}
-
-impl From<sqlx::Error> for StoreError {
-    fn from(error: sqlx::Error) -> Self {
-        /// Primary result code of SQLite; extended codes have it in their low byte.
-        const SQLITE_BUSY: u32 = 5;
-        let code = error.as_database_error().and_then(|error| error.code()?.parse::<u32>().ok());
-        if code.is_some_and(|code| code & 0xff == SQLITE_BUSY) { Self::Locked } else { Self::Database(error) }
-    }
-}
+use writer::{Write, Writer};
 
 /// The durable state of the service.
 #[derive(Debug)]
 pub struct Store {
-    readers: SqlitePool,
+    readers: Arc<Readers>,
     writer: Writer,
     sweeper: Sweeper,
     tasks: TaskTracker,
+    /// What the last check found, and when.
+    checked: tokio::sync::Mutex<Option<(Instant, Result<(), Unavailable>)>>,
 }
 
 impl Store {
-    /// Opens the database at `path`, creating and migrating it as needed. The writer runs in `tasks` until the store is
-    /// closed.
+    /// Opens the database at `path`, creating and migrating it as needed, whoever else works with it. The writer runs in `tasks` until
+    /// the store is closed. Where nothing can be written now, it can be read, and writes fail until they can be done.
     ///
     /// # Errors
     ///
-    /// If it cannot be opened or migrated, or SQLite is too old.
+    /// If it cannot be opened or migrated, is another program's or damaged, or SQLite is too old.
     pub async fn open(path: &Path, tasks: &TaskTracker) -> Result<Self, StoreError> {
-        let options = SqliteConnectOptions::new()
-            .filename(path)
-            .create_if_missing(true)
-            .journal_mode(SqliteJournalMode::Wal)
-            .synchronous(SqliteSynchronous::Full)
-            .busy_timeout(BUSY_TIMEOUT)
-            .statement_cache_capacity(N_STATEMENTS)
-            .disable_statement_logging();
-        let mut connection = SqliteConnection::connect_with(&options).await?;
-        check_version(&mut connection).await?;
-        migrator().run_direct(None, &mut connection, false).await?;
-        // A database that cannot be written to should be told of now, not with the first request.
-        connection.begin_with("BEGIN IMMEDIATE").await?.rollback().await?;
-        let readers = SqlitePoolOptions::new()
-            .max_connections(N_READERS)
-            .connect_with(options.create_if_missing(false).pragma("query_only", "ON"))
-            .await?;
-        let writer = Writer::start(connection, tasks);
+        Self::open_locking(path, Locking::None, tasks).await
+    }
+
+    /// As [`Self::open`], for as long as no other process does the same. The lock ends with the writer.
+    ///
+    /// # Errors
+    ///
+    /// Likewise, and [`StoreError::InUse`] if another process has it.
+    pub async fn open_alone(path: &Path, tasks: &TaskTracker) -> Result<Self, StoreError> {
+        Self::open_locking(path, Locking::Exclusive, tasks).await
+    }
+
+    async fn open_locking(path: &Path, locking: Locking, tasks: &TaskTracker) -> Result<Self, StoreError> {
+        let mut database = Database::new(path, locking)?;
+        let connection = match database.connect().await {
+            Ok(connection) => Some(connection),
+            Err(error @ StoreError::Unavailable(_)) => {
+                // What cannot be read either says less than this.
+                if database.read_only(Depth::Whole).await.is_err() {
+                    return Err(error);
+                }
+                tracing::error!(
+                    error = &error as &dyn std::error::Error,
+                    "nothing can be written; the database is only read"
+                );
+                None
+            }
+            Err(error) => return Err(error),
+        };
+        let readers = Arc::clone(database.readers());
+        let writer = Writer::start(database, connection, tasks);
+        Ok(Self::of(readers, writer, tasks))
+    }
+
+    /// Opens the database at `path` to read it, whoever works with it. It is left as it is.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be opened, is another program's, or has another schema than this version's.
+    pub async fn open_to_read(path: &Path, tasks: &TaskTracker) -> Result<Self, StoreError> {
+        let database = Database::new(path, Locking::None)?;
+        database.read_only(Depth::Schema).await?;
+        Ok(Self::of(Arc::clone(database.readers()), Writer::none(), tasks))
+    }
+
+    fn of(readers: Arc<Readers>, writer: Writer, tasks: &TaskTracker) -> Self {
         let sweeper = Sweeper::start(writer.clone(), tasks);
-        Ok(Self { readers, writer, sweeper, tasks: tasks.clone() })
+        Self { readers, writer, sweeper, tasks: tasks.clone(), checked: tokio::sync::Mutex::default() }
     }
 
     /// Takes no more reads or writes. Once the writer has ended, all that was written stands in a single file.
@@ -147,80 +125,69 @@ impl Store {
         self.writer.close();
     }
 
+    fn readers(&self) -> &SqlitePool {
+        self.readers.pool()
+    }
+
     /// Counts up whenever a model was registered or deleted, before whoever did so is told.
     pub(crate) fn models_generation(&self) -> u64 {
         self.writer.models_generation()
     }
 
-    /// Whether the database answers, and writes are taken.
+    /// Notes that the service is alive at `now`, as is done at least `every` so often. Time without service before does not count for
+    /// open sessions.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be written.
+    pub async fn note_alive(&self, now: Timestamp, every: Duration) -> Result<(), StoreError> {
+        self.writer.write(Write::Alive(Alive { now, every })).await.map(drop)
+    }
+
+    /// Whether something can be written, as [`Self::note_alive`] is; tried at most once a second, and known within two.
     ///
     /// # Errors
     ///
     /// If not.
-    pub async fn check(&self) -> Result<(), StoreError> {
-        if !self.writer.is_running() {
-            return Err(StoreError::Closed);
+    pub async fn check(&self, now: Timestamp, every: Duration) -> Result<(), StoreError> {
+        // Whoever asks meanwhile is told the same.
+        let mut checked = self.checked.lock().await;
+        if let Some((at, known)) = *checked
+            && at.elapsed() < CHECK_EVERY
+        {
+            return Ok(known?);
         }
-        sqlx::query("SELECT count(*) FROM (SELECT 1 FROM models LIMIT 1)").execute(&self.readers).await?;
-        Ok(())
+        let noted = tokio::time::timeout(CHECK_TIMEOUT, self.note_alive(now, every)).await;
+        let found = match noted.unwrap_or(Err(Unavailable::Slow.into())) {
+            Ok(()) => Ok(()),
+            Err(StoreError::Unavailable(unavailable)) => Err(unavailable),
+            Err(error) => return Err(error),
+        };
+        *checked = Some((Instant::now(), found));
+        Ok(found?)
     }
 }
 
-/// Every migration, in order. They are part of the program, so that it runs wherever it is copied to.
-fn migrator() -> Migrator {
-    let migration = |version, description: &'static str, sql: &'static str| {
-        Migration::new(version, description.into(), MigrationType::Simple, sql.into_sql_str(), false)
-    };
-    Migrator {
-        migrations: vec![
-            migration(1, "models and policies", include_str!("../../migrations/0001_models_and_policies.sql")),
-            migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
-            migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
-            migration(4, "large definitions", include_str!("../../migrations/0004_large_definitions.sql")),
-            migration(5, "arrivals", include_str!("../../migrations/0005_arrivals.sql")),
-            migration(6, "short policies", include_str!("../../migrations/0006_short_policies.sql")),
-        ]
-        .into(),
-        ..Migrator::DEFAULT
-    }
-}
+/// How often it is tried whether something can be written. Each time costs a sync of the disk.
+const CHECK_EVERY: Duration = Duration::from_secs(1);
 
-async fn check_version(connection: &mut SqliteConnection) -> Result<(), StoreError> {
-    let found: String = sqlx::query_scalar("SELECT sqlite_version()").fetch_one(connection).await?;
-    let mut parts = found.split('.').map(|part| part.parse::<u32>().unwrap_or(0));
-    let mut next = || parts.next().unwrap_or(0);
-    let version = (next(), next(), next());
-    if version < LEAST_SQLITE_VERSION {
-        return Err(StoreError::Version { found, needed: LEAST_SQLITE_VERSION });
-    }
-    Ok(())
-}
+/// How long that may take: those who ask wait no longer than two seconds.
+const CHECK_TIMEOUT: Duration = Duration::from_millis(1500);
 
-/// A part of a long list.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Page<T> {
-    /// The items, in order.
-    pub items: Vec<T>,
-    /// The key of the last item, if there are more.
-    pub next: Option<String>,
-}
-
-impl<T> Page<T> {
-    /// Makes a page of at most `limit` of `rows`, of which the query asked for one more than that.
-    fn of(mut rows: Vec<T>, limit: u32, key: impl Fn(&T) -> String) -> Self {
-        let limit = limit as usize;
-        let has_more = rows.len() > limit;
-        rows.truncate(limit);
-        let next = if has_more { rows.last().map(key) } else { None };
-        Self { items: rows, next }
-    }
+/// How closely a database is looked at that is only read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Depth {
+    /// Whether it is ours, and has this version's schema.
+    Schema,
+    /// Whether it is whole as well.
+    Whole,
 }
 
 fn corrupt<E: Into<Box<dyn std::error::Error + Send + Sync>>>(
     table: &'static str,
     column: &'static str,
 ) -> impl FnOnce(E) -> StoreError {
-    move |source| StoreError::Corrupt { table, column, source: source.into() }
+    move |source| StoreError::Corrupt { table, column, row: None, source: source.into() }
 }
 
 /// As SQLite holds it; the counts and times of this program stay far below its limit.
@@ -247,10 +214,10 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let tasks = TaskTracker::new();
         let store = Store::open(&directory.path().join("etude.db"), &tasks).await.unwrap();
-        store.check().await.unwrap();
+        let check = || store.check(Timestamp::UNIX_EPOCH, Duration::ZERO);
         store.writer.close();
         tasks.close();
         tasks.wait().await;
-        assert!(matches!(store.check().await, Err(StoreError::Closed)), "though it could be read");
+        assert!(matches!(check().await, Err(StoreError::Closed)), "though it could be read");
     }
 }

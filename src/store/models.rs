@@ -6,8 +6,9 @@ use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
 
 use super::definitions::{self, NewPieces};
+use super::page::Rows;
 use super::writer::{Write, Written};
-use super::{Page, Store, StoreError, as_integer, corrupt, count, timestamp};
+use super::{Page, Store, StoreError, as_integer, corrupt, count, page, timestamp};
 use crate::attribute::AttributeDocument;
 use crate::model::ActionDocument;
 
@@ -145,7 +146,7 @@ impl Store {
     /// If the database failed.
     pub async fn model(&self, name: &str) -> Result<Option<ModelRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM models WHERE name = $1").bind(name);
-        let row = query.fetch_optional(&self.readers).await?;
+        let row = query.fetch_optional(self.readers()).await?;
         let read = |row: SqliteRow| {
             let definition = match row.try_get("definition_id")? {
                 Some(id) => StoredDefinition::Pieces(id),
@@ -163,7 +164,7 @@ impl Store {
     /// If the database failed.
     pub async fn model_key(&self, name: &str) -> Result<Option<ModelKey>, StoreError> {
         let query = sqlx::query("SELECT hash, n_states FROM models WHERE name = $1").bind(name);
-        let row = query.fetch_optional(&self.readers).await?;
+        let row = query.fetch_optional(self.readers()).await?;
         let read = |row: SqliteRow| {
             Ok(ModelKey { hash: row.try_get("hash")?, is_lazy: row.try_get::<i64, _>("n_states")? == UNKNOWN })
         };
@@ -176,14 +177,18 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn models(&self, after: Option<&str>, limit: u32) -> Result<Page<ModelSummary>, StoreError> {
+        // Labels may be so long that even a few models are not read ahead.
+        let sizes = "SELECT octet_length(attributes) + octet_length(actions) FROM models WHERE name > $1 ORDER BY name LIMIT $2";
+        let sizes = sqlx::query_scalar(sizes).bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
+        let (n_rows, rest) = page::fitting(&sizes.fetch_all(self.readers()).await?, limit);
         let query = sqlx::query(
             "SELECT name, hash, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms
              FROM models WHERE name > $1 ORDER BY name LIMIT $2",
         );
-        let query = query.bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
-        let rows = query.fetch_all(&self.readers).await?;
-        let models = rows.iter().map(read_summary).collect::<Result<Vec<_>, _>>()?;
-        Ok(Page::of(models, limit, |model| model.name.clone()))
+        let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(self.readers());
+        Rows { table: "models", key: "name", name: "name", long: &["attributes", "actions"], read: read_summary }
+            .page(rows, n_rows, rest)
+            .await
     }
 }
 

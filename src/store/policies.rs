@@ -1,13 +1,18 @@
 //! The table of policies.
+//!
+//! What is stored of a policy is never changed, and has a checksum. The link to the one that refines it is a column of its own, and
+//! becomes part of the text when that is read.
 
 use std::sync::OnceLock;
 
 use jiff::Timestamp;
+use sqlx::sqlite::SqliteRow;
 use sqlx::{AssertSqlSafe, Row, SqlSafeStr, SqlStr, SqliteConnection};
 
+use super::page::{Rest, Rows};
 use super::refinements::NewRefinement;
 use super::writer::Write;
-use super::{Page, Store, StoreError, corrupt};
+use super::{Page, Store, StoreError};
 use crate::mapping::read_answer;
 
 /// A policy to be stored.
@@ -28,6 +33,8 @@ pub struct NewPolicy {
 pub struct PolicySummaryRow {
     /// The order in which it became durable.
     pub sequence: i64,
+    /// Its id.
+    pub id: String,
     /// JSON.
     pub summary: String,
 }
@@ -52,17 +59,33 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn policy(&self, id: &str) -> Result<Option<String>, StoreError> {
-        let query = sqlx::query("SELECT summary, policy, steps FROM policies WHERE id = $1").bind(id);
-        let Some(row) = query.fetch_optional(&self.readers).await? else { return Ok(None) };
-        let Some(steps) = row.try_get::<Option<Vec<u8>>, _>("steps")? else { return Ok(Some(row.try_get("policy")?)) };
+        let query =
+            sqlx::query("SELECT summary, policy, steps, checksum, refined_by FROM policies WHERE id = $1").bind(id);
+        let Some(row) = query.fetch_optional(self.readers()).await? else { return Ok(None) };
+        match self.read_policy(&row).await {
+            Ok(policy) => Ok(Some(policy)),
+            Err(error) => Err(error.of_row("policies", id)),
+        }
+    }
+
+    async fn read_policy(&self, row: &SqliteRow) -> Result<String, StoreError> {
+        let steps: Option<Vec<u8>> = row.try_get("steps")?;
         let summary: String = row.try_get("summary")?;
+        let checksum = Checksum::stored(row)?;
+        let Some(steps) = steps else {
+            let policy: String = row.try_get("policy")?;
+            return linked(policy, row);
+        };
+        if checksum.is_some_and(|stored| stored != Checksum::of(&summary, &steps)) {
+            return Err(corrupt("checksum")("it is not that of the summary and the steps"));
+        }
         let answer = if steps.len() <= MAX_INLINE_BYTES {
             read_answer(&summary, &steps)
         } else {
             let reading = self.tasks.spawn_blocking(move || read_answer(&summary, &steps));
-            reading.await.map_err(corrupt("policies", "steps"))?
+            reading.await.map_err(corrupt("steps"))?
         };
-        Ok(Some(answer.map_err(corrupt("policies", "steps"))?))
+        linked(answer.map_err(corrupt("steps"))?, row)
     }
 
     /// At most `limit` policies in the order in which they became durable, from the first after the sequence number
@@ -72,16 +95,68 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn policies(&self, after: i64, limit: u32) -> Result<Page<PolicySummaryRow>, StoreError> {
-        let query =
-            sqlx::query("SELECT sequence, summary FROM policies WHERE sequence > $1 ORDER BY sequence LIMIT $2");
-        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch_all(&self.readers).await?;
-        let read = |row: &sqlx::sqlite::SqliteRow| -> Result<PolicySummaryRow, StoreError> {
-            let sequence = row.try_get("sequence").map_err(corrupt("policies", "sequence"))?;
-            Ok(PolicySummaryRow { sequence, summary: row.try_get("summary")? })
-        };
-        let policies = rows.iter().map(read).collect::<Result<Vec<_>, _>>()?;
-        Ok(Page::of(policies, limit, |policy| policy.sequence.to_string()))
+        let query = sqlx::query(
+            "SELECT sequence, id, summary, checksum, refined_by FROM policies WHERE sequence > $1 ORDER BY sequence LIMIT $2",
+        );
+        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch(self.readers());
+        Rows { table: TABLE, key: "sequence", name: "id", long: &["summary"], read: read_summary }
+            .page(rows, limit, Rest::IsNone)
+            .await
     }
+}
+
+const TABLE: &str = "policies";
+
+fn corrupt<E: Into<Box<dyn std::error::Error + Send + Sync>>>(column: &'static str) -> impl FnOnce(E) -> StoreError {
+    super::corrupt(TABLE, column)
+}
+
+/// What tells whether a policy is as it was written: CRC-32, of the summary and of the steps.
+#[derive(Clone, Copy, PartialEq, Eq)]
+struct Checksum {
+    summary: u32,
+    steps: u32,
+}
+
+impl Checksum {
+    fn of(summary: &str, steps: &[u8]) -> Self {
+        Self { summary: crc32fast::hash(summary.as_bytes()), steps: crc32fast::hash(steps) }
+    }
+
+    /// The one that is stored; `None` of a policy that was stored before there were any.
+    fn stored(row: &SqliteRow) -> Result<Option<Self>, StoreError> {
+        let stored: Option<i64> = row.try_get("checksum")?;
+        let [a, b, c, d, e, f, g, h] = match stored {
+            Some(stored) => stored.to_be_bytes(),
+            None => return Ok(None),
+        };
+        Ok(Some(Self { summary: u32::from_be_bytes([a, b, c, d]), steps: u32::from_be_bytes([e, f, g, h]) }))
+    }
+
+    fn as_integer(self) -> i64 {
+        (i64::from(self.summary) << 32) | i64::from(self.steps)
+    }
+}
+
+fn read_summary(row: &SqliteRow) -> Result<PolicySummaryRow, StoreError> {
+    let summary: String = row.try_get("summary")?;
+    if Checksum::stored(row)?.is_some_and(|stored| stored.summary != crc32fast::hash(summary.as_bytes())) {
+        return Err(corrupt("checksum")("it is not that of the summary"));
+    }
+    Ok(PolicySummaryRow { sequence: row.try_get("sequence")?, id: row.try_get("id")?, summary: linked(summary, row)? })
+}
+
+/// The text of a policy or its summary, with the link to the policy that refines it, if there is one.
+fn linked(text: String, row: &SqliteRow) -> Result<String, StoreError> {
+    /// How all of them end that were not refined yet when they were written.
+    const NOT_REFINED: &str = r#""refined_by":null}"#;
+    let refined_by: Option<&str> = row.try_get("refined_by")?;
+    let Some(refined_by) = refined_by else { return Ok(text) };
+    let Some(before) = text.strip_suffix(NOT_REFINED) else {
+        return Err(corrupt("refined_by")("the policy names another one, or none"));
+    };
+    let refined_by = serde_json::to_string(refined_by).map_err(corrupt("refined_by"))?;
+    Ok(format!(r#"{before}"refined_by":{refined_by}}}"#))
 }
 
 pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -> Result<(), StoreError> {
@@ -120,8 +195,9 @@ pub(super) async fn add_at_once(
 async fn insert(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
     let mut insert = sqlx::query(insert_of(policies.len()));
     for policy in policies {
-        insert =
-            insert.bind(&policy.id).bind(&policy.summary).bind(&policy.steps).bind(policy.created_at.as_millisecond());
+        let checksum = Checksum::of(&policy.summary, &policy.steps).as_integer();
+        insert = insert.bind(&policy.id).bind(&policy.summary).bind(&policy.steps).bind(checksum);
+        insert = insert.bind(policy.created_at.as_millisecond());
     }
     insert.execute(connection).await?;
     Ok(())
@@ -131,8 +207,9 @@ async fn insert(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> R
 fn insert_of(n_rows: usize) -> SqlStr {
     static INSERTS: [OnceLock<SqlStr>; MAX_ROWS + 1] = [const { OnceLock::new() }; MAX_ROWS + 1];
     let put_together = || {
-        let rows = vec!["(?, ?, '', ?, ?)"; n_rows].join(", ");
-        let insert = format!("INSERT INTO policies (id, summary, policy, steps, created_at_ms) VALUES {rows}");
+        let rows = vec!["(?, ?, '', ?, ?, ?)"; n_rows].join(", ");
+        let insert =
+            format!("INSERT INTO policies (id, summary, policy, steps, checksum, created_at_ms) VALUES {rows}");
         AssertSqlSafe(insert).into_sql_str()
     };
     match INSERTS.get(n_rows) {

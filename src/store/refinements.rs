@@ -3,8 +3,11 @@
 use sqlx::{Row, SqliteConnection};
 
 use super::policies::{self, NewPolicy};
-use super::writer::Write;
+use super::writer::{Write, Written};
 use super::{Store, StoreError};
+
+/// How often a refinement is taken up. What has ended the process, or was ended with it, so many times would do so for ever.
+pub const MAX_ATTEMPTS: u32 = 3;
 
 /// A policy that is to be refined.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -37,13 +40,35 @@ impl Store {
             "SELECT rowid AS sequence, policy_id, model_hash, request FROM refinements WHERE rowid > $1
              ORDER BY rowid LIMIT 1",
         );
-        let Some(row) = query.bind(after).fetch_optional(&self.readers).await? else { return Ok(None) };
+        let Some(row) = query.bind(after).fetch_optional(self.readers()).await? else { return Ok(None) };
         let refinement = NewRefinement {
             policy_id: row.try_get("policy_id")?,
             model_hash: row.try_get("model_hash")?,
             request: row.try_get("request")?,
         };
         Ok(Some((row.try_get("sequence")?, refinement)))
+    }
+
+    /// Begins another attempt at a refinement: durable, so that it counts whatever becomes of the process. Says whether there may be
+    /// one; if there were [`MAX_ATTEMPTS`] already, the refinement is removed.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn begin_refinement(&self, policy_id: &str) -> Result<bool, StoreError> {
+        match self.writer.write(Write::BeginRefinement(policy_id.to_owned())).await? {
+            Written::Done(has_begun) => Ok(has_begun),
+            _ => Err(StoreError::Closed),
+        }
+    }
+
+    /// Takes an attempt back, which has ended for reasons that are not its own.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn return_refinement(&self, policy_id: &str) -> Result<(), StoreError> {
+        self.writer.write(Write::ReturnRefinement(policy_id.to_owned())).await.map(drop)
     }
 
     /// Stores a refined policy and links the two.
@@ -71,14 +96,23 @@ pub(super) async fn end(connection: &mut SqliteConnection, end: &RefinementEnd) 
     let was_waiting = deleted.execute(&mut *connection).await?.rows_affected() > 0;
     let (true, Some(refined)) = (was_waiting, &end.refined) else { return Ok(()) };
     policies::add(connection, refined).await?;
-    sqlx::query(
-        "UPDATE policies SET summary = json_set(summary, '$.refined_by', $2),
-             policy = iif(steps IS NULL, json_set(policy, '$.refined_by', $2), policy)
-         WHERE id = $1",
-    )
-    .bind(&end.policy_id)
-    .bind(&refined.id)
-    .execute(connection)
-    .await?;
+    let linked = sqlx::query("UPDATE policies SET refined_by = $2 WHERE id = $1");
+    linked.bind(&end.policy_id).bind(&refined.id).execute(connection).await?;
+    Ok(())
+}
+
+pub(super) async fn begin(connection: &mut SqliteConnection, policy_id: &str) -> Result<bool, StoreError> {
+    let begun = sqlx::query("UPDATE refinements SET attempts = attempts + 1 WHERE policy_id = $1 AND attempts < $2");
+    let begun = begun.bind(policy_id).bind(MAX_ATTEMPTS).execute(&mut *connection).await?;
+    if begun.rows_affected() == 0 {
+        sqlx::query("DELETE FROM refinements WHERE policy_id = $1").bind(policy_id).execute(connection).await?;
+        return Ok(false);
+    }
+    Ok(true)
+}
+
+pub(super) async fn give_back(connection: &mut SqliteConnection, policy_id: &str) -> Result<(), StoreError> {
+    let returned = sqlx::query("UPDATE refinements SET attempts = attempts - 1 WHERE policy_id = $1 AND attempts > 0");
+    returned.bind(policy_id).execute(connection).await?;
     Ok(())
 }

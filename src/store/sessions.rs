@@ -1,6 +1,7 @@
 //! The tables of sessions and their observations.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
+use std::time::Duration;
 
 use jiff::Timestamp;
 use serde::Deserialize;
@@ -8,11 +9,13 @@ use serde_json::Value;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
+use super::alive::Alive;
+use super::page::{Rest, Rows};
 use super::policies::NewPolicy;
 use super::refinements::NewRefinement;
 use super::trials::{self, NewTrial};
 use super::writer::{Write, Written};
-use super::{Page, Store, StoreError, as_integer, corrupt, policies, refinements, timestamp};
+use super::{Page, Store, StoreError, arrivals, as_integer, corrupt, count, policies, refinements, timestamp};
 use crate::attribute::ByAttribute;
 
 /// How far a session has come.
@@ -138,6 +141,20 @@ pub struct SessionEnd {
     pub refinement: Option<NewRefinement>,
 }
 
+/// A session that has just expired.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ExpiredSession {
+    /// Its id.
+    pub id: String,
+    /// When something last came for it, not counting time without service.
+    pub active_at: Timestamp,
+    /// How many observations it had.
+    pub n_observations: u32,
+}
+
+/// Most sessions that expire in one transaction, so that nobody waits long for it.
+pub const MAX_EXPIRED_AT_ONCE: usize = 256;
+
 impl Store {
     /// Opens a session, and its trial if it explores. Says whether the trial's learner was there.
     ///
@@ -175,13 +192,24 @@ impl Store {
         self.done(Write::EndSession(Box::new(end))).await
     }
 
-    /// Ends every open session that was last active before `before`, and forgets its observations.
+    /// Ends open sessions that were last active longer than `idle` before `now`, and forgets their observations:
+    /// [`MAX_EXPIRED_AT_ONCE`] of them, if there are more. Time without service does not count, of which this is a sign, as
+    /// [`Self::note_alive`] is.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn expire_sessions(&self, before: Timestamp) -> Result<(), StoreError> {
-        self.writer.write(Write::ExpireSessions(before)).await.map(drop)
+    pub async fn expire_sessions(
+        &self,
+        now: Timestamp,
+        idle: Duration,
+        every: Duration,
+    ) -> Result<Vec<ExpiredSession>, StoreError> {
+        let before = now.checked_sub(idle).unwrap_or(Timestamp::MIN);
+        match self.writer.write(Write::ExpireSessions { before, alive: Alive { now, every } }).await? {
+            Written::ExpireSessions(expired) => Ok(expired),
+            _ => Err(StoreError::Closed),
+        }
     }
 
     async fn done(&self, write: Write) -> Result<bool, StoreError> {
@@ -191,13 +219,16 @@ impl Store {
         }
     }
 
-    /// Brings observations that have arrived to their table, whoever's they are.
-    async fn settle(&self) -> Result<(), StoreError> {
+    /// Brings observations that have arrived to their table, whoever's they are. Where nothing can be written, gives them, by session.
+    async fn settle(&self) -> Result<BTreeMap<String, NewObservations>, StoreError> {
         let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM arrivals)");
-        if query.fetch_one(&self.readers).await? {
-            self.writer.write(Write::Settle).await?;
+        if !query.fetch_one(self.readers()).await? {
+            return Ok(BTreeMap::new());
         }
-        Ok(())
+        match self.writer.write(Write::Settle).await {
+            Err(StoreError::Unavailable(_)) => arrivals::read(self.readers()).await,
+            settled => settled.map(|_| BTreeMap::new()),
+        }
     }
 
     /// The session with this id.
@@ -206,10 +237,11 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn session(&self, id: &str) -> Result<Option<SessionRow>, StoreError> {
-        self.settle().await?;
+        let arrived = self.settle().await?;
         let query = sqlx::query("SELECT * FROM sessions WHERE id = $1").bind(id);
-        let row = query.fetch_optional(&self.readers).await?;
-        row.as_ref().map(read_session).transpose()
+        let row = query.fetch_optional(self.readers()).await?;
+        let session = row.as_ref().map(read_session).transpose().map_err(|error| error.of_row("sessions", id))?;
+        Ok(session.map(|session| session.with(&arrived)))
     }
 
     /// At most `limit` sessions in the order in which they were opened, from the first after the sequence number `after`.
@@ -218,11 +250,13 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRow>, StoreError> {
-        self.settle().await?;
+        let arrived = self.settle().await?;
         let query = sqlx::query("SELECT * FROM sessions WHERE sequence > $1 ORDER BY sequence LIMIT $2");
-        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch_all(&self.readers).await?;
-        let sessions = rows.iter().map(read_session).collect::<Result<Vec<_>, _>>()?;
-        Ok(Page::of(sessions, limit, |session| session.sequence.to_string()))
+        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch(self.readers());
+        let rows_of = Rows { table: "sessions", key: "sequence", name: "id", long: &["weights"], read: read_session };
+        let mut page = rows_of.page(rows, limit, Rest::IsNone).await?;
+        page.items = page.items.into_iter().map(|session| session.with(&arrived)).collect();
+        Ok(page)
     }
 
     /// The observations of a session, in order: JSON arrays of states.
@@ -231,9 +265,26 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn observations(&self, session_id: &str) -> Result<Vec<String>, StoreError> {
-        self.settle().await?;
-        let query = sqlx::query_scalar("SELECT states FROM observations WHERE session_id = $1 ORDER BY seq");
-        Ok(query.bind(session_id).fetch_all(&self.readers).await?)
+        let mut arrived = self.settle().await?;
+        let query =
+            sqlx::query_as("SELECT seq + n_states, states FROM observations WHERE session_id = $1 ORDER BY seq");
+        let stored: Vec<(i64, String)> = query.bind(session_id).fetch_all(self.readers()).await?;
+        let n_stored = stored.last().map_or(0, |(end, _)| *end);
+        // What was settled since it was read is stored already.
+        let new = arrived.remove(session_id).filter(|new| i64::from(new.seq) == n_stored);
+        Ok(stored.into_iter().map(|(_, states)| states).chain(new.map(|new| new.states)).collect())
+    }
+}
+
+impl SessionRow {
+    /// With what has arrived for it, and is not settled yet.
+    fn with(mut self, arrived: &BTreeMap<String, NewObservations>) -> Self {
+        // What was settled since it was read is in the row already.
+        if let Some(new) = arrived.get(&self.id).filter(|new| new.seq == self.n_observations) {
+            self.n_observations += new.n_states;
+            self.active_at = self.active_at.max(new.at);
+        }
+        self
     }
 }
 
@@ -369,18 +420,36 @@ pub(super) async fn end(connection: &mut SqliteConnection, end: &SessionEnd) -> 
     Ok(true)
 }
 
-pub(super) async fn expire(connection: &mut SqliteConnection, before: Timestamp) -> Result<(), StoreError> {
-    let before_ms = before.as_millisecond();
-    sqlx::query(
-        "DELETE FROM observations WHERE session_id IN
-             (SELECT id FROM sessions WHERE status = 'open' AND active_at_ms < $1)",
-    )
-    .bind(before_ms)
-    .execute(&mut *connection)
-    .await?;
-    sqlx::query("UPDATE sessions SET status = 'expired' WHERE status = 'open' AND active_at_ms < $1")
-        .bind(before_ms)
+pub(super) async fn expire(
+    connection: &mut SqliteConnection,
+    before: Timestamp,
+) -> Result<Vec<ExpiredSession>, StoreError> {
+    let query = sqlx::query(
+        "SELECT id, active_at_ms, n_observations FROM sessions WHERE status = 'open' AND active_at_ms < $1
+         ORDER BY active_at_ms LIMIT $2",
+    );
+    let query = query.bind(before.as_millisecond()).bind(as_integer(MAX_EXPIRED_AT_ONCE as u64));
+    let read = |row: &SqliteRow| {
+        Ok(ExpiredSession {
+            id: row.try_get("id")?,
+            active_at: timestamp("sessions", "active_at_ms", row.try_get("active_at_ms")?)?,
+            n_observations: u32::try_from(count(row, "sessions", "n_observations")?).unwrap_or(u32::MAX),
+        })
+    };
+    let rows = query.fetch_all(&mut *connection).await?;
+    let expired = rows.iter().map(read).collect::<Result<Vec<_>, StoreError>>()?;
+    if expired.is_empty() {
+        return Ok(expired);
+    }
+    let ids: Vec<&str> = expired.iter().map(|session| session.id.as_str()).collect();
+    let ids = serde_json::to_string(&ids).map_err(corrupt("sessions", "id"))?;
+    sqlx::query("DELETE FROM observations WHERE session_id IN (SELECT value FROM json_each($1))")
+        .bind(&ids)
+        .execute(&mut *connection)
+        .await?;
+    sqlx::query("UPDATE sessions SET status = 'expired' WHERE id IN (SELECT value FROM json_each($1))")
+        .bind(&ids)
         .execute(connection)
         .await?;
-    Ok(())
+    Ok(expired)
 }

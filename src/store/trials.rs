@@ -1,14 +1,17 @@
 //! The table of trials, and the log of rewards as it is written.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use jiff::Timestamp;
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
 use sqlx::sqlite::SqliteRow;
 use sqlx::{AssertSqlSafe, QueryBuilder, Row, SqliteConnection};
 
+use super::page::{Rest, Rows};
 use super::writer::{Write, Written};
-use super::{NewPolicy, NewRefinement, Page, Store, StoreError, as_integer, count, policies, refinements, timestamp};
+use super::{
+    NewPolicy, NewRefinement, Page, Store, StoreError, as_integer, count, learners, policies, refinements, timestamp,
+};
 
 /// A trial to be stored.
 #[derive(Clone, Debug)]
@@ -231,7 +234,7 @@ impl Store {
     /// If the database failed.
     pub async fn trial(&self, id: &str) -> Result<Option<TrialRow>, StoreError> {
         let query = sqlx::query(AssertSqlSafe(format!("{SELECT} {FROM} WHERE t.id = $1"))).bind(id);
-        query.fetch_optional(&self.readers).await?.map(|row| read_trial(&row)).transpose()
+        query.fetch_optional(self.readers()).await?.map(|row| read_trial(&row)).transpose()
     }
 
     /// At most `limit` trials of a learner with the given status by `now`, in the order of their numbers, from the first
@@ -253,9 +256,10 @@ impl Store {
             "{SELECT} {FROM} WHERE t.learner = $1 AND t.number > $2 AND {condition} ORDER BY t.number LIMIT $3"
         )));
         let query = query.bind(learner).bind(as_integer(after)).bind(i64::from(limit) + 1).bind(now.as_millisecond());
-        let rows = query.fetch_all(&self.readers).await?;
-        let trials = rows.iter().map(read_trial).collect::<Result<Vec<_>, _>>()?;
-        Ok(Page::of(trials, limit, |trial| trial.number.to_string()))
+        let rows = query.fetch(self.readers());
+        Rows { table: "trials", key: "number", name: "id", long: &["weights", "fail_reason"], read: read_trial }
+            .page(rows, limit, Rest::IsNone)
+            .await
     }
 
     /// The largest number of a trial of a learner; 0 if there is none.
@@ -265,7 +269,7 @@ impl Store {
     /// If the database failed.
     pub async fn last_trial_number(&self, learner: i64) -> Result<u64, StoreError> {
         let query = sqlx::query("SELECT COALESCE(MAX(number), 0) AS number FROM trials WHERE learner = $1");
-        count(&query.bind(learner).fetch_one(&self.readers).await?, "trials", "number")
+        count(&query.bind(learner).fetch_one(self.readers()).await?, "trials", "number")
     }
 }
 
@@ -356,10 +360,12 @@ pub(super) async fn fail(
     Ok(FailTrial::Failed(trial))
 }
 
-/// Accepts rewards, in order. Takes two statements, however many there are.
+/// Accepts rewards, in order. Takes two statements, however many there are, and another one if a learner is not yet among those that
+/// are marked as having rewards to fold, `pending`.
 pub(super) async fn reward_all(
     connection: &mut SqliteConnection,
     rewards: &[&NewReward],
+    pending: &mut FxHashSet<i64>,
 ) -> Result<Vec<PutReward>, StoreError> {
     let mut read = read_rewarded(connection, rewards).await?;
     let mut accepted = Vec::with_capacity(rewards.len());
@@ -385,6 +391,13 @@ pub(super) async fn reward_all(
         });
     }
     if !accepted.is_empty() {
+        let new: BTreeSet<i64> =
+            accepted.iter().map(|(learner, ..)| *learner).filter(|id| !pending.contains(id)).collect();
+        if !new.is_empty() {
+            let ids = serde_json::to_string(&new).map_err(super::corrupt("learners", "sequence"))?;
+            learners::mark_pending(connection, &ids).await?;
+            pending.extend(new);
+        }
         let mut insert =
             QueryBuilder::new("INSERT INTO rewards (learner, reward_order, trial, reward, accepted_at_ms) ");
         insert.push_values(accepted, |mut row, (learner, order, trial, new)| {

@@ -5,10 +5,14 @@
 //! more: so groups grow with the load, and nobody waits for a clock. Observations, which are most of it, only arrive with a commit,
 //! and are settled in their table later (`arrivals`). A group of nothing but observations, or nothing but policies, takes a single
 //! statement, as each costs the driver a change of threads.
+//!
+//! After an error nothing is known of the connection: a transaction may be open or not, whatever the driver has counted. So it is closed,
+//! and whoever writes next opens another. Nothing is acknowledged that is not in the file which has the database's name then.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use rustc_hash::FxHashSet;
 use sqlx::{Connection, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
 use tokio_util::sync::CancellationToken;
@@ -16,12 +20,14 @@ use tokio_util::task::TaskTracker;
 
 use jiff::Timestamp;
 
+use super::alive::{self, Alive};
 use super::arrivals::Arrivals;
+use super::database::Database;
 use super::models::DeleteModel;
 use super::{
-    FailTrial, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement, NewReward, NewSession, NewTrial,
-    PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, WeightsRow, definitions, learners, models,
-    policies, refinements, sessions, trials,
+    ExpiredSession, FailTrial, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement, NewReward, NewSession,
+    NewTrial, PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, Unavailable, WeightsRow,
+    definitions, learners, models, policies, refinements, sessions, trials,
 };
 
 /// Most writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
@@ -43,6 +49,10 @@ pub(super) enum Write {
     },
     SweepDefinition(i64),
     AddPolicies(Vec<NewPolicy>, Vec<NewRefinement>),
+    /// One more attempt at a refinement.
+    BeginRefinement(String),
+    /// Takes that back.
+    ReturnRefinement(String),
     EndRefinement(Box<RefinementEnd>),
     OpenSession(Box<NewSession>),
     AddObservations(NewObservations),
@@ -54,8 +64,12 @@ pub(super) enum Write {
     EndSession(Box<SessionEnd>),
     /// Brings observations that have arrived to their table.
     Settle,
-    /// Those last active before this time.
-    ExpireSessions(Timestamp),
+    /// Some of those last active before a time, after a sign of life.
+    ExpireSessions {
+        before: Timestamp,
+        alive: Alive,
+    },
+    Alive(Alive),
     PutLearner(NewLearner),
     DeleteLearner(String),
     AddWeights {
@@ -98,6 +112,7 @@ pub(super) enum Written {
     AddTrial(bool),
     FailTrial(Box<FailTrial>),
     PutReward(Box<PutReward>),
+    ExpireSessions(Vec<ExpiredSession>),
 }
 
 #[derive(Debug)]
@@ -115,14 +130,30 @@ pub(super) struct Writer {
 }
 
 impl Writer {
-    /// Starts the writer in `tasks`. It ends when it is closed or dropped, and everything waiting has been written.
-    pub(super) fn start(connection: SqliteConnection, tasks: &TaskTracker) -> Self {
+    /// Starts the writer in `tasks`, with its way to the database if there is one yet. It ends when it is closed or dropped, and
+    /// everything waiting has been written.
+    pub(super) fn start(database: Database, connection: Option<SqliteConnection>, tasks: &TaskTracker) -> Self {
         let (queue, jobs) = mpsc::channel(MAX_WAITING);
         let closing = CancellationToken::new();
         let models_generation = Arc::new(AtomicU64::new(0));
-        let running = run(connection, jobs, closing.clone(), Arc::clone(&models_generation));
-        tasks.spawn(running);
+        let open = Open {
+            database,
+            connection,
+            known: Known::default(),
+            was_interrupted: true,
+            trouble: None,
+            models_generation: Arc::clone(&models_generation),
+        };
+        tasks.spawn(open.run(jobs, closing.clone()));
         Self { queue, closing, models_generation }
+    }
+
+    /// The way to no writer.
+    pub(super) fn none() -> Self {
+        let (queue, _) = mpsc::channel(1);
+        let closing = CancellationToken::new();
+        closing.cancel();
+        Self { queue, closing, models_generation: Arc::default() }
     }
 
     /// Counts up whenever a model was registered or deleted, before whoever did so is told.
@@ -133,11 +164,6 @@ impl Writer {
     /// Takes no more writes, and ends once everything waiting has been written.
     pub(super) fn close(&self) {
         self.closing.cancel();
-    }
-
-    /// Whether writes are taken: not once it has ended, for whatever reason.
-    pub(super) fn is_running(&self) -> bool {
-        !self.queue.is_closed()
     }
 
     /// Completes when no more writes are taken.
@@ -157,97 +183,159 @@ impl Writer {
     }
 }
 
-async fn run(
-    mut connection: SqliteConnection,
-    mut jobs: mpsc::Receiver<Job>,
-    closing: CancellationToken,
+/// What the writer knows of the database without looking, as long as what it writes succeeds.
+#[derive(Debug, Default)]
+struct Known {
+    arrivals: Arrivals,
+    /// Learners that are marked as having rewards to fold.
+    pending: FxHashSet<i64>,
+}
+
+/// The writer at work.
+struct Open {
+    database: Database,
+    /// `None` after an error, until something is to be written.
+    connection: Option<SqliteConnection>,
+    known: Known,
+    /// Whether no sign of life was written since the start, or since the database was unavailable.
+    was_interrupted: bool,
+    /// Why nothing could be written the last time, if that was so.
+    trouble: Option<Unavailable>,
     models_generation: Arc<AtomicU64>,
-) {
-    let mut group = Vec::with_capacity(MAX_GROUP);
-    let mut arrivals = Arrivals::default();
-    loop {
-        // Whoever is ready to go on may have something for this group too.
-        tokio::task::yield_now().await;
-        tokio::select! {
-            n_jobs = jobs.recv_many(&mut group, MAX_GROUP) => if n_jobs == 0 { break },
-            () = closing.cancelled(), if !jobs.is_closed() => {
-                // What waits is still received.
-                jobs.close();
-                continue;
+}
+
+impl Open {
+    async fn run(mut self, mut jobs: mpsc::Receiver<Job>, closing: CancellationToken) {
+        let mut group = Vec::with_capacity(MAX_GROUP);
+        loop {
+            // Whoever is ready to go on may have something for this group too.
+            tokio::task::yield_now().await;
+            tokio::select! {
+                n_jobs = jobs.recv_many(&mut group, MAX_GROUP) => if n_jobs == 0 { break },
+                () = closing.cancelled(), if !jobs.is_closed() => {
+                    // What waits is still received.
+                    jobs.close();
+                    continue;
+                }
+            }
+            match self.commit(&group).await {
+                Ok(written) => {
+                    for (job, written) in group.drain(..).zip(written) {
+                        // Whoever waited may be gone.
+                        let _ = job.answer.send(Ok(written));
+                    }
+                }
+                Err(StoreError::Unavailable(unavailable)) => {
+                    // Each on its own would fare no better.
+                    for job in group.drain(..) {
+                        let _ = job.answer.send(Err(unavailable.into()));
+                    }
+                }
+                Err(_) if group.len() > 1 => {
+                    // One write must not spoil the others: each gets a transaction and an error of its own.
+                    for job in group.drain(..) {
+                        let written = self.commit(std::slice::from_ref(&job)).await;
+                        let written = written.and_then(|mut written| written.pop().ok_or(StoreError::Closed));
+                        let _ = job.answer.send(written);
+                    }
+                }
+                Err(error) => {
+                    if let Some(job) = group.pop() {
+                        let _ = job.answer.send(Err(error));
+                    }
+                }
             }
         }
-        let is_of_models = |job: &Job| matches!(job.write, Write::PutModel(_) | Write::DeleteModel(_));
-        let are_models_changed = group.iter().any(is_of_models);
-        let committed = commit(&mut connection, &mut arrivals, &group).await;
-        if are_models_changed {
-            models_generation.fetch_add(1, Ordering::AcqRel);
+        self.close().await;
+    }
+
+    /// Applies `group`. If it cannot be, what was known is forgotten, and the connection with it.
+    async fn commit(&mut self, group: &[Job]) -> Result<Vec<Written>, StoreError> {
+        let committed = self.try_commit(group).await;
+        if group.iter().any(|job| matches!(job.write, Write::PutModel(_) | Write::DeleteModel(_))) {
+            self.models_generation.fetch_add(1, Ordering::AcqRel);
         }
         match committed {
             Ok(written) => {
-                for (job, written) in group.drain(..).zip(written) {
-                    // Whoever waited may be gone.
-                    let _ = job.answer.send(Ok(written));
+                if self.trouble.take().is_some() {
+                    tracing::info!("the database takes writes again");
                 }
+                Ok(written)
             }
-            Err(StoreError::Locked) => {
-                // Each on its own would wait as long again.
-                for job in group.drain(..) {
-                    let _ = job.answer.send(Err(StoreError::Locked));
-                }
-            }
-            Err(_) if group.len() > 1 => {
-                // One write must not spoil the others: each gets a transaction and an error of its own.
-                for job in group.drain(..) {
-                    let written = commit(&mut connection, &mut arrivals, std::slice::from_ref(&job)).await;
-                    if is_of_models(&job) {
-                        models_generation.fetch_add(1, Ordering::AcqRel);
-                    }
-                    let _ = job.answer.send(written.and_then(|mut written| written.pop().ok_or(StoreError::Closed)));
-                }
-            }
-            Err(error) => {
-                if let Some(job) = group.pop() {
-                    let _ = job.answer.send(Err(error));
-                }
-            }
+            Err(error) => Err(self.failed(error).await),
         }
     }
-    if !arrivals.is_empty()
-        && let Err(error) = settle(&mut connection, &mut arrivals).await
-    {
-        // They are durable where they are.
-        tracing::warn!(error = &error as &dyn std::error::Error, "observations were left for the next start to settle");
+
+    async fn try_commit(&mut self, group: &[Job]) -> Result<Vec<Written>, StoreError> {
+        let connection = match &mut self.connection {
+            Some(connection) => connection,
+            none => none.insert(self.database.connect().await?),
+        };
+        let gives_life = |job: &Job| matches!(job.write, Write::Alive(_) | Write::ExpireSessions { .. });
+        let gives_life = group.iter().any(gives_life);
+        let written = write_group(connection, &mut self.known, group, self.was_interrupted).await?;
+        self.database.check_written()?;
+        self.was_interrupted &= !gives_life;
+        Ok(written)
     }
-    // Checkpoints the log, so that what is left behind is a single file.
-    if let Err(error) = connection.close().await {
-        tracing::warn!(error = &error as &dyn std::error::Error, "the database was not closed cleanly");
+
+    async fn failed(&mut self, error: StoreError) -> StoreError {
+        self.known = Known::default();
+        if let Some(connection) = self.connection.take() {
+            // Nothing depends on how it ends: what was not committed is undone by whoever opens the database next.
+            let _ = connection.close().await;
+        }
+        let error = self.database.diagnose(error).await;
+        if let StoreError::Unavailable(unavailable) = error {
+            self.was_interrupted = true;
+            if self.trouble.replace(unavailable) != Some(unavailable) {
+                tracing::error!(error = &unavailable as &dyn std::error::Error, "nothing can be written for now");
+            }
+        }
+        error
+    }
+
+    async fn close(mut self) {
+        let Some(mut connection) = self.connection.take() else { return };
+        if !self.known.arrivals.is_empty()
+            && let Err(error) = settle(&mut connection, &mut self.known.arrivals).await
+        {
+            // They are durable where they are.
+            tracing::warn!(
+                error = &error as &dyn std::error::Error,
+                "observations were left for the next start to settle"
+            );
+        }
+        // Checkpoints the log, so that what is left behind is a single file.
+        if let Err(error) = connection.close().await {
+            tracing::warn!(error = &error as &dyn std::error::Error, "the database was not closed cleanly");
+        }
     }
 }
 
-/// Applies `group`; what was known is forgotten if it cannot be.
-async fn commit(
+/// Applies `group`: durable when this returns.
+async fn write_group(
     connection: &mut SqliteConnection,
-    arrivals: &mut Arrivals,
+    known: &mut Known,
     group: &[Job],
+    was_interrupted: bool,
 ) -> Result<Vec<Written>, StoreError> {
     let observations = group.iter().map(|job| match &job.write {
         Write::AddObservations(new) => Some(new),
         _ => None,
     });
+    let arrivals = &mut known.arrivals;
     let at_once = match observations.collect::<Option<Vec<_>>>() {
-        None => add_policies(connection, group).await,
-        Some(news) if arrivals.is_known() && !arrivals.is_full() => add_observations(connection, arrivals, &news).await,
-        Some(_) => Ok(None),
+        None => add_policies(connection, group).await?,
+        Some(news) if arrivals.is_known() && !arrivals.is_full() => {
+            add_observations(connection, arrivals, &news).await?
+        }
+        Some(_) => None,
     };
-    let committed = match at_once {
-        Ok(Some(written)) => Ok(written),
-        Ok(None) => transact(connection, arrivals, group).await,
-        Err(error) => Err(error),
-    };
-    if committed.is_err() {
-        arrivals.forget();
+    match at_once {
+        Some(written) => Ok(written),
+        None => transact(connection, known, group, was_interrupted).await,
     }
-    committed
 }
 
 /// Adds observations in one statement. Gives nothing, and has done nothing, if one of them does not come next as far as is
@@ -278,16 +366,20 @@ async fn add_policies(connection: &mut SqliteConnection, group: &[Job]) -> Resul
 /// any order is one in which they may have come.
 async fn transact(
     connection: &mut SqliteConnection,
-    arrivals: &mut Arrivals,
+    known: &mut Known,
     group: &[Job],
+    was_interrupted: bool,
 ) -> Result<Vec<Written>, StoreError> {
+    let Known { arrivals, pending } = known;
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     let observations = group.iter().filter_map(|job| match &job.write {
         Write::AddObservations(new) => Some(new),
         _ => None,
     });
     let observations: Vec<_> = observations.collect();
-    let is_read = |job: &Job| matches!(job.write, Write::EndSession(_) | Write::ExpireSessions(_) | Write::Settle);
+    let is_read = |job: &Job| {
+        matches!(job.write, Write::EndSession(_) | Write::ExpireSessions { .. } | Write::Alive(_) | Write::Settle)
+    };
     let are_read = group.iter().any(is_read);
     let mut are_next = Vec::new();
     // Whoever has nothing to do with observations does not wait for them.
@@ -317,11 +409,24 @@ async fn transact(
                 None
             }
             Write::AddPolicies(_, to_refine) if to_refine.is_empty() => Some(Written::Done(true)),
+            Write::Alive(alive) => {
+                alive::note(&mut transaction, *alive, was_interrupted).await?;
+                Some(Written::Done(true))
+            }
+            Write::ExpireSessions { before, alive } => {
+                alive::note(&mut transaction, *alive, was_interrupted).await?;
+                arrivals.expired();
+                Some(Written::ExpireSessions(sessions::expire(&mut transaction, *before).await?))
+            }
+            Write::AddWeights { learner, weights } => {
+                pending.remove(learner);
+                Some(Written::AddWeights(learners::add_weights(&mut transaction, *learner, weights).await?))
+            }
             write => Some(apply(&mut transaction, arrivals, write).await?),
         });
     }
     if !rewards.is_empty() {
-        let put = trials::reward_all(&mut transaction, &rewards).await?;
+        let put = trials::reward_all(&mut transaction, &rewards, pending).await?;
         let waiting = written.iter_mut().filter(|written| written.is_none());
         for (written, put) in waiting.zip(put) {
             *written = Some(Written::PutReward(Box::new(put)));
@@ -360,6 +465,11 @@ async fn apply(
             }
             Written::Done(true)
         }
+        Write::BeginRefinement(policy_id) => Written::Done(refinements::begin(connection, policy_id).await?),
+        Write::ReturnRefinement(policy_id) => {
+            refinements::give_back(connection, policy_id).await?;
+            Written::Done(true)
+        }
         Write::EndRefinement(end) => {
             refinements::end(connection, end).await?;
             Written::Done(true)
@@ -376,22 +486,18 @@ async fn apply(
             arrivals.ended(&end.session_id);
             Written::Done(sessions::end(connection, end).await?)
         }
-        Write::ExpireSessions(before) => {
-            arrivals.expired();
-            sessions::expire(connection, *before).await?;
-            Written::Done(true)
-        }
         // Was done before.
         Write::Settle => Written::Done(true),
         Write::PutLearner(learner) => Written::PutLearner(learners::put(connection, learner).await?),
         Write::DeleteLearner(name) => Written::DeleteLearner(learners::delete(connection, name).await?),
-        Write::AddWeights { learner, weights } => {
-            Written::AddWeights(learners::add_weights(connection, *learner, weights).await?)
-        }
         Write::AddTrial(trial) => Written::AddTrial(trials::add(connection, trial).await?),
         Write::FailTrial { id, reason } => {
             Written::FailTrial(Box::new(trials::fail(connection, id, reason.as_deref()).await?))
         }
-        Write::AddObservations(_) | Write::PutReward(_) => unreachable!("applied together with their like"),
+        Write::AddObservations(_)
+        | Write::PutReward(_)
+        | Write::Alive(_)
+        | Write::ExpireSessions { .. }
+        | Write::AddWeights { .. } => unreachable!("applied with what is known of others"),
     })
 }

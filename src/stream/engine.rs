@@ -14,7 +14,7 @@ use crate::mapping::{CommittedStep, Demonstration};
 use crate::service::{
     Caller, Client, Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
-use crate::store::{AcceptedReward, StoreError};
+use crate::store::{AcceptedReward, StoreError, Unavailable};
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
@@ -401,8 +401,14 @@ fn ends(error: &SessionError) -> Over {
             ServiceError::Pool(PoolError::Busy)
             | ServiceError::NoRoom(_)
             | ServiceError::Compiling { .. }
-            | ServiceError::Store(StoreError::Locked),
+            | ServiceError::Store(StoreError::Unavailable(Unavailable::Locked | Unavailable::Slow)),
         ) => Over::because(Closed::Overloaded, StreamProblem::new("overloaded", detail)),
+        SessionError::Service(ServiceError::Store(StoreError::Unavailable(Unavailable::Full))) => {
+            Over::because(Closed::Failed, StreamProblem::new("storage-full", detail))
+        }
+        SessionError::Service(ServiceError::Store(StoreError::Unavailable(_))) => {
+            Over::because(Closed::Failed, StreamProblem::new("not-ready", detail))
+        }
         SessionError::Service(_) => {
             tracing::error!(error = error as &dyn Error, "a stream failed");
             let problem = StreamProblem::new("internal", "an internal error was logged; resume the session");

@@ -7,6 +7,7 @@ mod session;
 
 use std::num::NonZeroU32;
 use std::sync::Arc;
+use std::time::Duration;
 
 use jiff::Timestamp;
 use serde_json::Value;
@@ -23,7 +24,7 @@ use super::{Caller, Etude, PoolError, ServiceError};
 use crate::attribute::{Schema, Weights};
 use crate::document::{self, Faults, Place};
 use crate::mapping::{Budget, CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, TooManySteps};
-use crate::store::{NewSession, Page, SessionRow, SessionStatus, SessionWeights, StoreError};
+use crate::store::{MAX_EXPIRED_AT_ONCE, NewSession, Page, SessionRow, SessionStatus, SessionWeights, StoreError};
 
 /// Why a session could not do as told.
 #[derive(Debug, thiserror::Error)]
@@ -206,7 +207,7 @@ impl Etude {
             let name = format!("{} with hash {}", row.model, row.model_hash);
             return Err(ServiceError::Unknown { kind: "model", name, pointer: None }.into());
         }
-        let weights = read_weights(row.weights, mapper.model().schema())?;
+        let weights = read_weights(row.weights, mapper.model().schema(), id)?;
         let lookahead = row.lookahead.and_then(NonZeroU32::new);
         let mut session = Session {
             id: row.id,
@@ -225,7 +226,7 @@ impl Etude {
             ownership,
         };
         let texts = self.store.observations(id).await?;
-        let observations = read_stored(&session.mapper, &texts)?;
+        let observations = read_stored(&session.mapper, &texts, id)?;
         let mut steps = session.advance(self, observations).await?;
         let policy = match row.policy_id {
             None => None,
@@ -236,12 +237,8 @@ impl Etude {
                 steps.extend(rest.map(|(rest, _)| rest).unwrap_or_default());
                 session.n_steps = steps.len();
                 let policy = self.policy(&policy_id).await?;
-                let corrupt = |error: serde_json::Error| StoreError::Corrupt {
-                    table: "policies",
-                    column: "policy",
-                    source: error.into(),
-                };
-                Some(serde_json::from_str(&policy).map_err(corrupt)?)
+                let read = serde_json::from_str(&policy);
+                Some(read.map_err(|error| StoreError::corrupt("policies", "policy", policy_id, error))?)
             }
         };
         Ok(Resumed { session, steps, policy })
@@ -268,32 +265,62 @@ impl Etude {
 
     /// Expires open sessions that have been idle for too long, now and then, until `stopping` is cancelled.
     pub async fn expire_until(self: Arc<Self>, stopping: CancellationToken) {
-        /// Sessions live at most this fraction of their time too long.
-        const CHECKS_PER_TIMEOUT: u32 = 10;
-        let mut ticks = tokio::time::interval((self.session_idle_timeout / CHECKS_PER_TIMEOUT).max(MIN_CHECK_INTERVAL));
+        let mut ticks = tokio::time::interval(self.alive_every());
         loop {
             tokio::select! {
                 _ = ticks.tick() => {}
                 () = stopping.cancelled() => return,
             }
-            let before = Timestamp::now().checked_sub(self.session_idle_timeout).unwrap_or(Timestamp::MIN);
-            if let Err(error) = self.store.expire_sessions(before).await {
+            if let Err(error) = self.expire_sessions(Timestamp::now()).await {
                 tracing::warn!(error = &error as &dyn std::error::Error, "idle sessions could not be expired");
             }
         }
     }
+
+    /// Expires the open sessions that have been idle for too long by `now`, and logs which.
+    ///
+    /// # Errors
+    ///
+    /// If the store failed.
+    pub async fn expire_sessions(&self, now: Timestamp) -> Result<(), ServiceError> {
+        /// Most that have a line of the log each; of further ones, it has the number.
+        const MAX_LOGGED: usize = 100;
+        let mut n_expired = 0;
+        loop {
+            let expired = self.store.expire_sessions(now, self.session_idle_timeout, self.alive_every()).await?;
+            for session in expired.iter().take(MAX_LOGGED.saturating_sub(n_expired)) {
+                tracing::info!(
+                    session = session.id,
+                    idle_s = now.duration_since(session.active_at).as_secs(),
+                    n_observations = session.n_observations,
+                    "a session has expired; its observations are deleted"
+                );
+            }
+            n_expired += expired.len();
+            if expired.len() < MAX_EXPIRED_AT_ONCE {
+                break;
+            }
+        }
+        if n_expired > MAX_LOGGED {
+            tracing::info!(n_sessions = n_expired, "more sessions have expired than are logged one by one");
+        }
+        Ok(())
+    }
+
+    /// How often the service looks for idle sessions, and notes that it is alive: sessions live at most this much too long.
+    pub(super) fn alive_every(&self) -> Duration {
+        const CHECKS_PER_TIMEOUT: u32 = 10;
+        (self.session_idle_timeout / CHECKS_PER_TIMEOUT).max(MIN_CHECK_INTERVAL)
+    }
 }
 
 /// Looking for idle sessions more often than this would only keep the disk busy.
-const MIN_CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_millis(50);
+const MIN_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 /// Reads weights that were stored.
-fn read_weights(weights: SessionWeights, schema: &Schema) -> Result<Weights, SessionError> {
-    let missing = |name: &str| StoreError::Corrupt {
-        table: "sessions",
-        column: "weights",
-        source: format!("the weight of {name:?} is missing").into(),
-    };
+fn read_weights(weights: SessionWeights, schema: &Schema, id: &str) -> Result<Weights, SessionError> {
+    let missing =
+        |name: &str| StoreError::corrupt("sessions", "weights", id, format!("the weight of {name:?} is missing"));
     let weights: Result<Vec<f64>, _> = match weights {
         SessionWeights::InOrder(weights) => Ok(weights),
         SessionWeights::Named(weights) => {
@@ -305,12 +332,9 @@ fn read_weights(weights: SessionWeights, schema: &Schema) -> Result<Weights, Ses
 }
 
 /// Reads observations that were stored, which were read without faults before.
-fn read_stored(mapper: &Mapper, texts: &[String]) -> Result<Vec<Observation>, SessionError> {
-    let corrupt = |source: Box<dyn std::error::Error + Send + Sync>| StoreError::Corrupt {
-        table: "observations",
-        column: "states",
-        source,
-    };
+fn read_stored(mapper: &Mapper, texts: &[String], id: &str) -> Result<Vec<Observation>, SessionError> {
+    let corrupt =
+        |source: Box<dyn std::error::Error + Send + Sync>| StoreError::corrupt("observations", "states", id, source);
     let mut observations = Vec::new();
     for text in texts {
         let document = document::parse(text.as_bytes()).map_err(|error| corrupt(error.into()))?;

@@ -291,6 +291,7 @@ impl Session {
         let texts = etude.store.observations(&self.id).await?;
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let (mapper, weights, start) = (Arc::clone(&self.mapper), self.weights.clone(), self.start);
+        let id = self.id.clone();
         let policy_id = match &self.source.trial_id {
             Some(trial) => etude.store.trial(trial).await?.map(|trial| trial.policy_id),
             None => None,
@@ -304,7 +305,7 @@ impl Session {
             lookahead: self.lookahead.map(NonZeroU32::get),
             ..Stamp::default()
         };
-        let job = move |_: &mut dyn Interrupt| Ok(conclude(online, &mapper, &texts, weights, start, stamp));
+        let job = move |_: &mut dyn Interrupt| Ok(conclude(online, &mapper, (&id, &texts), weights, start, stamp));
         let (steps, policy, row, refinement) = etude.pool.run_patiently(self.client, job).await??;
         let is_refined = refinement.is_some();
         let end = SessionEnd { session_id: self.id.clone(), policy: row.at(now), refinement };
@@ -330,11 +331,11 @@ pub type Observation = Vec<Option<crate::attribute::Value>>;
 
 type Concluded = (Vec<CommittedStep>, Policy, PolicyText, Option<NewRefinement>);
 
-/// Commits the rest, and writes the policy of the whole.
+/// Commits the rest, and writes the policy of the whole session, which has this id and these observations.
 fn conclude(
     online: OnlineMapping,
     mapper: &Mapper,
-    texts: &[String],
+    (id, texts): (&str, &[String]),
     weights: Weights,
     start: Option<u32>,
     stamp: Stamp,
@@ -342,7 +343,7 @@ fn conclude(
     let started = Instant::now();
     let (steps, mapping) = online.end().ok_or(SessionError::Empty)?;
     Policy::check_steps(mapper.model(), &mapping)?;
-    let demonstration = Demonstration::of(read_stored(mapper, texts)?).ok_or(SessionError::Empty)?;
+    let demonstration = Demonstration::of(read_stored(mapper, texts, id)?).ok_or(SessionError::Empty)?;
     let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);

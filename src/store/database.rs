@@ -1,0 +1,433 @@
+//! The files of the database, and the ways to them.
+//!
+//! ```text
+//! etude.db       0600; its identity (device and inode) is that of the first look at it
+//! etude.db-lock  locked by the process that writes, for as long as it lives
+//! etude.db-wal, etude.db-shm: SQLite's
+//! ```
+//!
+//! The first way that a writer gets is the one by which the database is looked at: whose it is, whether it is whole, whether it has this
+//! version's schema. Where nothing can be written, the database is read all the same if that can be: until a writer gets its way.
+//! The file of the database is never opened here but by SQLite, which would lose its locks if another descriptor were closed.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, ErrorKind};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use sqlx::migrate::{Migration, MigrationType, Migrator};
+use sqlx::sqlite::{SqliteConnectOptions, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
+use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection};
+
+use super::{Depth, StoreError, Unavailable};
+
+/// Earlier ones can corrupt a database in WAL mode.
+const LEAST_SQLITE_VERSION: (u32, u32, u32) = (3, 51, 3);
+
+/// How long a connection waits for another process's lock.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Readers at the same time. Reads are short, and there are few cores.
+const N_READERS: u32 = 4;
+
+/// Statements that a connection keeps prepared: all that there are, those with a number of rows as often as there are numbers.
+const N_STATEMENTS: usize = 256;
+
+/// What migration 7 sets.
+const APPLICATION_ID: i64 = 0x6574_7564;
+
+/// Nobody but the service's user is to read what others have sent.
+const MODE: u32 = 0o600;
+
+/// Whether others are kept from the database.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Locking {
+    /// By a lock on the file beside it.
+    Exclusive,
+    /// Not, as there are none.
+    None,
+}
+
+/// The files of the database, as its writer knows them.
+#[derive(Debug)]
+pub(super) struct Database {
+    path: PathBuf,
+    locking: Locking,
+    /// Held while this lives.
+    lock: Option<File>,
+    /// `None` until there is a file.
+    identity: Option<Identity>,
+    /// That of the log, since something was written to it by the way that is open.
+    log_identity: Option<Identity>,
+    /// Whether a writer has had its way, and with it the look at the database.
+    is_looked_at: bool,
+    /// Whether there is a log: not where memory cannot be shared between processes.
+    has_log: bool,
+    readers: Arc<Readers>,
+}
+
+/// Tells a file from another one that has its path later.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Identity {
+    device: u64,
+    inode: u64,
+}
+
+impl Identity {
+    fn of(path: &Path) -> io::Result<Self> {
+        let metadata = fs::metadata(path)?;
+        Ok(Self { device: metadata.dev(), inode: metadata.ino() })
+    }
+}
+
+/// The ways to read.
+#[derive(Debug, Default)]
+pub(super) struct Readers {
+    /// Once a writer had its way.
+    regular: OnceLock<SqlitePool>,
+    /// Until then.
+    without_writer: OnceLock<SqlitePool>,
+}
+
+impl Readers {
+    /// The pool to read by.
+    ///
+    /// # Panics
+    ///
+    /// Never: a store that is open has one.
+    pub(super) fn pool(&self) -> &SqlitePool {
+        self.regular.get().or_else(|| self.without_writer.get()).expect("a store that is open can be read")
+    }
+
+    pub(super) async fn close(&self) {
+        for pool in [&self.regular, &self.without_writer].into_iter().filter_map(OnceLock::get) {
+            pool.close().await;
+        }
+    }
+}
+
+impl Database {
+    /// The database at `path`, which is resolved now: whatever becomes of the working directory or of links later.
+    ///
+    /// # Errors
+    ///
+    /// If its directory is not there.
+    pub(super) fn new(path: &Path, locking: Locking) -> Result<Self, StoreError> {
+        let path = resolve(path).map_err(|source| StoreError::Create { path: path.to_owned(), source })?;
+        let identity = Identity::of(&path).ok();
+        let readers = Arc::default();
+        Ok(Self {
+            path,
+            locking,
+            lock: None,
+            identity,
+            log_identity: None,
+            is_looked_at: false,
+            has_log: false,
+            readers,
+        })
+    }
+
+    pub(super) fn readers(&self) -> &Arc<Readers> {
+        &self.readers
+    }
+
+    /// Opens a way to write, and ways to read beside it.
+    ///
+    /// # Errors
+    ///
+    /// [`StoreError::Unavailable`] if it may go through later; whatever else speaks against using the database.
+    pub(super) async fn connect(&mut self) -> Result<SqliteConnection, StoreError> {
+        match self.try_connect().await {
+            Err(error) => Err(self.diagnose(error).await),
+            connected => connected,
+        }
+    }
+
+    async fn try_connect(&mut self) -> Result<SqliteConnection, StoreError> {
+        self.take_lock()?;
+        if self.identity.is_none() {
+            self.create()?;
+        }
+        self.check_identity()?;
+        self.log_identity = None;
+        let mut connection = options(&self.path).synchronous(SqliteSynchronous::Full).connect().await?;
+        if !self.is_looked_at {
+            check_version(&mut connection).await?;
+            check_whose(&mut connection).await?;
+            quick_check(&mut connection).await?;
+            let mode: String = sqlx::query_scalar("PRAGMA journal_mode = WAL").fetch_one(&mut connection).await?;
+            self.has_log = mode == "wal";
+            migrator().run_direct(None, &mut connection, false).await?;
+            // A database that cannot be written to is to be told of now.
+            connection.begin_with("BEGIN IMMEDIATE").await?.rollback().await?;
+        }
+        self.check_identity()?;
+        if self.readers.regular.get().is_none() {
+            let regular = readers(options(&self.path).pragma("query_only", "ON")).await?;
+            // Nobody else sets it.
+            let _ = self.readers.regular.set(regular);
+            if let Some(pool) = self.readers.without_writer.get() {
+                pool.close().await;
+            }
+        }
+        self.is_looked_at = true;
+        Ok(connection)
+    }
+
+    /// Opens ways to read, which leave the database and its directory as they are as far as can be.
+    ///
+    /// # Errors
+    ///
+    /// If it cannot be read, or not be understood without being changed.
+    pub(super) async fn read_only(&self, depth: Depth) -> Result<(), StoreError> {
+        let options = options(&self.path).read_only(true);
+        let pool = match look_at(options.clone(), depth).await {
+            // Without room for the memory that is shared, or leave to make the file for it, only a file that nobody writes to can be
+            // read: as it is, without what its log has.
+            Err(StoreError::Unavailable(_)) if self.is_log_empty() => look_at(options.immutable(true), depth).await?,
+            pool => pool?,
+        };
+        // Nobody else sets it.
+        let _ = self.readers.without_writer.set(pool);
+        Ok(())
+    }
+
+    /// Makes sure that what was just written is in the database's file and its log, as whoever opens them by their names finds them.
+    ///
+    /// # Errors
+    ///
+    /// [`Unavailable::Gone`] if not.
+    pub(super) fn check_written(&mut self) -> Result<(), StoreError> {
+        self.check_identity()?;
+        if !self.has_log {
+            return Ok(());
+        }
+        let log = Identity::of(&self.beside("-wal")).map_err(|_| Unavailable::Gone)?;
+        if *self.log_identity.get_or_insert(log) == log { Ok(()) } else { Err(Unavailable::Gone.into()) }
+    }
+
+    /// What is behind an error of SQLite, as far as can be found out.
+    pub(super) async fn diagnose(&self, error: StoreError) -> StoreError {
+        let StoreError::Unavailable(unavailable) = error else { return error };
+        if self.check_identity().is_err() {
+            return Unavailable::Gone.into();
+        }
+        if let Unavailable::Failing { .. } = unavailable {
+            // A disk that has no room is not always told from one that fails otherwise. It may take its time.
+            let path = self.path.clone();
+            let probed = tokio::task::spawn_blocking(move || probe(&path)).await;
+            return probed.ok().and_then(Result::err).unwrap_or(unavailable).into();
+        }
+        unavailable.into()
+    }
+
+    fn check_identity(&self) -> Result<(), StoreError> {
+        // Without one, there was no file that could be gone.
+        let Some(identity) = self.identity else { return Ok(()) };
+        if Identity::of(&self.path).is_ok_and(|found| found == identity) {
+            Ok(())
+        } else {
+            Err(Unavailable::Gone.into())
+        }
+    }
+
+    fn take_lock(&mut self) -> Result<(), StoreError> {
+        if self.locking == Locking::None || self.lock.is_some() {
+            return Ok(());
+        }
+        let path = self.beside("-lock");
+        // Not truncated, as nothing is in it. It stays when the process ends: whoever removed it could remove another's.
+        let opened = OpenOptions::new().write(true).create(true).truncate(false).mode(MODE).open(&path);
+        let opened = opened.or_else(|error| if is_read_only(&error) { File::open(&path) } else { Err(error) });
+        let file = opened.map_err(|source| match unavailable(&source) {
+            Some(unavailable) => unavailable.into(),
+            None => StoreError::Lock { lock: path.clone(), source },
+        })?;
+        match file.try_lock() {
+            Ok(()) => {
+                self.lock = Some(file);
+                Ok(())
+            }
+            Err(fs::TryLockError::WouldBlock) => Err(StoreError::InUse { lock: path }),
+            Err(fs::TryLockError::Error(source)) => Err(StoreError::Lock { lock: path, source }),
+        }
+    }
+
+    /// Makes an empty file, which is an empty database; others by SQLite have its mode.
+    fn create(&mut self) -> Result<(), StoreError> {
+        let made = OpenOptions::new().write(true).create_new(true).mode(MODE).open(&self.path);
+        match made {
+            Ok(_) => {}
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => {}
+            Err(source) => return Err(StoreError::Create { path: self.path.clone(), source }),
+        }
+        let identity = Identity::of(&self.path);
+        self.identity = Some(identity.map_err(|source| StoreError::Create { path: self.path.clone(), source })?);
+        Ok(())
+    }
+
+    fn is_log_empty(&self) -> bool {
+        match fs::metadata(self.beside("-wal")) {
+            Ok(log) => log.len() == 0,
+            Err(error) => error.kind() == ErrorKind::NotFound,
+        }
+    }
+
+    /// The file beside the database whose name ends so.
+    fn beside(&self, end: &str) -> PathBuf {
+        let mut name = self.path.clone().into_os_string();
+        name.push(end);
+        name.into()
+    }
+}
+
+/// The path without links, as SQLite names the files beside it; of a file that is not there yet, that of its directory.
+fn resolve(path: &Path) -> io::Result<PathBuf> {
+    match fs::canonicalize(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => {}
+        resolved => return resolved,
+    }
+    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let name = path.file_name().ok_or(ErrorKind::InvalidFilename)?;
+    Ok(fs::canonicalize(directory)?.join(name))
+}
+
+/// Writes a little beside the database, and removes it.
+fn probe(path: &Path) -> Result<(), Unavailable> {
+    /// More than what is left over in a page of a full disk.
+    const N_BYTES: usize = 64 * 1024;
+    let directory = path.parent().unwrap_or(Path::new("."));
+    let written = tempfile::tempfile_in(directory).and_then(|mut file| {
+        io::Write::write_all(&mut file, &[0; N_BYTES])?;
+        file.sync_all()
+    });
+    match written {
+        Ok(()) => Ok(()),
+        Err(error) => unavailable(&error).map_or(Ok(()), Err),
+    }
+}
+
+/// What an error of a file says of its disk.
+fn unavailable(error: &io::Error) -> Option<Unavailable> {
+    match error.kind() {
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => Some(Unavailable::Full),
+        _ if is_read_only(error) => Some(Unavailable::ReadOnly),
+        _ => None,
+    }
+}
+
+fn is_read_only(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::ReadOnlyFilesystem | ErrorKind::PermissionDenied)
+}
+
+/// What every connection has.
+fn options(path: &Path) -> SqliteConnectOptions {
+    SqliteConnectOptions::new()
+        .filename(path)
+        .create_if_missing(false)
+        .busy_timeout(BUSY_TIMEOUT)
+        .statement_cache_capacity(N_STATEMENTS)
+        .disable_statement_logging()
+}
+
+/// Ways to read that stay: opened anew, they could need room that there is none of.
+async fn readers(options: SqliteConnectOptions) -> Result<SqlitePool, StoreError> {
+    let pool = SqlitePoolOptions::new().max_connections(N_READERS).idle_timeout(None).max_lifetime(None);
+    Ok(pool.connect_with(options).await?)
+}
+
+/// Ways to read a database that is whole, and has this version's schema.
+async fn look_at(options: SqliteConnectOptions, depth: Depth) -> Result<SqlitePool, StoreError> {
+    let mut connection = options.connect().await?;
+    check_version(&mut connection).await?;
+    check_whose(&mut connection).await?;
+    check_schema(&mut connection).await?;
+    if depth == Depth::Whole {
+        quick_check(&mut connection).await?;
+    }
+    connection.close().await?;
+    readers(options).await
+}
+
+/// Every migration, in order. They are part of the program, so that it runs wherever it is copied to.
+fn migrator() -> Migrator {
+    let migration = |version, description: &'static str, sql: &'static str| {
+        Migration::new(version, description.into(), MigrationType::Simple, sql.into_sql_str(), false)
+    };
+    Migrator {
+        migrations: vec![
+            migration(1, FIRST_MIGRATION, include_str!("../../migrations/0001_models_and_policies.sql")),
+            migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
+            migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
+            migration(4, "large definitions", include_str!("../../migrations/0004_large_definitions.sql")),
+            migration(5, "arrivals", include_str!("../../migrations/0005_arrivals.sql")),
+            migration(6, "short policies", include_str!("../../migrations/0006_short_policies.sql")),
+            migration(7, "incidents", include_str!("../../migrations/0007_incidents.sql")),
+        ]
+        .into(),
+        ..Migrator::DEFAULT
+    }
+}
+
+/// By which databases are known that were not migrated for long.
+const FIRST_MIGRATION: &str = "models and policies";
+
+async fn check_version(connection: &mut SqliteConnection) -> Result<(), StoreError> {
+    let found: String = sqlx::query_scalar("SELECT sqlite_version()").fetch_one(connection).await?;
+    let mut parts = found.split('.').map(|part| part.parse::<u32>().unwrap_or(0));
+    let mut next = || parts.next().unwrap_or(0);
+    let version = (next(), next(), next());
+    if version < LEAST_SQLITE_VERSION {
+        return Err(StoreError::Version { found, needed: LEAST_SQLITE_VERSION });
+    }
+    Ok(())
+}
+
+/// Refuses what another program has made. An empty database is anybody's.
+async fn check_whose(connection: &mut SqliteConnection) -> Result<(), StoreError> {
+    let id: i64 = sqlx::query_scalar("PRAGMA application_id").fetch_one(&mut *connection).await?;
+    if id != 0 {
+        return if id == APPLICATION_ID { Ok(()) } else { Err(StoreError::Foreign) };
+    }
+    let names: Vec<String> =
+        sqlx::query_scalar("SELECT name FROM sqlite_schema WHERE name NOT LIKE 'sqlite\\_%' ESCAPE '\\'")
+            .fetch_all(&mut *connection)
+            .await?;
+    let is_begun = names.iter().any(|name| name == "_sqlx_migrations");
+    // Whoever was killed while it made the first tables has left this one.
+    if names.len() == usize::from(is_begun) {
+        return Ok(());
+    }
+    let is_ours = is_begun && {
+        let query =
+            sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM _sqlx_migrations WHERE version = 1 AND description = $1)");
+        query.bind(FIRST_MIGRATION).fetch_one(connection).await?
+    };
+    if is_ours { Ok(()) } else { Err(StoreError::Foreign) }
+}
+
+/// Refuses a file whose pages do not fit together.
+async fn quick_check(connection: &mut SqliteConnection) -> Result<(), StoreError> {
+    let checked = sqlx::query_scalar::<_, String>("PRAGMA quick_check(1)").fetch_one(connection).await;
+    match checked.map_err(StoreError::from) {
+        Ok(finding) if finding == "ok" => Ok(()),
+        Ok(finding) => Err(StoreError::Damaged { finding }),
+        Err(error) => Err(error),
+    }
+}
+
+/// Refuses a database that has another schema than this version's.
+async fn check_schema(connection: &mut SqliteConnection) -> Result<(), StoreError> {
+    let applied: Vec<i64> =
+        sqlx::query_scalar("SELECT version FROM _sqlx_migrations ORDER BY version").fetch_all(connection).await?;
+    let known = migrator();
+    let last = known.migrations.last().map_or(0, |migration| migration.version);
+    match applied.last() {
+        Some(applied) if *applied > last => Err(StoreError::Newer { migration: *applied }),
+        Some(applied) if *applied == last => Ok(()),
+        _ => Err(StoreError::Outdated),
+    }
+}

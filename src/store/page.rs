@@ -1,0 +1,145 @@
+//! Lists in parts.
+
+use futures_util::{Stream, TryStreamExt};
+use sqlx::Row;
+use sqlx::sqlite::SqliteRow;
+
+use super::StoreError;
+
+/// A page ends with the item that brings the text of its rows to this size. An answer has a few times as much, and with a few of
+/// them at once a small service stays small; most lists do not come near it with as many items as may be asked for.
+pub(super) const MAX_BYTES: usize = 1 << 20;
+
+/// A part of a long list.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Page<T> {
+    /// The items, in order.
+    pub items: Vec<T>,
+    /// Names or ids of rows that belong here but hold what this program never writes.
+    pub unreadable: Vec<String>,
+    /// The key of the last row, if there are more.
+    pub next: Option<String>,
+}
+
+/// What there is to know of the rows of a list.
+pub(super) struct Rows<T> {
+    pub(super) table: &'static str,
+    /// By which column the list is ordered.
+    pub(super) key: &'static str,
+    /// Which column names a row.
+    pub(super) name: &'static str,
+    /// Which columns may be long.
+    pub(super) long: &'static [&'static str],
+    pub(super) read: fn(&SqliteRow) -> Result<T, StoreError>,
+}
+
+impl<T> Rows<T> {
+    /// Makes a page of at most `limit` of `rows`, one at least. Either the query asked for one more than that, or `rest` says whether
+    /// there are any.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub(super) async fn page(
+        &self,
+        mut rows: impl Stream<Item = Result<SqliteRow, sqlx::Error>> + Unpin,
+        limit: u32,
+        rest: Rest,
+    ) -> Result<Page<T>, StoreError> {
+        let mut page = Page { items: Vec::new(), unreadable: Vec::new(), next: None };
+        let (mut last, mut n_rows, mut n_bytes) = (None, 0, 0);
+        while let Some(row) = rows.try_next().await? {
+            if n_rows == limit || n_bytes >= MAX_BYTES {
+                page.next = last;
+                return Ok(page);
+            }
+            n_rows += 1;
+            n_bytes += self.long.iter().map(|column| text(&row, column).map_or(0, <[u8]>::len)).sum::<usize>();
+            last = shown(&row, self.key);
+            match (self.read)(&row) {
+                Ok(item) => page.items.push(item),
+                Err(error) => {
+                    let name = shown(&row, self.name).unwrap_or_default();
+                    page.unreadable.push(leave_out(error.of_row(self.table, &name), name)?);
+                }
+            }
+        }
+        if rest == Rest::IsMore {
+            page.next = last;
+        }
+        Ok(page)
+    }
+}
+
+/// What comes after the rows of a query.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Rest {
+    /// Nothing.
+    IsNone,
+    /// More of the list.
+    IsMore,
+}
+
+/// How many of the next rows, which have so many bytes, make a page of at most `limit`, and what comes after them: for rows that may be
+/// so long that none of them is read ahead.
+pub(super) fn fitting(sizes: &[i64], limit: u32) -> (u32, Rest) {
+    let (mut n_rows, mut n_bytes) = (0, 0_u64);
+    for size in sizes {
+        if n_rows == limit || n_bytes >= MAX_BYTES as u64 {
+            return (n_rows, Rest::IsMore);
+        }
+        n_rows += 1;
+        n_bytes = n_bytes.saturating_add(size.unsigned_abs());
+    }
+    (n_rows, Rest::IsNone)
+}
+
+impl<T> Page<T> {
+    /// The page of what `item` makes of each item.
+    pub fn map<U>(self, item: impl FnMut(T) -> U) -> Page<U> {
+        let Self { items, unreadable, next } = self;
+        Page { items: items.into_iter().map(item).collect(), unreadable, next }
+    }
+
+    /// The page of what `item` makes of each item; those of which nothing can be made, as their rows hold what this program never
+    /// writes, are named by `name`.
+    ///
+    /// # Errors
+    ///
+    /// Whatever else goes wrong.
+    pub fn try_map<U>(
+        self,
+        name: impl Fn(&T) -> &str,
+        item: impl Fn(T) -> Result<U, StoreError>,
+    ) -> Result<Page<U>, StoreError> {
+        let Self { items, mut unreadable, next } = self;
+        let mut made = Vec::with_capacity(items.len());
+        for from in items {
+            let name = name(&from).to_owned();
+            match item(from) {
+                Ok(to) => made.push(to),
+                Err(error) => unreadable.push(leave_out(error, name)?),
+            }
+        }
+        Ok(Page { items: made, unreadable, next })
+    }
+}
+
+/// Logs what is wrong with a row, and gives its name.
+fn leave_out(error: StoreError, name: String) -> Result<String, StoreError> {
+    if !error.is_of_a_row() {
+        return Err(error);
+    }
+    tracing::error!(error = &error as &dyn std::error::Error, "a list leaves out a row");
+    Ok(name)
+}
+
+fn text<'r>(row: &'r SqliteRow, column: &str) -> Option<&'r [u8]> {
+    row.try_get::<Option<&[u8]>, _>(column).ok().flatten()
+}
+
+/// A name, an id or a number, whatever is wrong with it.
+fn shown(row: &SqliteRow, column: &str) -> Option<String> {
+    let number = row.try_get::<i64, _>(column).ok().map(|number| number.to_string());
+    number.or_else(|| text(row, column).map(|text| String::from_utf8_lossy(text).into_owned()))
+}
