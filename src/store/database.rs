@@ -14,12 +14,13 @@ use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 use std::time::Duration;
 
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::sqlite::{SqliteConnectOptions, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection};
+use tokio::sync::RwLock;
 
 use super::{Depth, StoreError, Unavailable};
 
@@ -59,13 +60,14 @@ pub(super) struct Database {
     lock: Option<File>,
     /// `None` until there is a file.
     identity: Option<Identity>,
-    /// That of the log, since something was written to it by the way that is open.
+    /// That of the log, which is there as long as somebody reads.
     log_identity: Option<Identity>,
-    /// Whether a writer has had its way, and with it the look at the database.
+    /// Whether a writer has had its way, and with it the look at the database; since then, there are ways to read that go with it.
     is_looked_at: bool,
     /// Whether there is a log: not where memory cannot be shared between processes.
     has_log: bool,
-    readers: Arc<Readers>,
+    /// `None` until there is a way to read.
+    readers: Option<Arc<Readers>>,
 }
 
 /// Tells a file from another one that has its path later.
@@ -83,28 +85,20 @@ impl Identity {
 }
 
 /// The ways to read.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Readers {
-    /// Once a writer had its way.
-    regular: OnceLock<SqlitePool>,
-    /// Until then.
-    without_writer: OnceLock<SqlitePool>,
+    /// Locked while one takes the place of another.
+    pool: RwLock<SqlitePool>,
 }
 
 impl Readers {
     /// The pool to read by.
-    ///
-    /// # Panics
-    ///
-    /// Never: a store that is open has one.
-    pub(super) fn pool(&self) -> &SqlitePool {
-        self.regular.get().or_else(|| self.without_writer.get()).expect("a store that is open can be read")
+    pub(super) async fn pool(&self) -> SqlitePool {
+        self.pool.read().await.clone()
     }
 
     pub(super) async fn close(&self) {
-        for pool in [&self.regular, &self.without_writer].into_iter().filter_map(OnceLock::get) {
-            pool.close().await;
-        }
+        self.pool().await.close().await;
     }
 }
 
@@ -117,21 +111,17 @@ impl Database {
     pub(super) fn new(path: &Path, locking: Locking) -> Result<Self, StoreError> {
         let path = resolve(path).map_err(|source| StoreError::Create { path: path.to_owned(), source })?;
         let identity = Identity::of(&path).ok();
-        let readers = Arc::default();
-        Ok(Self {
-            path,
-            locking,
-            lock: None,
-            identity,
-            log_identity: None,
-            is_looked_at: false,
-            has_log: false,
-            readers,
-        })
+        let (lock, log_identity, readers) = (None, None, None);
+        Ok(Self { path, locking, lock, identity, log_identity, is_looked_at: false, has_log: false, readers })
     }
 
-    pub(super) fn readers(&self) -> &Arc<Readers> {
-        &self.readers
+    /// The ways to read.
+    ///
+    /// # Errors
+    ///
+    /// If there are none.
+    pub(super) fn readers(&self) -> Result<Arc<Readers>, StoreError> {
+        self.readers.clone().ok_or(StoreError::Closed)
     }
 
     /// Opens a way to write, and ways to read beside it.
@@ -151,30 +141,63 @@ impl Database {
         if self.identity.is_none() {
             self.create()?;
         }
-        self.check_identity()?;
-        self.log_identity = None;
+        self.check_files()?;
+        let Some(readers) = self.readers.clone().filter(|_| !self.is_looked_at) else {
+            let (connection, pool) = self.open().await?;
+            if let Some(pool) = pool {
+                self.readers = Some(Arc::new(Readers { pool: RwLock::new(pool) }));
+            }
+            return Ok(connection);
+        };
+        // The ways to read that there are without a writer keep its own from being opened as they should, and take locks away when they
+        // are closed. So that is done first, once it looks as if it were worth it, and undone if it was not.
+        probe_aside(&self.path).await?;
+        let mut place = readers.pool.write().await;
+        place.close().await;
+        let opened = self.open().await;
+        let (connection, pool) = match opened {
+            Ok((connection, Some(pool))) => (Ok(connection), pool),
+            Ok((connection, None)) => return Ok(connection),
+            Err(error) => (Err(error), self.look_at(Depth::Schema).await?),
+        };
+        *place = pool;
+        connection
+    }
+
+    /// Opens a way to write, and for the first of them, ways to read that go with it.
+    async fn open(&mut self) -> Result<(SqliteConnection, Option<SqlitePool>), StoreError> {
         let mut connection = options(&self.path).synchronous(SqliteSynchronous::Full).connect().await?;
-        if !self.is_looked_at {
-            check_version(&mut connection).await?;
-            check_whose(&mut connection).await?;
-            quick_check(&mut connection).await?;
-            let mode: String = sqlx::query_scalar("PRAGMA journal_mode = WAL").fetch_one(&mut connection).await?;
-            self.has_log = mode == "wal";
-            migrator().run_direct(None, &mut connection, false).await?;
-            // A database that cannot be written to is to be told of now.
-            connection.begin_with("BEGIN IMMEDIATE").await?.rollback().await?;
-        }
-        self.check_identity()?;
-        if self.readers.regular.get().is_none() {
-            let regular = readers(options(&self.path).pragma("query_only", "ON")).await?;
-            // Nobody else sets it.
-            let _ = self.readers.regular.set(regular);
-            if let Some(pool) = self.readers.without_writer.get() {
-                pool.close().await;
+        match self.prepare(&mut connection).await {
+            Ok(pool) => Ok((connection, pool)),
+            Err(error) => {
+                let _ = connection.close().await;
+                Err(error)
             }
         }
+    }
+
+    async fn prepare(&mut self, connection: &mut SqliteConnection) -> Result<Option<SqlitePool>, StoreError> {
+        if self.is_looked_at {
+            self.check_files()?;
+            return Ok(None);
+        }
+        check_version(connection).await?;
+        check_whose(connection).await?;
+        quick_check(connection).await?;
+        let mode: String = sqlx::query_scalar("PRAGMA journal_mode = WAL").fetch_one(&mut *connection).await?;
+        self.has_log = mode == "wal";
+        migrator().run_direct(None, connection, false).await?;
+        // A file that can only be read has been opened all the same. That it is locked is no reason not to have it open.
+        let written =
+            sqlx::query("UPDATE service SET last_alive_ms = last_alive_ms WHERE FALSE").execute(&mut *connection);
+        match written.await.map_err(StoreError::from) {
+            Ok(_) | Err(StoreError::Unavailable(Unavailable::Locked)) => {}
+            Err(error) => return Err(error),
+        }
+        let readers = readers(options(&self.path).pragma("query_only", "ON")).await?;
+        self.check_written()?;
         self.is_looked_at = true;
-        Ok(connection)
+        Ok(Some(readers))
     }
 
     /// Opens ways to read, which leave the database and its directory as they are as far as can be.
@@ -182,17 +205,20 @@ impl Database {
     /// # Errors
     ///
     /// If it cannot be read, or not be understood without being changed.
-    pub(super) async fn read_only(&self, depth: Depth) -> Result<(), StoreError> {
+    pub(super) async fn read_only(&mut self, depth: Depth) -> Result<(), StoreError> {
+        let pool = self.look_at(depth).await?;
+        self.readers = Some(Arc::new(Readers { pool: RwLock::new(pool) }));
+        Ok(())
+    }
+
+    async fn look_at(&self, depth: Depth) -> Result<SqlitePool, StoreError> {
         let options = options(&self.path).read_only(true);
-        let pool = match look_at(options.clone(), depth).await {
+        match look_at(options.clone(), depth).await {
             // Without room for the memory that is shared, or leave to make the file for it, only a file that nobody writes to can be
             // read: as it is, without what its log has.
-            Err(StoreError::Unavailable(_)) if self.is_log_empty() => look_at(options.immutable(true), depth).await?,
-            pool => pool?,
-        };
-        // Nobody else sets it.
-        let _ = self.readers.without_writer.set(pool);
-        Ok(())
+            Err(StoreError::Unavailable(_)) if self.is_log_empty() => look_at(options.immutable(true), depth).await,
+            pool => pool,
+        }
     }
 
     /// Makes sure that what was just written is in the database's file and its log, as whoever opens them by their names finds them.
@@ -201,37 +227,37 @@ impl Database {
     ///
     /// [`Unavailable::Gone`] if not.
     pub(super) fn check_written(&mut self) -> Result<(), StoreError> {
-        self.check_identity()?;
-        if !self.has_log {
-            return Ok(());
+        if self.has_log && self.log_identity.is_none() {
+            // From now on it stays, as readers have it open.
+            self.log_identity = Some(Identity::of(&self.beside("-wal")).map_err(|_| Unavailable::Gone)?);
         }
-        let log = Identity::of(&self.beside("-wal")).map_err(|_| Unavailable::Gone)?;
-        if *self.log_identity.get_or_insert(log) == log { Ok(()) } else { Err(Unavailable::Gone.into()) }
+        self.check_files()
+    }
+
+    fn check_files(&self) -> Result<(), StoreError> {
+        let is_there = |path: &Path, known: Option<Identity>| {
+            known.is_none_or(|known| Identity::of(path).is_ok_and(|found| found == known))
+        };
+        if is_there(&self.path, self.identity)
+            && (self.log_identity.is_none() || is_there(&self.beside("-wal"), self.log_identity))
+        {
+            Ok(())
+        } else {
+            Err(Unavailable::Gone.into())
+        }
     }
 
     /// What is behind an error of SQLite, as far as can be found out.
     pub(super) async fn diagnose(&self, error: StoreError) -> StoreError {
         let StoreError::Unavailable(unavailable) = error else { return error };
-        if self.check_identity().is_err() {
+        if self.check_files().is_err() {
             return Unavailable::Gone.into();
         }
         if let Unavailable::Failing { .. } = unavailable {
-            // A disk that has no room is not always told from one that fails otherwise. It may take its time.
-            let path = self.path.clone();
-            let probed = tokio::task::spawn_blocking(move || probe(&path)).await;
-            return probed.ok().and_then(Result::err).unwrap_or(unavailable).into();
+            // A disk that has no room is not always told from one that fails otherwise.
+            return probe_aside(&self.path).await.err().unwrap_or(unavailable).into();
         }
         unavailable.into()
-    }
-
-    fn check_identity(&self) -> Result<(), StoreError> {
-        // Without one, there was no file that could be gone.
-        let Some(identity) = self.identity else { return Ok(()) };
-        if Identity::of(&self.path).is_ok_and(|found| found == identity) {
-            Ok(())
-        } else {
-            Err(Unavailable::Gone.into())
-        }
     }
 
     fn take_lock(&mut self) -> Result<(), StoreError> {
@@ -269,6 +295,11 @@ impl Database {
         Ok(())
     }
 
+    /// Whether nothing was ever written to it.
+    pub(super) fn is_empty(&self) -> bool {
+        fs::metadata(&self.path).is_ok_and(|file| file.len() == 0) && self.is_log_empty()
+    }
+
     fn is_log_empty(&self) -> bool {
         match fs::metadata(self.beside("-wal")) {
             Ok(log) => log.len() == 0,
@@ -295,7 +326,12 @@ fn resolve(path: &Path) -> io::Result<PathBuf> {
     Ok(fs::canonicalize(directory)?.join(name))
 }
 
-/// Writes a little beside the database, and removes it.
+/// Writes a little beside the database, and removes it, on a thread of its own, as a disk may take its time.
+async fn probe_aside(path: &Path) -> Result<(), Unavailable> {
+    let path = path.to_owned();
+    tokio::task::spawn_blocking(move || probe(&path)).await.unwrap_or(Ok(()))
+}
+
 fn probe(path: &Path) -> Result<(), Unavailable> {
     /// More than what is left over in a page of a full disk.
     const N_BYTES: usize = 64 * 1024;
@@ -333,9 +369,10 @@ fn options(path: &Path) -> SqliteConnectOptions {
         .disable_statement_logging()
 }
 
-/// Ways to read that stay: opened anew, they could need room that there is none of.
+/// Ways to read, all of them now, which stay: opened later, one could need room that there is none of, or find another file.
 async fn readers(options: SqliteConnectOptions) -> Result<SqlitePool, StoreError> {
-    let pool = SqlitePoolOptions::new().max_connections(N_READERS).idle_timeout(None).max_lifetime(None);
+    let pool = SqlitePoolOptions::new().min_connections(N_READERS).max_connections(N_READERS);
+    let pool = pool.idle_timeout(None).max_lifetime(None);
     Ok(pool.connect_with(options).await?)
 }
 

@@ -106,7 +106,7 @@ impl Store {
             "SELECT id FROM (SELECT id FROM definitions UNION SELECT definition_id FROM definition_pieces)
              WHERE NOT EXISTS (SELECT 1 FROM models WHERE definition_id = id)",
         );
-        for id in left.fetch_all(self.readers()).await? {
+        for id in left.fetch_all(&self.readers().await).await? {
             self.sweeper.sweep(id);
         }
         Ok(())
@@ -147,9 +147,9 @@ impl Store {
     pub async fn piece(&self, definition_id: i64, seq: i64) -> Result<Option<Vec<u8>>, StoreError> {
         let query = sqlx::query_scalar("SELECT piece FROM definition_pieces WHERE definition_id = $1 AND seq = $2");
         let query = query.bind(definition_id).bind(seq);
-        let Some(piece): Option<Vec<u8>> = query.fetch_optional(self.readers()).await? else {
+        let Some(piece): Option<Vec<u8>> = query.fetch_optional(&self.readers().await).await? else {
             // Pieces are only ever removed once the model is.
-            return match is_a_models(definition_id).fetch_one(self.readers()).await? {
+            return match is_a_models(definition_id).fetch_one(&self.readers().await).await? {
                 false => Err(StoreError::Removed),
                 true if seq == 0 => Err(corrupt("definition_pieces", "seq")("the first piece is missing")),
                 true => Ok(None),
@@ -247,7 +247,7 @@ mod tests {
 
     /// How many definitions and pieces there are, whoever they belong to.
     async fn counts(store: &Store) -> (i64, i64) {
-        let count = |table| sqlx::query_scalar(table).fetch_one(store.readers());
+        let count = |table| sqlx::query_scalar(table).fetch_one(&store.readers().await);
         let definitions = count("SELECT count(*) FROM definitions").await.unwrap();
         (definitions, count("SELECT count(*) FROM definition_pieces").await.unwrap())
     }

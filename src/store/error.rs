@@ -15,7 +15,10 @@ pub enum StoreError {
     #[error(transparent)]
     Unavailable(#[from] Unavailable),
     /// There is no database, and none can be made.
-    #[error("there is no database {}, and it cannot be created", path.display())]
+    #[error(
+        "there is no database {}, and it cannot be created: its directory must exist, have room, and be writable for this user",
+        path.display()
+    )]
     Create {
         /// Where it was to be.
         path: PathBuf,
@@ -169,6 +172,10 @@ impl From<sqlx::Error> for StoreError {
         const SQLITE_FULL: u32 = 13;
         const SQLITE_CANTOPEN: u32 = 14;
         const SQLITE_NOTADB: u32 = 26;
+        // A pool is closed when another one takes its place, or the service stops.
+        if let sqlx::Error::PoolTimedOut | sqlx::Error::PoolClosed = error {
+            return Unavailable::Slow.into();
+        }
         let code = error.as_database_error().and_then(|error| error.code()?.parse::<u32>().ok());
         let Some(code) = code else { return Self::Database(error) };
         // Extended codes have the primary one in their low byte.

@@ -25,6 +25,7 @@ mod sessions;
 mod trials;
 mod writer;
 
+use std::io;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -84,7 +85,10 @@ impl Store {
         let mut database = Database::new(path, locking)?;
         let connection = match database.connect().await {
             Ok(connection) => Some(connection),
-            Err(error @ StoreError::Unavailable(_)) => {
+            Err(error @ StoreError::Unavailable(unavailable)) => {
+                if database.is_empty() {
+                    return Err(StoreError::Create { path: path.to_owned(), source: io::Error::other(unavailable) });
+                }
                 // What cannot be read either says less than this.
                 if database.read_only(Depth::Whole).await.is_err() {
                     return Err(error);
@@ -97,7 +101,7 @@ impl Store {
             }
             Err(error) => return Err(error),
         };
-        let readers = Arc::clone(database.readers());
+        let readers = database.readers()?;
         let writer = Writer::start(database, connection, tasks);
         Ok(Self::of(readers, writer, tasks))
     }
@@ -108,9 +112,9 @@ impl Store {
     ///
     /// If it cannot be opened, is another program's, or has another schema than this version's.
     pub async fn open_to_read(path: &Path, tasks: &TaskTracker) -> Result<Self, StoreError> {
-        let database = Database::new(path, Locking::None)?;
+        let mut database = Database::new(path, Locking::None)?;
         database.read_only(Depth::Schema).await?;
-        Ok(Self::of(Arc::clone(database.readers()), Writer::none(), tasks))
+        Ok(Self::of(database.readers()?, Writer::none(), tasks))
     }
 
     fn of(readers: Arc<Readers>, writer: Writer, tasks: &TaskTracker) -> Self {
@@ -125,8 +129,8 @@ impl Store {
         self.writer.close();
     }
 
-    fn readers(&self) -> &SqlitePool {
-        self.readers.pool()
+    async fn readers(&self) -> SqlitePool {
+        self.readers.pool().await
     }
 
     /// Counts up whenever a model was registered or deleted, before whoever did so is told.

@@ -146,7 +146,7 @@ impl Store {
     /// If the database failed.
     pub async fn model(&self, name: &str) -> Result<Option<ModelRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM models WHERE name = $1").bind(name);
-        let row = query.fetch_optional(self.readers()).await?;
+        let row = query.fetch_optional(&self.readers().await).await?;
         let read = |row: SqliteRow| {
             let definition = match row.try_get("definition_id")? {
                 Some(id) => StoredDefinition::Pieces(id),
@@ -164,7 +164,7 @@ impl Store {
     /// If the database failed.
     pub async fn model_key(&self, name: &str) -> Result<Option<ModelKey>, StoreError> {
         let query = sqlx::query("SELECT hash, n_states FROM models WHERE name = $1").bind(name);
-        let row = query.fetch_optional(self.readers()).await?;
+        let row = query.fetch_optional(&self.readers().await).await?;
         let read = |row: SqliteRow| {
             Ok(ModelKey { hash: row.try_get("hash")?, is_lazy: row.try_get::<i64, _>("n_states")? == UNKNOWN })
         };
@@ -180,12 +180,13 @@ impl Store {
         // Labels may be so long that even a few models are not read ahead.
         let sizes = "SELECT octet_length(attributes) + octet_length(actions) FROM models WHERE name > $1 ORDER BY name LIMIT $2";
         let sizes = sqlx::query_scalar(sizes).bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
-        let (n_rows, rest) = page::fitting(&sizes.fetch_all(self.readers()).await?, limit);
+        let (n_rows, rest) = page::fitting(&sizes.fetch_all(&self.readers().await).await?, limit);
         let query = sqlx::query(
             "SELECT name, hash, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms
              FROM models WHERE name > $1 ORDER BY name LIMIT $2",
         );
-        let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(self.readers());
+        let readers = self.readers().await;
+        let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(&readers);
         Rows { table: "models", key: "name", name: "name", long: &["attributes", "actions"], read: read_summary }
             .page(rows, n_rows, rest)
             .await

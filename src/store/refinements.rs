@@ -40,7 +40,7 @@ impl Store {
             "SELECT rowid AS sequence, policy_id, model_hash, request FROM refinements WHERE rowid > $1
              ORDER BY rowid LIMIT 1",
         );
-        let Some(row) = query.bind(after).fetch_optional(self.readers()).await? else { return Ok(None) };
+        let Some(row) = query.bind(after).fetch_optional(&self.readers().await).await? else { return Ok(None) };
         let refinement = NewRefinement {
             policy_id: row.try_get("policy_id")?,
             model_hash: row.try_get("model_hash")?,

@@ -21,9 +21,14 @@ impl Process {
     }
 
     pub(crate) fn start_with(flags: &[&str], database: &Path) -> Self {
+        Self::start_under(&[], flags, database)
+    }
+
+    /// Starts the service with variables in its environment.
+    pub(crate) fn start_under(variables: &[(&str, &Path)], flags: &[&str], database: &Path) -> Self {
         let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
         command.args(["serve", "--log-format", "text"]).args(flags).arg("--database").arg(database);
-        command.env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG");
+        command.env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG").envs(variables.iter().copied());
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
         let listening = lines.find(|line| line.contains("listening on http://")).expect("the service starts");
@@ -42,6 +47,16 @@ impl Process {
                 return;
             }
         }
+    }
+
+    pub(crate) fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// SIGTERM, and waits for the clean end.
+    pub(crate) fn stop(mut self) {
+        let sent = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
+        assert!(sent.success() && self.child.wait().unwrap().success());
     }
 
     /// SIGKILL: no handler runs, nothing is flushed.
