@@ -312,12 +312,51 @@ mod tests {
             Ok(())
         }));
         assert!(futures_util::poll!(&mut running).is_pending());
-        assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), Some(Outcome::Later));
+        for _ in 0..=MAX_ATTEMPTS {
+            assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), Some(Outcome::Later));
+            assert_eq!(etude.store.n_attempts(&id).await, Some(0), "it does not count");
+        }
         drop(running);
         while etude.refine_next(&mut after, &mut None).await.unwrap() == Some(Outcome::Later) {
             tokio::task::yield_now().await;
         }
         assert!(read(&etude, &id).await["refined_by"].is_string());
+    }
+
+    #[tokio::test]
+    async fn a_refinement_that_ends_the_process_is_given_up_after_three_attempts() {
+        let directory = tempfile::tempdir().unwrap();
+        let etude = etude(directory.path()).await;
+        let id = made(&etude, &request()).await;
+        for n in 1..=MAX_ATTEMPTS {
+            // As if the process had ended then.
+            assert!(etude.store.begin_refinement(&id).await.unwrap());
+            assert_eq!(etude.store.n_attempts(&id).await, Some(n));
+        }
+        let mut after = 0;
+        assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), Some(Outcome::Ended));
+        assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), None);
+        assert_eq!(read(&etude, &id).await["refined_by"], Value::Null, "it stays what it is");
+    }
+
+    #[tokio::test]
+    async fn an_attempt_that_is_stopped_does_not_count() {
+        let directory = tempfile::tempdir().unwrap();
+        let etude = Arc::new(etude(directory.path()).await);
+        // So large that it takes far longer to be searched than to be stopped.
+        let world = ModelText::Whole(br#"{"dynamics": {"kind": "wumpus", "width": 100, "height": 100}}"#.to_vec());
+        etude.put_model(&Name::new("large").unwrap(), world, Format::Json, caller()).await.unwrap();
+        let mut request = request();
+        request["model"] = "large".into();
+        let id = made(&etude, &request).await;
+        let stopping = CancellationToken::new();
+        let mut refining = Box::pin(Arc::clone(&etude).refine_until(stopping.clone()));
+        while etude.store.n_attempts(&id).await != Some(1) {
+            assert!(futures_util::poll!(&mut refining).is_pending());
+        }
+        stopping.cancel();
+        refining.await;
+        assert_eq!(etude.store.n_attempts(&id).await, Some(0));
     }
 
     #[tokio::test]

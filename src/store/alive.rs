@@ -55,3 +55,116 @@ pub(super) async fn note(
     .await?;
     Ok(())
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::store::{ExpiredSession, NewObservations, NewSession, Store};
+
+    const IDLE: Duration = Duration::from_mins(60);
+    const EVERY: Duration = Duration::from_mins(6);
+
+    fn at(minute: i64) -> Timestamp {
+        Timestamp::from_second(1_000_000 + 60 * minute).unwrap()
+    }
+
+    /// A service that begins at this minute.
+    async fn begin(directory: &Path, minute: i64) -> (Store, TaskTracker) {
+        let tasks = TaskTracker::new();
+        let store = Store::open(&directory.join("etude.db"), &tasks).await.unwrap();
+        store.note_alive(at(minute), EVERY).await.unwrap();
+        (store, tasks)
+    }
+
+    async fn end((store, tasks): (Store, TaskTracker)) {
+        store.close().await;
+        tasks.close();
+        tasks.wait().await;
+    }
+
+    async fn open(store: &Store, id: &str, minute: i64) {
+        let session = NewSession {
+            id: id.to_owned(),
+            model: "m".to_owned(),
+            model_hash: "0".to_owned(),
+            weights: [("x".into(), 1.0)].into_iter().collect(),
+            lookahead: None,
+            start: None,
+            learner: None,
+            weights_version: None,
+            trial: None,
+            created_at: at(minute),
+        };
+        assert!(store.open_session(session).await.unwrap());
+    }
+
+    async fn observe(store: &Store, id: &str, minute: i64) {
+        let states = "[1,2,3]".to_owned();
+        let new = NewObservations { session_id: id.to_owned(), seq: 0, n_states: 3, states, at: at(minute) };
+        assert!(store.add_observations(new).await.unwrap());
+    }
+
+    /// The sessions that expire at this minute.
+    async fn expired(store: &Store, minute: i64) -> Vec<ExpiredSession> {
+        store.expire_sessions(at(minute), IDLE, EVERY).await.unwrap()
+    }
+
+    async fn last_minute(store: &Store, id: &str) -> i64 {
+        let session = store.session(id).await.unwrap().unwrap();
+        (session.active_at.as_second() - 1_000_000) / 60
+    }
+
+    #[tokio::test]
+    async fn time_in_which_the_service_is_down_does_not_count_for_sessions() {
+        let directory = tempfile::tempdir().unwrap();
+        let service = begin(directory.path(), 0).await;
+        open(&service.0, "idle", 0).await;
+        open(&service.0, "observed", 0).await;
+        // It only arrives, and is not settled yet.
+        observe(&service.0, "observed", 30).await;
+        service.0.note_alive(at(40), EVERY).await.unwrap();
+        end(service).await;
+        // Idle for 40 minutes and for 10 when the service went down, for a day.
+        let day = 24 * 60;
+        let (store, tasks) = begin(directory.path(), 40 + day).await;
+        assert_eq!((last_minute(&store, "idle").await, last_minute(&store, "observed").await), (day, 30 + day));
+        assert_eq!(expired(&store, day + 45).await, []);
+        let gone = ExpiredSession { id: "idle".to_owned(), active_at: at(day), n_observations: 0 };
+        // Signs of life have come in between.
+        for minute in (50..60).step_by(5) {
+            assert_eq!(expired(&store, day + minute).await, []);
+        }
+        assert_eq!(expired(&store, day + 61).await, [gone]);
+        for minute in (65..90).step_by(5) {
+            assert_eq!(expired(&store, day + minute).await, []);
+        }
+        let gone = ExpiredSession { id: "observed".to_owned(), active_at: at(day + 30), n_observations: 3 };
+        assert_eq!(expired(&store, day + 91).await, [gone]);
+        assert_eq!(store.observations("observed").await.unwrap(), Vec::<String>::new());
+        end((store, tasks)).await;
+    }
+
+    #[tokio::test]
+    async fn time_in_which_the_service_is_suspended_or_was_killed_does_not_count_either() {
+        let directory = tempfile::tempdir().unwrap();
+        let (store, tasks) = begin(directory.path(), 0).await;
+        open(&store, "a", 0).await;
+        observe(&store, "a", 10).await;
+        // Nothing for hours, though signs of life come every six minutes.
+        assert_eq!(expired(&store, 500).await, []);
+        assert_eq!(last_minute(&store, "a").await, 500);
+        // Killed: the last sign of life is that something came for a session.
+        open(&store, "b", 505).await;
+        drop(store);
+        tasks.close();
+        tasks.wait().await;
+        let (store, tasks) = begin(directory.path(), 1000).await;
+        assert_eq!((last_minute(&store, "a").await, last_minute(&store, "b").await), (995, 1000));
+        assert_eq!(expired(&store, 1005).await, []);
+        end((store, tasks)).await;
+    }
+}

@@ -247,7 +247,8 @@ mod tests {
 
     /// How many definitions and pieces there are, whoever they belong to.
     async fn counts(store: &Store) -> (i64, i64) {
-        let count = |table| sqlx::query_scalar(table).fetch_one(&store.readers().await);
+        let readers = store.readers().await;
+        let count = |table| sqlx::query_scalar(table).fetch_one(&readers);
         let definitions = count("SELECT count(*) FROM definitions").await.unwrap();
         (definitions, count("SELECT count(*) FROM definition_pieces").await.unwrap())
     }

@@ -143,3 +143,75 @@ fn shown(row: &SqliteRow, column: &str) -> Option<String> {
     let number = row.try_get::<i64, _>(column).ok().map(|number| number.to_string());
     number.or_else(|| text(row, column).map(|text| String::from_utf8_lossy(text).into_owned()))
 }
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::attribute::AttributeDocument;
+    use crate::learning::Distribution;
+    use crate::store::{ModelSummary, NewDefinition, NewLearner, NewModel, NewPolicy, Store};
+
+    /// Half of what a page takes, so that it has two items.
+    const HALF: usize = MAX_BYTES / 2;
+
+    /// Reads all pages by `read`, and gives how many items each of them has.
+    async fn n_items<T>(read: impl AsyncFn(Option<String>) -> Result<Page<T>, StoreError>) -> Vec<usize> {
+        let (mut n_items, mut after) = (Vec::new(), None);
+        loop {
+            let page = read(after).await.unwrap();
+            n_items.push(page.items.len());
+            match page.next {
+                Some(next) => after = Some(next),
+                None => return n_items,
+            }
+        }
+    }
+
+    #[tokio::test]
+    async fn pages_of_long_rows_end_early_and_the_next_one_goes_on() {
+        const N: usize = 5;
+        let directory = tempfile::tempdir().unwrap();
+        let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+        let now = Timestamp::UNIX_EPOCH;
+        let long = "a".repeat(HALF);
+        let attribute: AttributeDocument =
+            serde_json::from_value(serde_json::json!({"name": "x", "kind": "cyclic", "labels": [long]})).unwrap();
+        for n in 0..N {
+            let policy =
+                NewPolicy { id: n.to_string(), summary: format!("\"{long}\""), steps: Vec::new(), created_at: now };
+            store.add_policies(vec![policy], Vec::new()).await.unwrap();
+            let summary = ModelSummary {
+                name: n.to_string(),
+                hash: String::new(),
+                attributes: vec![attribute.clone()],
+                actions: Vec::new(),
+                size: None,
+                n_unsafe: 0,
+                created_at: now,
+            };
+            store.put_model(NewModel { summary, definition: NewDefinition::Text(String::new()) }).await.unwrap();
+            let learner = NewLearner {
+                name: n.to_string(),
+                hash: String::new(),
+                definition: long.clone(),
+                initial: Distribution { mean: Vec::new(), sd: Vec::new(), expected_reward: None },
+                created_at: now,
+            };
+            store.put_learner(learner).await.unwrap();
+        }
+        let number = |after: Option<String>| after.map_or(0, |after| after.parse().unwrap());
+        assert_eq!(n_items(async |after| store.policies(number(after), 1000).await).await, [2, 2, 1]);
+        assert_eq!(n_items(async |after| store.models(after.as_deref(), 1000).await).await, [2, 2, 1]);
+        assert_eq!(n_items(async |after| store.learners(after.as_deref(), 1000).await).await, [2, 2, 1]);
+        // Fewer may be asked for, or be longer than a page.
+        assert_eq!(n_items(async |after| store.models(after.as_deref(), 1).await).await, [1; N]);
+        assert_eq!(fitting(&[3 * HALF as i64, 1], 10), (1, Rest::IsMore));
+        assert_eq!(
+            (fitting(&[], 10), fitting(&[1, 1], 2), fitting(&[1, 1, 1], 2)),
+            ((0, Rest::IsNone), (2, Rest::IsNone), (2, Rest::IsMore))
+        );
+    }
+}

@@ -71,6 +71,13 @@ impl Store {
         self.writer.write(Write::ReturnRefinement(policy_id.to_owned())).await.map(drop)
     }
 
+    /// How often the refinement of this policy was taken up, if it waits.
+    #[cfg(test)]
+    pub(crate) async fn n_attempts(&self, policy_id: &str) -> Option<u32> {
+        let query = sqlx::query_scalar("SELECT attempts FROM refinements WHERE policy_id = $1").bind(policy_id);
+        query.fetch_optional(&self.readers().await).await.unwrap()
+    }
+
     /// Stores a refined policy and links the two.
     ///
     /// # Errors
