@@ -566,7 +566,7 @@ async fn a_second_service_is_refused_and_commands_that_only_read_work_beside_the
     );
     let server = format!("http://{}", tried.address);
     assert_eq!(
-        etude(&["learner", "import", &import[2], "--name", "gold-3", "--server", &server]),
+        etude(&["learner", "import", import[2], "--name", "gold-3", "--server", &server]),
         (true, String::new())
     );
     // All goes on as before.

@@ -65,7 +65,7 @@ mod tests {
     use super::*;
     use crate::store::{ExpiredSession, NewObservations, NewSession, Store};
 
-    const IDLE: Duration = Duration::from_mins(60);
+    const IDLE: Duration = Duration::from_hours(1);
     const EVERY: Duration = Duration::from_mins(6);
 
     fn at(minute: i64) -> Timestamp {

@@ -337,7 +337,7 @@ fn probe(path: &Path) -> Result<(), Unavailable> {
     const N_BYTES: usize = 64 * 1024;
     let directory = path.parent().unwrap_or(Path::new("."));
     let written = tempfile::tempfile_in(directory).and_then(|mut file| {
-        io::Write::write_all(&mut file, &[0; N_BYTES])?;
+        io::Write::write_all(&mut file, &vec![0; N_BYTES])?;
         file.sync_all()
     });
     match written {

@@ -7,7 +7,7 @@
 //!    +------ reads ------------> pool of readers (query_only)
 //! ```
 //!
-//! A write that was answered is on disk. Rows become domain types here and nowhere else; times are milliseconds since 1970,
+//! A write that was answered is on disk, in the file that has the database's name. Where nothing can be written, reading goes on. Rows become domain types here and nowhere else; times are milliseconds since 1970,
 //! documents are JSON text, in compressed pieces where it is long. Of a policy, what could be told from the rest is left out, and
 //! put back when it is read.
 

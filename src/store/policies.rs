@@ -71,12 +71,12 @@ impl Store {
     async fn read_policy(&self, row: &SqliteRow) -> Result<String, StoreError> {
         let steps: Option<Vec<u8>> = row.try_get("steps")?;
         let summary: String = row.try_get("summary")?;
-        let checksum = Checksum::stored(row)?;
+        let stored = stored_checksum(row)?;
         let Some(steps) = steps else {
             let policy: String = row.try_get("policy")?;
             return linked(policy, row);
         };
-        if checksum.is_some_and(|stored| stored != Checksum::of(&summary, &steps)) {
+        if stored.is_some_and(|stored| stored != checksum(&summary, &steps)) {
             return Err(corrupt("checksum")("it is not that of the summary and the steps"));
         }
         let answer = if steps.len() <= MAX_INLINE_BYTES {
@@ -112,36 +112,24 @@ fn corrupt<E: Into<Box<dyn std::error::Error + Send + Sync>>>(column: &'static s
     super::corrupt(TABLE, column)
 }
 
-/// What tells whether a policy is as it was written: CRC-32, of the summary and of the steps.
-#[derive(Clone, Copy, PartialEq, Eq)]
-struct Checksum {
-    summary: u32,
-    steps: u32,
+/// What tells whether a policy is as it was written: CRC-32, of the summary in the upper half and of the steps in the lower one.
+fn checksum(summary: &str, steps: &[u8]) -> i64 {
+    half_checksum(summary) | i64::from(crc32fast::hash(steps))
 }
 
-impl Checksum {
-    fn of(summary: &str, steps: &[u8]) -> Self {
-        Self { summary: crc32fast::hash(summary.as_bytes()), steps: crc32fast::hash(steps) }
-    }
+/// The same, of the summary alone.
+fn half_checksum(summary: &str) -> i64 {
+    i64::from(crc32fast::hash(summary.as_bytes())) << 32
+}
 
-    /// The one that is stored; `None` of a policy that was stored before there were any.
-    fn stored(row: &SqliteRow) -> Result<Option<Self>, StoreError> {
-        let stored: Option<i64> = row.try_get("checksum")?;
-        let [a, b, c, d, e, f, g, h] = match stored {
-            Some(stored) => stored.to_be_bytes(),
-            None => return Ok(None),
-        };
-        Ok(Some(Self { summary: u32::from_be_bytes([a, b, c, d]), steps: u32::from_be_bytes([e, f, g, h]) }))
-    }
-
-    fn as_integer(self) -> i64 {
-        (i64::from(self.summary) << 32) | i64::from(self.steps)
-    }
+/// The one that is stored; `None` of a policy that was stored before there were any.
+fn stored_checksum(row: &SqliteRow) -> Result<Option<i64>, StoreError> {
+    Ok(row.try_get("checksum")?)
 }
 
 fn read_summary(row: &SqliteRow) -> Result<PolicySummaryRow, StoreError> {
     let summary: String = row.try_get("summary")?;
-    if Checksum::stored(row)?.is_some_and(|stored| stored.summary != crc32fast::hash(summary.as_bytes())) {
+    if stored_checksum(row)?.is_some_and(|stored| (stored >> 32) << 32 != half_checksum(&summary)) {
         return Err(corrupt("checksum")("it is not that of the summary"));
     }
     Ok(PolicySummaryRow { sequence: row.try_get("sequence")?, id: row.try_get("id")?, summary: linked(summary, row)? })
@@ -196,7 +184,7 @@ pub(super) async fn add_at_once(
 async fn insert(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
     let mut insert = sqlx::query(insert_of(policies.len()));
     for policy in policies {
-        let checksum = Checksum::of(&policy.summary, &policy.steps).as_integer();
+        let checksum = checksum(&policy.summary, &policy.steps);
         insert = insert.bind(&policy.id).bind(&policy.summary).bind(&policy.steps).bind(checksum);
         insert = insert.bind(policy.created_at.as_millisecond());
     }
