@@ -776,3 +776,14 @@ async fn a_locked_database_is_not_ready_within_two_seconds_and_can_be_read() {
     sqlx::raw_sql("ROLLBACK").execute(&mut foreign).await.unwrap();
     tried.until_ready_is(200, "ready\n").await;
 }
+
+#[tokio::test]
+async fn a_session_that_expires_is_logged_with_what_is_deleted() {
+    let directory = tempfile::tempdir().unwrap();
+    let flags = ["--listen", "127.0.0.1:0", "--session-idle-timeout", "100ms"];
+    let mut process = Process::start_with(&flags, &directory.path().join("etude.db"));
+    let tried = Tried::new(&process);
+    tried.set_up().await;
+    let (_stream, session) = tried.session(3).await;
+    process.has_logged(&["a session has expired", &session, "idle_s=", "n_observations=3"]).await;
+}

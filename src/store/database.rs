@@ -60,7 +60,7 @@ pub(super) struct Database {
     lock: Option<File>,
     /// `None` until there is a file.
     identity: Option<Identity>,
-    /// That of the log, which is there as long as somebody reads.
+    /// That of the log, which is there as long as any way to the database is open.
     log_identity: Option<Identity>,
     /// Whether a writer has had its way, and with it the look at the database; since then, there are ways to read that go with it.
     is_looked_at: bool,
@@ -247,6 +247,16 @@ impl Database {
         }
     }
 
+    /// Closes a way to write, however that ends: what was not committed is undone by whoever opens the database next.
+    pub(super) async fn disconnect(&mut self, connection: SqliteConnection) {
+        let was_there = self.check_files().is_ok();
+        let _ = connection.close().await;
+        // Whoever closes the last way to the database removes its log, of which nothing is left to be done then.
+        if was_there && self.is_log_missing() {
+            self.log_identity = None;
+        }
+    }
+
     /// What is behind an error of SQLite, as far as can be found out.
     pub(super) async fn diagnose(&self, error: StoreError) -> StoreError {
         let StoreError::Unavailable(unavailable) = error else { return error };
@@ -301,10 +311,11 @@ impl Database {
     }
 
     fn is_log_empty(&self) -> bool {
-        match fs::metadata(self.beside("-wal")) {
-            Ok(log) => log.len() == 0,
-            Err(error) => error.kind() == ErrorKind::NotFound,
-        }
+        self.is_log_missing() || fs::metadata(self.beside("-wal")).is_ok_and(|log| log.len() == 0)
+    }
+
+    fn is_log_missing(&self) -> bool {
+        fs::metadata(self.beside("-wal")).is_err_and(|error| error.kind() == ErrorKind::NotFound)
     }
 
     /// The file beside the database whose name ends so.
@@ -372,7 +383,10 @@ fn options(path: &Path) -> SqliteConnectOptions {
 /// Ways to read, all of them now, which stay: opened later, one could need room that there is none of, or find another file.
 async fn readers(options: SqliteConnectOptions) -> Result<SqlitePool, StoreError> {
     let pool = SqlitePoolOptions::new().min_connections(N_READERS).max_connections(N_READERS);
-    let pool = pool.idle_timeout(None).max_lifetime(None);
+    // Until a connection has read, SQLite holds nothing open for it, and whoever closes another one may remove the log.
+    let pool = pool.idle_timeout(None).max_lifetime(None).after_connect(|connection, _| {
+        Box::pin(async move { sqlx::query("SELECT 1 FROM sqlite_schema").execute(connection).await.map(drop) })
+    });
     Ok(pool.connect_with(options).await?)
 }
 
@@ -466,5 +480,60 @@ async fn check_schema(connection: &mut SqliteConnection) -> Result<(), StoreErro
         Some(applied) if *applied > last => Err(StoreError::Newer { migration: *applied }),
         Some(applied) if *applied == last => Ok(()),
         _ => Err(StoreError::Outdated),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sqlx::Row;
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::store::Store;
+
+    #[tokio::test]
+    async fn a_database_of_the_version_before_is_migrated_with_what_it_knows() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("etude.db");
+        let mut before = options(&path).create_if_missing(true).connect().await.unwrap();
+        let mut migrator = migrator();
+        migrator.migrations.to_mut().pop();
+        migrator.run_direct(None, &mut before, false).await.unwrap();
+        // One learner has a reward that is not folded in, and one policy was refined.
+        let refined = r#"{"coverage":{},"refines":null,"refined_by":"q"}"#;
+        let rows = "INSERT INTO learners VALUES (1, 'behind', '', '', 0), (2, 'even', '', '', 0);
+            INSERT INTO weights VALUES (1, 0, 0, NULL, '[]', '[]', 0), (2, 0, 0, NULL, '[]', '[]', 0);
+            INSERT INTO trials (sequence, id, learner, number, weights, weights_version, policy_id, lease_expires_at_ms, created_at_ms)
+                VALUES (1, 't', 1, 1, '{}', 0, 'p', 0, 0);
+            INSERT INTO rewards VALUES (1, 1, 1, 7.0, 0);";
+        sqlx::raw_sql(rows).execute(&mut before).await.unwrap();
+        let policy = sqlx::query("INSERT INTO policies (id, summary, policy, created_at_ms) VALUES ('p', $1, $1, 0)");
+        policy.bind(refined).execute(&mut before).await.unwrap();
+        before.close().await.unwrap();
+
+        let read = Store::open_to_read(&path, &TaskTracker::new()).await;
+        assert!(matches!(read, Err(StoreError::Outdated)), "whoever only reads does not migrate it");
+        let store = Store::open(&path, &TaskTracker::new()).await.unwrap();
+        assert_eq!(store.learners_behind().await.unwrap(), ["behind"]);
+        assert_eq!(store.policy("p").await.unwrap().unwrap(), refined);
+        assert_eq!(store.policies(0, 10).await.unwrap().items[0].summary, refined);
+        let id = sqlx::query("PRAGMA application_id").fetch_one(&store.readers().await).await.unwrap();
+        assert_eq!(id.get::<i64, _>(0), APPLICATION_ID);
+    }
+
+    #[tokio::test]
+    async fn a_database_of_a_newer_version_is_refused_and_left_as_it_is() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("etude.db");
+        drop(Store::open(&path, &TaskTracker::new()).await.unwrap());
+        let mut newer = options(&path).connect().await.unwrap();
+        let applied = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
+            VALUES (1000, 'later', TRUE, x'00', 0)";
+        sqlx::query(applied).execute(&mut newer).await.unwrap();
+        newer.close().await.unwrap();
+        let opened = Store::open(&path, &TaskTracker::new()).await;
+        assert!(matches!(opened, Err(StoreError::Newer { migration: 1000 })), "{opened:?}");
+        let read = Store::open_to_read(&path, &TaskTracker::new()).await;
+        assert!(matches!(read, Err(StoreError::Newer { migration: 1000 })), "{read:?}");
     }
 }

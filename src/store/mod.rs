@@ -224,4 +224,19 @@ mod tests {
         tasks.wait().await;
         assert!(matches!(check().await, Err(StoreError::Closed)), "though it could be read");
     }
+
+    #[tokio::test]
+    async fn a_log_that_goes_with_the_last_connection_is_not_taken_for_a_deleted_database() {
+        let directory = tempfile::tempdir().unwrap();
+        let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+        let policy = |id: &str| {
+            let (id, summary) = (id.to_owned(), "{}".to_owned());
+            vec![NewPolicy { id, summary, steps: Vec::new(), created_at: Timestamp::UNIX_EPOCH }]
+        };
+        store.add_policies(policy("a"), Vec::new()).await.unwrap();
+        // Nobody has it open any more but the writer, which opens it anew after an error.
+        store.readers.close().await;
+        assert!(store.add_policies(policy("a"), Vec::new()).await.is_err(), "its id is taken");
+        store.add_policies(policy("b"), Vec::new()).await.unwrap();
+    }
 }

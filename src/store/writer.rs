@@ -282,8 +282,7 @@ impl Open {
     async fn failed(&mut self, error: StoreError) -> StoreError {
         self.known = Known::default();
         if let Some(connection) = self.connection.take() {
-            // Nothing depends on how it ends: what was not committed is undone by whoever opens the database next.
-            let _ = connection.close().await;
+            self.database.disconnect(connection).await;
         }
         let error = self.database.diagnose(error).await;
         if let StoreError::Unavailable(unavailable) = error {
