@@ -256,7 +256,7 @@ impl Service {
         std::thread::spawn(move || std::io::copy(&mut log, &mut std::io::sink()));
         let model = model.to_string();
         let head = format!(
-            "PUT /v1/models/figure-4 HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\ncontent-length: {}\r\n\r\n",
+            "PUT /v1/models/figure-4 HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: {}\r\n\r\n",
             model.len()
         );
         runtime.block_on(async { Client::connect(address).await?.send(format!("{head}{model}").as_bytes()).await })?;
@@ -291,7 +291,7 @@ fn http(body: &str) -> Vec<u8> {
 }
 
 fn http_to(path: &str, body: &str) -> Vec<u8> {
-    let mut request = format!("POST {path} HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\n");
+    let mut request = format!("POST {path} HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n");
     // Writing to a string cannot fail.
     let _ = write!(request, "content-length: {}\r\n\r\n{body}", body.len());
     request.into_bytes()

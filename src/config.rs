@@ -5,8 +5,10 @@ use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use axum::http::HeaderValue;
 use clap::Args;
 
+use crate::http;
 use crate::memory::{self, Memory};
 use crate::model;
 use crate::service::{PoolSettings, Settings, TimeLimits};
@@ -21,6 +23,16 @@ pub struct ServeConfig {
     /// SQLite database; created if missing.
     #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_name = "FILE")]
     pub database: PathBuf,
+    /// Name by which the service may be asked for, besides IP addresses, localhost and the machine's own names; `*` for any.
+    #[arg(
+        long, env = "ETUDE_ALLOW_HOST", value_delimiter = ',', value_parser = http::allowed_host, value_name = "NAME"
+    )]
+    pub allow_host: Vec<String>,
+    /// Origin of web pages that may use the service, besides its own, such as `https://app.example`.
+    #[arg(
+        long, env = "ETUDE_ALLOW_ORIGIN", value_delimiter = ',', value_parser = http::allowed_origin, value_name = "ORIGIN"
+    )]
+    pub allow_origin: Vec<HeaderValue>,
     /// Searches that run at the same time [default: one per core].
     #[arg(long, env = "ETUDE_SEARCH_THREADS", value_parser = parse_threads, value_name = "N")]
     pub search_threads: Option<NonZeroUsize>,

@@ -16,7 +16,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::config::ServeConfig;
-use crate::http::{self, Context};
+use crate::http::{self, Access, Context};
 use crate::service::Etude;
 use crate::store::StoreError;
 use crate::telemetry;
@@ -91,6 +91,7 @@ impl Server {
         tasks.spawn(Arc::clone(&etude).learn_periodically(config.learn_every, stopping.clone()));
         let router = http::router(Context {
             etude: Arc::clone(&etude),
+            access: Access::new(&config.allow_host, &config.allow_origin),
             stopping: stopping.clone(),
             max_body_bytes: config.max_body_bytes,
             max_model_bytes: config.max_model_bytes,

@@ -514,7 +514,7 @@ async fn a_body_cut_off_in_the_middle_is_refused_and_changes_nothing() {
     let service = Service::start(&[]).await;
     let body = corridor().to_string();
     let head = format!(
-        "PUT /v1/models/m HTTP/1.1\r\nhost: x\r\ncontent-type: application/json\r\ncontent-length: {}\r\n\r\n",
+        "PUT /v1/models/m HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\ncontent-length: {}\r\n\r\n",
         body.len()
     );
     let cut = format!("{head}{}", &body[..body.len() / 2]);
@@ -709,7 +709,7 @@ async fn a_shutdown_answers_what_still_runs_and_closes_the_database() {
 async fn a_client_that_does_not_finish_its_request_finds_its_connection_closed() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let service = Service::start(&["--head-timeout", "1s"]).await;
-    for begun in ["", "GET /livez HTTP/1.1\r\nhost: ", "GET /livez HTTP/1.1\r\nhost: here\r\n\r\n"] {
+    for begun in ["", "GET /livez HTTP/1.1\r\nhost: ", "GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n"] {
         let mut stream = tokio::net::TcpStream::connect(service.address).await.unwrap();
         stream.write_all(begun.as_bytes()).await.unwrap();
         let mut answer = String::new();

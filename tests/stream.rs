@@ -32,6 +32,8 @@ use tokio_util::task::TaskTracker;
 /// Longer than anything here takes; a test that waits for this fails.
 const PATIENCE: Duration = Duration::from_secs(30);
 
+const NDJSON: &str = "application/x-ndjson";
+
 /// A websocket client.
 struct Client {
     socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
@@ -189,7 +191,7 @@ async fn lines_go_both_ways_at_the_same_time() {
     let (service, demonstration) = figure_4().await;
     let (lines, body) = mpsc::channel::<Result<String, std::io::Error>>(1);
     let body = Body::wrap_stream(tokio_stream::wrappers::ReceiverStream::new(body));
-    let request = service.client.post(service.url("/v1/stream")).body(body);
+    let request = service.client.post(service.url("/v1/stream")).header("content-type", NDJSON).body(body);
     let response = tokio::time::timeout(PATIENCE, request.send()).await.unwrap().unwrap();
     assert_eq!(response.headers()["content-type"], "application/x-ndjson");
     let mut answer = response.bytes_stream();
@@ -238,7 +240,7 @@ async fn lines_are_not_compressed() {
     let problem: Value = serde_json::from_str(&response.text().await.unwrap()).unwrap();
     assert_eq!(problem["type"], "/problems/unsupported-encoding");
     let identity = service.client.post(service.url("/v1/stream")).header("content-encoding", "identity");
-    let answer = identity.body("{}\n").send().await.unwrap().text().await.unwrap();
+    let answer = identity.header("content-type", NDJSON).body("{}\n").send().await.unwrap().text().await.unwrap();
     assert!(answer.contains("hello") && answer.contains("bad-frame"), "{answer}");
 }
 
@@ -744,7 +746,8 @@ async fn a_client_that_waits_to_be_told_to_send_its_frames_is_told() {
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     let service = Service::start(&[]).await;
     let mut client = TcpStream::connect(service.address).await.unwrap();
-    let head = "POST /v1/stream HTTP/1.1\r\nhost: etude\r\ntransfer-encoding: chunked\r\nexpect: 100-continue\r\n\r\n";
+    let head = "POST /v1/stream HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/x-ndjson\r\ntransfer-encoding: chunked\r\n\
+                expect: 100-continue\r\n\r\n";
     client.write_all(head.as_bytes()).await.unwrap();
     let mut answer = [0; 12];
     client.read_exact(&mut answer).await.unwrap();

@@ -1,32 +1,43 @@
 //! Reading bodies and writing JSON.
+//!
+//! Nobody waits for a client for ever, and nobody takes a client's word for how much will come: each body has a limit in bytes and a
+//! least speed, and takes memory as its bytes come. Who is refused is answered at once; what is still to come of the body is read
+//! beside that, for a while.
 
-use std::io::{self, BufRead, Read};
-use std::time::{Duration, Instant};
+use std::io::{self, BufRead};
+use std::time::Duration;
 
 use axum::body::{Body, BodyDataStream, Bytes, HttpBody};
-use axum::extract::Request;
-use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, EXPECT};
+use axum::extract::{FromRequestParts, Request};
+use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, EXPECT, TRANSFER_ENCODING};
+use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use futures_util::{Stream, StreamExt, TryStreamExt};
 use serde::Serialize;
+use tokio::time::Instant;
 
 use super::Context;
+use super::answer::{self, UNCOUNTED_BYTES};
 use super::encoding::{BodyError, DecodedLimit, Encoding};
 use super::problem::{Problem, ProblemKind};
 use crate::document::Quoted;
+use crate::memory::{Held, Memory, NoRoom};
 use crate::model::Format;
 use crate::service::{ModelText, OpenText, PipeWriter, ServiceError, pipe};
 
-/// How long a client may take to send its body.
+/// How long a client may take to send its body, however slowly it comes.
 const BODY_TIMEOUT: Duration = Duration::from_mins(1);
 
-/// How much of a body that is too large is read and thrown away, as a multiple of the limit. Most clients only look at the
-/// answer once they have sent everything; past this, they find the connection closed.
-const MAX_DISCARDED_LIMITS: usize = 64;
-
-/// Slowest that the body of a large model may come, beyond [`BODY_TIMEOUT`]: it keeps others from sending theirs.
+/// Slowest that a body may come beyond [`BODY_TIMEOUT`]: it keeps others from sending theirs.
 const MIN_BYTES_PER_S: u64 = 64 * 1024;
+
+/// How long the rest of a body that is not wanted is read and thrown away. Most clients only look at the answer once they have sent
+/// everything; past this, they find the connection closed.
+const DISCARD_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// How much of it is read, as a multiple of the limit.
+const MAX_DISCARDED_LIMITS: usize = 64;
 
 /// Of the body of a model, how much is waited for before reading begins: one that is not larger is at hand then.
 const AT_HAND_BYTES: usize = 1 << 20;
@@ -34,7 +45,8 @@ const AT_HAND_BYTES: usize = 1 << 20;
 /// Largest body of a reward or of a reason.
 const MAX_SMALL_BODY_BYTES: usize = 16 * 1024;
 
-/// Reads the JSON body of a request, which has its limit as it is sent and once it is decompressed.
+/// Reads the JSON body of a request, which has its limit as it is sent and once it is decompressed. The memory of a large one is held
+/// as long as its bytes.
 pub(super) async fn read_json(request: Request, context: &Context) -> Result<Bytes, Problem> {
     let limit = SentLimit { n_bytes: context.max_body_bytes, setting: "ETUDE_MAX_BODY_BYTES" };
     read_json_within(limit, request, context).await
@@ -51,30 +63,38 @@ pub(super) async fn read_small_json(request: Request, context: &Context) -> Resu
 
 async fn read_json_within(limit: SentLimit, request: Request, context: &Context) -> Result<Bytes, Problem> {
     let is_json = format_of(request.headers()) == Some(Format::Json);
-    let encoding = Encoding::declared(request.headers());
-    let read = async {
-        let body = open(request, limit).await?;
-        let (bytes, _) = collect(body, limit, usize::MAX).await?;
-        if is_json {
-            Ok((bytes, encoding.map_err(|encoding| unsupported_encoding(&encoding))?))
-        } else {
-            let detail = "send JSON with the header `content-type: application/json`";
-            Err(Problem::new(ProblemKind::UnsupportedMediaType, detail))
-        }
+    let detail = "send JSON with the header `content-type: application/json`";
+    let encoding = match declared_encoding(request.headers()) {
+        Ok(encoding) if is_json => encoding,
+        Err(problem) if is_json => return Err(refuse(request, context, problem)),
+        _ => return Err(refuse(request, context, Problem::new(ProblemKind::UnsupportedMediaType, detail))),
     };
-    let (bytes, encoding) = tokio::time::timeout(BODY_TIMEOUT, read).await.map_err(|_| slow())??;
+    let (collected, _) = collect(open(request, limit, context)?, usize::MAX, context).await?;
+    let bytes = collected.into_bytes();
     if encoding == Encoding::Identity {
         return Ok(bytes);
     }
+    let memory = context.etude.memory().clone();
     // Off the threads that serve others; bounded by the limit.
-    let decode = move || -> io::Result<Vec<u8>> {
+    let decode = move || -> io::Result<Bytes> {
         let limit = DecodedLimit { n_bytes: limit.n_bytes as u64, setting: limit.setting };
-        let mut decoded = Vec::new();
-        encoding.decode(io::Cursor::new(bytes), limit)?.read_to_end(&mut decoded)?;
-        Ok(decoded)
+        let mut decoder = encoding.decode(io::Cursor::new(bytes), limit)?;
+        let mut decoded = Collected::new(&memory);
+        loop {
+            let chunk = decoder.fill_buf()?;
+            if chunk.is_empty() {
+                return Ok(decoded.into_bytes());
+            }
+            decoded.push(chunk).map_err(BodyError::NoRoom)?;
+            let n_bytes = chunk.len();
+            decoder.consume(n_bytes);
+            // The decoder looks back at as much.
+            let n_seen = decoded.bytes.len().min(Encoding::MAX_WINDOW_BYTES);
+            decoded.hold(decoded.bytes.capacity() + n_seen).map_err(BodyError::NoRoom)?;
+        }
     };
     let decoded = context.tasks.spawn_blocking(decode).await.map_err(io::Error::other).flatten();
-    decoded.map(Bytes::from).map_err(|error| unreadable(&error))
+    decoded.map_err(|error| unreadable(&error))
 }
 
 /// Most bytes of a body as it is sent, and what the setting is called.
@@ -90,123 +110,256 @@ pub(super) struct SentModel {
     pub(super) format: Format,
     /// What is still to come of it.
     pub(super) pump: Option<Pump>,
+    /// The memory of what is at hand, if that is much.
+    pub(super) held: Option<Held>,
 }
 
 /// Reads the body of a model: JSON or NDJSON, compressed or not. A large one is read as it comes.
-pub(super) async fn read_model(request: Request, sent: SentLimit, decoded: DecodedLimit) -> Result<SentModel, Problem> {
-    let format = format_of(request.headers());
-    let encoding = Encoding::declared(request.headers());
-    let first = async {
-        let body = open(request, sent).await?;
-        collect(body, sent, AT_HAND_BYTES).await
-    };
-    let (bytes, rest) = tokio::time::timeout(BODY_TIMEOUT, first).await.map_err(|_| slow())??;
-    let declared = match (format, encoding) {
-        (Some(format), Ok(encoding)) => Ok((format, encoding)),
+pub(super) async fn read_model(
+    request: Request,
+    sent: SentLimit,
+    decoded: DecodedLimit,
+    context: &Context,
+) -> Result<SentModel, Problem> {
+    let (format, encoding) = match (format_of(request.headers()), declared_encoding(request.headers())) {
+        (Some(format), Ok(encoding)) => (format, encoding),
         (None, _) => {
             let detail = "send JSON with the header `content-type: application/json`, or `application/x-ndjson`";
-            Err(Problem::new(ProblemKind::UnsupportedMediaType, detail))
+            return Err(refuse(request, context, Problem::new(ProblemKind::UnsupportedMediaType, detail)));
         }
-        (_, Err(encoding)) => Err(unsupported_encoding(&encoding)),
+        (_, Err(problem)) => return Err(refuse(request, context, problem)),
     };
-    let (format, encoding) = match declared {
-        Ok(declared) => declared,
-        Err(problem) => {
-            if let Some(rest) = rest {
-                discard(Body::from_stream(rest), sent.n_bytes).await;
-            }
-            return Err(problem);
-        }
-    };
+    let (collected, rest) = collect(open(request, sent, context)?, AT_HAND_BYTES, context).await?;
+    let (bytes, held) = collected.into_parts();
     let open = |body: Box<dyn BufRead + Send>| -> OpenText { Box::new(move || encoding.decode(body, decoded)) };
     let (text, pump) = match rest {
         None if encoding == Encoding::Identity => (ModelText::Whole(bytes.into()), None),
         None => (ModelText::Packed(open(Box::new(io::Cursor::new(bytes)))), None),
         Some(rest) => {
             let (to_reader, reader) = pipe();
-            let pump = Pump { first: bytes, rest, limit: sent, to_reader };
-            (ModelText::Arriving(open(Box::new(reader))), Some(pump))
+            (ModelText::Arriving(open(Box::new(reader))), Some(Pump { first: bytes, rest, to_reader }))
         }
     };
-    Ok(SentModel { text, format, pump })
+    Ok(SentModel { text, format, pump, held })
 }
 
 /// Carries the rest of a body to its reader.
 pub(super) struct Pump {
     first: Bytes,
-    rest: BodyDataStream,
-    limit: SentLimit,
+    rest: Arriving,
     to_reader: PipeWriter<Bytes>,
 }
 
 impl Pump {
-    /// Ends when all was read, or the reader wants no more and the rest was thrown away.
-    pub(super) async fn run(self) {
-        let Self { first, mut rest, limit, to_reader } = self;
-        let mut n_sent = first.len();
-        let mut waited = Duration::ZERO;
+    /// Ends when all was read, or the reader wants no more.
+    pub(super) async fn run(self, context: &Context) {
+        let Self { first, mut rest, to_reader } = self;
         let mut wants_more = to_reader.send(Ok(first)).await;
         while wants_more {
-            let allowed = BODY_TIMEOUT + Duration::from_secs(n_sent as u64 / MIN_BYTES_PER_S);
-            // Only the client's time counts, not the reader's.
-            let asked = Instant::now();
-            let next = tokio::time::timeout(allowed.saturating_sub(waited), rest.next()).await;
-            waited += asked.elapsed();
-            let chunk = match next {
-                Ok(None) => return to_reader.end().await,
-                Ok(Some(Ok(chunk))) if n_sent + chunk.len() <= limit.n_bytes => Ok(chunk),
-                Ok(Some(Ok(_))) => Err(BodyError::TooLarge(too_large_detail(limit))),
-                Ok(Some(Err(_))) => Err(BodyError::Incomplete),
-                Err(_) => Err(BodyError::Slow(format!("the body came slower than {MIN_BYTES_PER_S} bytes/s"))),
-            };
-            n_sent += chunk.as_ref().map_or(0, Bytes::len);
+            let Some(chunk) = rest.next().await else { return to_reader.end().await };
             wants_more = chunk.is_ok() & to_reader.send(chunk.map_err(io::Error::from)).await;
         }
-        drop(to_reader);
-        discard(Body::from_stream(rest), limit.n_bytes).await;
+        rest.discard(context);
     }
+}
+
+/// A body on its way, which has a limit and a least speed.
+struct Arriving {
+    stream: BodyDataStream,
+    limit: SentLimit,
+    n_bytes: usize,
+    /// How long the client was waited for.
+    waited: Duration,
+}
+
+impl Arriving {
+    fn new(stream: BodyDataStream, limit: SentLimit) -> Self {
+        Self { stream, limit, n_bytes: 0, waited: Duration::ZERO }
+    }
+
+    /// The next chunk. After an error, there is none.
+    async fn next(&mut self) -> Option<Result<Bytes, BodyError>> {
+        let allowed = BODY_TIMEOUT + Duration::from_secs(self.n_bytes as u64 / MIN_BYTES_PER_S);
+        // Only the client's time counts, not that of whoever asks.
+        let asked = Instant::now();
+        let next = tokio::time::timeout(allowed.saturating_sub(self.waited), self.stream.next()).await;
+        self.waited += asked.elapsed();
+        Some(match next {
+            Ok(None) => return None,
+            Ok(Some(Ok(chunk))) => {
+                self.n_bytes += chunk.len();
+                if self.n_bytes <= self.limit.n_bytes { Ok(chunk) } else { Err(too_large(self.limit)) }
+            }
+            Ok(Some(Err(_))) => Err(BodyError::Incomplete),
+            Err(_) => {
+                let after = BODY_TIMEOUT.as_secs();
+                Err(BodyError::Slow(format!("the body took over {after} s, at less than {MIN_BYTES_PER_S} bytes/s")))
+            }
+        })
+    }
+
+    /// Reads on beside the answer.
+    fn discard(self, context: &Context) {
+        let Self { stream, limit, waited, .. } = self;
+        // Who was too slow already is not waited for.
+        if waited < BODY_TIMEOUT {
+            discard(stream, limit.n_bytes, context);
+        }
+    }
+}
+
+/// Bytes that are collected, whose memory is held if they are many.
+struct Collected<'m> {
+    memory: &'m Memory,
+    /// Most bodies come in one piece, which is not copied. All that there is, unless there are `bytes`.
+    first: Bytes,
+    bytes: Vec<u8>,
+    held: Option<Held>,
+}
+
+impl<'m> Collected<'m> {
+    fn new(memory: &'m Memory) -> Self {
+        Self { memory, first: Bytes::new(), bytes: Vec::new(), held: None }
+    }
+
+    fn n_bytes(&self) -> usize {
+        self.first.len().max(self.bytes.len())
+    }
+
+    /// Adds a chunk that may be kept as it is.
+    fn add(&mut self, chunk: Bytes) -> Result<(), NoRoom> {
+        if self.n_bytes() == 0 {
+            self.hold(chunk.len())?;
+            self.first = chunk;
+            return Ok(());
+        }
+        if self.bytes.is_empty() {
+            let first = std::mem::take(&mut self.first);
+            self.push(&first)?;
+        }
+        self.push(&chunk)
+    }
+
+    fn push(&mut self, chunk: &[u8]) -> Result<(), NoRoom> {
+        let n_bytes = self.bytes.len() + chunk.len();
+        if n_bytes > self.bytes.capacity() {
+            // Not by what was announced, which need not come.
+            let capacity = n_bytes.next_power_of_two();
+            self.hold(capacity)?;
+            self.bytes.reserve_exact(capacity - self.bytes.len());
+        }
+        self.bytes.extend_from_slice(chunk);
+        Ok(())
+    }
+
+    /// Takes memory until `n_bytes` are held, if that is much.
+    fn hold(&mut self, n_bytes: usize) -> Result<(), NoRoom> {
+        match &mut self.held {
+            Some(held) => held.grow_to(n_bytes as u64)?,
+            None if n_bytes > UNCOUNTED_BYTES => self.held = Some(self.memory.try_take(n_bytes as u64)?),
+            None => {}
+        }
+        Ok(())
+    }
+
+    /// The bytes, and their memory.
+    fn into_parts(self) -> (Bytes, Option<Held>) {
+        let Self { first, bytes, mut held, .. } = self;
+        if let Some(held) = &mut held {
+            held.shrink_to(first.len().max(bytes.capacity()) as u64);
+        }
+        (if bytes.is_empty() { first } else { bytes.into() }, held)
+    }
+
+    /// The bytes, which hold their memory.
+    fn into_bytes(self) -> Bytes {
+        let (bytes, held) = self.into_parts();
+        answer::holding(bytes, held)
+    }
+}
+
+/// A request that is complete without a body, and has none that a web page can send without asking.
+pub(super) struct NoForm;
+
+impl<S: Send + Sync> FromRequestParts<S> for NoForm {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Problem> {
+        const FORMS: [&str; 3] = ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data"];
+        let headers = &parts.headers;
+        let has_body = headers.contains_key(TRANSFER_ENCODING)
+            || headers.get(CONTENT_LENGTH).is_some_and(|length| length.as_bytes() != b"0");
+        if has_body && FORMS.iter().any(|form| essence(headers).eq_ignore_ascii_case(form)) {
+            return Err(Problem::new(ProblemKind::UnsupportedMediaType, "this is asked for without a body"));
+        }
+        Ok(Self)
+    }
+}
+
+/// Refuses a request without a look at its body.
+pub(super) fn refuse(request: Request, context: &Context, problem: Problem) -> Problem {
+    // Whoever asks for leave to send gets the answer instead.
+    if !request.headers().contains_key(EXPECT) {
+        discard(request.into_body().into_data_stream(), context.max_body_bytes, context);
+    }
+    problem
+}
+
+/// Whether a request declares that its body is NDJSON.
+pub(super) fn is_ndjson(headers: &HeaderMap) -> bool {
+    format_of(headers) == Some(Format::Ndjson)
 }
 
 /// The problem of a body that could not be read to its end.
 pub(super) fn unreadable(error: &io::Error) -> Problem {
-    let kind = match error.get_ref().and_then(|inner| inner.downcast_ref::<BodyError>()) {
-        Some(BodyError::Incomplete) => ProblemKind::IncompleteBody,
-        Some(BodyError::TooLarge(_)) => ProblemKind::TooLarge,
-        Some(BodyError::Slow(_)) => ProblemKind::SlowBody,
-        None => ProblemKind::BrokenEncoding,
-    };
-    Problem::new(kind, error.to_string())
+    match error.get_ref() {
+        Some(inner) if inner.is::<NoRoom>() => Problem::new(ProblemKind::Busy, inner.to_string()),
+        Some(inner) => match inner.downcast_ref::<BodyError>() {
+            Some(error) => error.into(),
+            None => Problem::new(ProblemKind::BrokenEncoding, error.to_string()),
+        },
+        None => Problem::new(ProblemKind::BrokenEncoding, error.to_string()),
+    }
 }
 
-fn unsupported_encoding(encoding: &str) -> Problem {
-    let detail = format!("the body is encoded as {}; send it as it is, or as gzip or zstd", Quoted(encoding));
-    Problem::new(ProblemKind::UnsupportedEncoding, detail)
-}
-
-fn slow() -> Problem {
-    Problem::new(ProblemKind::SlowBody, format!("the body took over {} s", BODY_TIMEOUT.as_secs()))
+impl From<&BodyError> for Problem {
+    fn from(error: &BodyError) -> Self {
+        let kind = match error {
+            BodyError::Incomplete => ProblemKind::IncompleteBody,
+            BodyError::TooLarge(_) => ProblemKind::TooLarge,
+            BodyError::Slow(_) => ProblemKind::SlowBody,
+            BodyError::NoRoom(_) => ProblemKind::Busy,
+        };
+        Self::new(kind, error.to_string())
+    }
 }
 
 /// The body, if it is not announced as too large.
-async fn open(request: Request, limit: SentLimit) -> Result<BodyDataStream, Problem> {
+fn open(request: Request, limit: SentLimit, context: &Context) -> Result<Arriving, Problem> {
     let announced =
         request.headers().get(CONTENT_LENGTH).and_then(|length| length.to_str().ok()?.parse::<usize>().ok());
-    let expects_leave = request.headers().contains_key(EXPECT);
-    let body = request.into_body();
     if announced.is_some_and(|length| length > limit.n_bytes) {
-        // Whoever asks for leave to send gets the answer instead.
-        if !expects_leave {
-            discard(body, limit.n_bytes).await;
-        }
-        return Err(too_large(limit));
+        return Err(refuse(request, context, Problem::from(&too_large(limit))));
     }
-    Ok(body.into_data_stream())
+    Ok(Arriving::new(request.into_body().into_data_stream(), limit))
+}
+
+fn declared_encoding(headers: &HeaderMap) -> Result<Encoding, Problem> {
+    Encoding::declared(headers).map_err(|encoding| {
+        let detail = format!("the body is encoded as {}; send it as it is, or as gzip or zstd", Quoted(&encoding));
+        Problem::new(ProblemKind::UnsupportedEncoding, detail)
+    })
+}
+
+/// The declared type of the body, without its parameters.
+fn essence(headers: &HeaderMap) -> &str {
+    let declared = headers.get(CONTENT_TYPE).and_then(|declared| declared.to_str().ok()).unwrap_or_default();
+    declared.split(';').next().unwrap_or_default().trim()
 }
 
 /// How the body is declared: as `application/json`, as another type that is written in JSON, or as NDJSON.
 fn format_of(headers: &HeaderMap) -> Option<Format> {
-    let declared = headers.get(CONTENT_TYPE).and_then(|declared| declared.to_str().ok()).unwrap_or_default();
-    let essence = declared.split(';').next().unwrap_or_default().trim();
+    let essence = essence(headers);
     // As most declare it.
     if essence == "application/json" {
         return Some(Format::Json);
@@ -214,66 +367,61 @@ fn format_of(headers: &HeaderMap) -> Option<Format> {
     let essence = essence.to_ascii_lowercase();
     match essence.strip_prefix("application/")? {
         "json" => Some(Format::Json),
-        "x-ndjson" | "ndjson" => Some(Format::Ndjson),
+        "x-ndjson" | "ndjson" | "jsonl" => Some(Format::Ndjson),
         subtype => subtype.ends_with("+json").then_some(Format::Json),
     }
 }
 
-/// Reads at most `limit`, until there are over `n_wanted` bytes; what is not read yet is given back.
+/// Reads until there are over `n_wanted` bytes; what is not read yet is given back.
 async fn collect(
-    mut stream: BodyDataStream,
-    limit: SentLimit,
+    mut body: Arriving,
     n_wanted: usize,
-) -> Result<(Bytes, Option<BodyDataStream>), Problem> {
-    // Most bodies come in one piece, which is not copied.
-    let (mut first, mut bytes) = (Bytes::new(), Vec::new());
-    while let Some(chunk) = stream.next().await {
-        let chunk =
-            chunk.map_err(|_| Problem::new(ProblemKind::IncompleteBody, "the connection ended within the body"))?;
-        if first.len().max(bytes.len()) + chunk.len() > limit.n_bytes {
-            discard(Body::from_stream(stream), limit.n_bytes).await;
-            return Err(too_large(limit));
+    context: &Context,
+) -> Result<(Collected<'_>, Option<Arriving>), Problem> {
+    let mut collected = Collected::new(context.etude.memory());
+    while let Some(chunk) = body.next().await {
+        if let Err(error) = chunk.and_then(|chunk| collected.add(chunk).map_err(BodyError::NoRoom)) {
+            body.discard(context);
+            return Err(Problem::from(&error));
         }
-        if first.is_empty() {
-            first = chunk;
-        } else {
-            if bytes.is_empty() {
-                // What was announced is within the limit.
-                let n_left = usize::try_from(HttpBody::size_hint(&stream).lower()).unwrap_or(0);
-                bytes.reserve_exact(first.len() + chunk.len() + n_left.min(n_wanted));
-                bytes.extend_from_slice(&first);
+        if collected.n_bytes() > n_wanted {
+            return Ok((collected, Some(body)));
+        }
+    }
+    Ok((collected, None))
+}
+
+/// Reads the rest of a body that is not wanted, and throws it away.
+fn discard(stream: BodyDataStream, limit: usize, context: &Context) {
+    if stream.is_end_stream() {
+        return;
+    }
+    let stopping = context.stopping.clone();
+    context.tasks.spawn(async move {
+        tokio::select! {
+            () = throw_away(stream, limit) => {}
+            () = stopping.cancelled() => {}
+        }
+    });
+}
+
+async fn throw_away(mut stream: BodyDataStream, limit: usize) {
+    let reading = async {
+        let mut n_left = limit.saturating_mul(MAX_DISCARDED_LIMITS);
+        while let Some(Ok(chunk)) = stream.next().await {
+            match n_left.checked_sub(chunk.len()) {
+                Some(left) => n_left = left,
+                None => return,
             }
-            bytes.extend_from_slice(&chunk);
         }
-        if first.len().max(bytes.len()) > n_wanted {
-            return Ok((whole(first, bytes), Some(stream)));
-        }
-    }
-    Ok((whole(first, bytes), None))
+    };
+    // Then the connection closes, as the rest is not read.
+    let _ = tokio::time::timeout(DISCARD_TIMEOUT, reading).await;
 }
 
-/// All that there is in several pieces, of which the first is alone unless there are `bytes`.
-fn whole(first: Bytes, bytes: Vec<u8>) -> Bytes {
-    if bytes.is_empty() { first } else { bytes.into() }
-}
-
-async fn discard(body: Body, limit: usize) {
-    let mut stream = body.into_data_stream();
-    let mut n_left = limit.saturating_mul(MAX_DISCARDED_LIMITS);
-    while let Some(Ok(chunk)) = stream.next().await {
-        match n_left.checked_sub(chunk.len()) {
-            Some(left) => n_left = left,
-            None => return,
-        }
-    }
-}
-
-fn too_large(limit: SentLimit) -> Problem {
-    Problem::new(ProblemKind::TooLarge, too_large_detail(limit))
-}
-
-fn too_large_detail(limit: SentLimit) -> String {
-    format!("the body has over {} bytes, the limit of this service ({})", limit.n_bytes, limit.setting)
+fn too_large(limit: SentLimit) -> BodyError {
+    let SentLimit { n_bytes, setting } = limit;
+    BodyError::TooLarge(format!("the body has over {n_bytes} bytes, the limit of this service ({setting})"))
 }
 
 /// A JSON answer.
@@ -292,12 +440,86 @@ pub(super) fn json_text(status: StatusCode, text: String) -> Response {
 }
 
 /// An answer whose JSON comes in parts.
-pub(super) fn json_stream(parts: impl Stream<Item = Result<Vec<u8>, ServiceError>> + Send + 'static) -> Response {
+pub(super) fn json_stream(parts: impl Stream<Item = Result<Bytes, ServiceError>> + Send + 'static) -> Response {
     // Too late for another answer: the connection is closed in the middle, which no client takes for the end.
     let parts = parts.inspect_err(|error| {
         tracing::error!(error = error as &dyn std::error::Error, "an answer was cut off");
     });
-    let mut response = Body::from_stream(parts).into_response();
+    let mut response = answer::paced(Body::from_stream(parts)).into_response();
     response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
     response
+}
+
+#[cfg(test)]
+mod tests {
+    use std::convert::Infallible;
+
+    use futures_util::stream;
+
+    use super::*;
+
+    const LIMIT: SentLimit = SentLimit { n_bytes: 1 << 30, setting: "TEST" };
+
+    /// A body of which a chunk of `n_bytes` comes after each `pause`.
+    fn trickling(n_bytes: usize, pause: Duration) -> BodyDataStream {
+        let chunks = stream::repeat(vec![b' '; n_bytes]).then(move |chunk| async move {
+            tokio::time::sleep(pause).await;
+            Ok::<_, Infallible>(chunk)
+        });
+        Body::from_stream(chunks).into_data_stream()
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_body_that_comes_too_slowly_is_not_waited_for() {
+        let started = Instant::now();
+        let mut body = Arriving::new(trickling(1, Duration::from_secs(1)), LIMIT);
+        let error = loop {
+            if let Err(error) = body.next().await.unwrap() {
+                break error;
+            }
+        };
+        assert!(matches!(error, BodyError::Slow(_)), "{error}");
+        assert_eq!(started.elapsed(), BODY_TIMEOUT);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_body_that_comes_steadily_may_take_its_time_and_so_may_its_reader() {
+        let mut body = Arriving::new(trickling(64 * 1024, Duration::from_secs(1)), LIMIT);
+        for _ in 0..1000 {
+            body.next().await.unwrap().unwrap();
+            tokio::time::sleep(Duration::from_secs(10)).await;
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn what_is_not_wanted_is_read_for_a_while_only() {
+        let started = Instant::now();
+        throw_away(trickling(1, Duration::from_secs(1)), 1 << 20).await;
+        assert_eq!(started.elapsed(), DISCARD_TIMEOUT);
+        throw_away(trickling(1 << 20, Duration::from_millis(1)), 1 << 20).await;
+        assert!(started.elapsed() < DISCARD_TIMEOUT * 2, "as many limits were read as are");
+    }
+
+    #[test]
+    fn memory_is_taken_as_bytes_come_and_held_as_long_as_they_are() {
+        let memory = Memory::with_room(1 << 20);
+        let chunk = |n_bytes: usize| Bytes::from(vec![b' '; n_bytes]);
+        let mut small = Collected::new(&memory);
+        small.add(chunk(UNCOUNTED_BYTES / 2)).unwrap();
+        small.add(chunk(UNCOUNTED_BYTES / 2)).unwrap();
+        assert_eq!(memory.free(), 1 << 20, "what is small is not counted");
+        small.add(chunk(1)).unwrap();
+        let bytes = small.into_bytes();
+        assert_eq!((bytes.len(), memory.free()), (UNCOUNTED_BYTES + 1, (1 << 20) - 2 * UNCOUNTED_BYTES as u64));
+        let part = bytes.slice(..10);
+        drop(bytes);
+        assert!(memory.free() < 1 << 20);
+        drop(part);
+        assert_eq!(memory.free(), 1 << 20);
+        let mut large = Collected::new(&memory);
+        let refused = (0..1 << 10).find_map(|_| large.add(chunk(UNCOUNTED_BYTES)).err());
+        assert_eq!(refused, Some(NoRoom { wanted: 2 << 20, room: 1 << 20 }));
+        drop(large);
+        assert_eq!(memory.free(), 1 << 20);
+    }
 }

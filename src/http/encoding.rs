@@ -5,6 +5,8 @@ use std::io::{self, BufRead, BufReader, Read};
 use axum::http::HeaderMap;
 use axum::http::header::CONTENT_ENCODING;
 
+use crate::memory::NoRoom;
+
 /// How a body was compressed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Encoding {
@@ -16,6 +18,12 @@ pub(super) enum Encoding {
 impl Encoding {
     /// What a client may send, as `Accept-Encoding` says it.
     pub(super) const ACCEPTED: &str = "gzip, zstd";
+
+    /// Largest window of a zstd frame, as a power of two: 8 MiB, as RFC 9659 has it for HTTP. A decoder keeps as much.
+    const MAX_WINDOW_LOG: u32 = 23;
+
+    /// Most bytes that a decoder looks back at.
+    pub(super) const MAX_WINDOW_BYTES: usize = 1 << Self::MAX_WINDOW_LOG;
 
     /// The encoding that is declared; the declaration, if it is none of the accepted ones.
     pub(super) fn declared(headers: &HeaderMap) -> Result<Self, String> {
@@ -38,8 +46,6 @@ impl Encoding {
         body: R,
         limit: DecodedLimit,
     ) -> io::Result<Box<dyn BufRead + Send>> {
-        /// Largest window of a zstd frame, as a power of two: 8 MiB, as RFC 9659 has it for HTTP. A decoder keeps as much.
-        const MAX_WINDOW_LOG: u32 = 23;
         let decoded: Box<dyn Read + Send> = match self {
             Self::Identity => {
                 return Ok(Box::new(BufReader::new(Limited { inner: body, n_left: limit.n_bytes, limit })));
@@ -47,7 +53,7 @@ impl Encoding {
             Self::Gzip => Box::new(flate2::bufread::MultiGzDecoder::new(body)),
             Self::Zstd => {
                 let mut decoder = zstd::stream::read::Decoder::with_buffer(body)?;
-                decoder.window_log_max(MAX_WINDOW_LOG)?;
+                decoder.window_log_max(Self::MAX_WINDOW_LOG)?;
                 Box::new(decoder)
             }
         };
@@ -71,6 +77,8 @@ pub(super) enum BodyError {
     TooLarge(String),
     #[error("{0}")]
     Slow(String),
+    #[error(transparent)]
+    NoRoom(NoRoom),
 }
 
 impl From<BodyError> for io::Error {

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::SharedContext;
-use super::body::{json, read_json};
+use super::body::{NoForm, json, read_json};
 use super::paging::{List, Paging};
 use super::path::PathName;
 use super::problem::Problem;
@@ -165,6 +165,7 @@ pub(super) async fn list_learners(State(context): State<SharedContext>, paging: 
     responses(
         (status = 204, description = "It is deleted"),
         (status = 404, description = "`unknown-learner`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`: it takes no body", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
@@ -172,6 +173,7 @@ pub(super) async fn list_learners(State(context): State<SharedContext>, paging: 
 pub(super) async fn delete_learner(
     State(context): State<SharedContext>,
     PathName(name): PathName,
+    _: NoForm,
 ) -> Result<StatusCode, Problem> {
     context.etude.delete_learner(&name).await?;
     Ok(StatusCode::NO_CONTENT)
@@ -276,11 +278,16 @@ pub(super) async fn list_weights(
         (status = 200, description = "The weights, with every reward that was accepted before", body = WeightsBody,
             headers(("etag" = String, description = "The version in quotes"))),
         (status = 404, description = "`unknown-learner`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`: it takes no body", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn learn(State(context): State<SharedContext>, PathName(name): PathName) -> Result<Response, Problem> {
+pub(super) async fn learn(
+    State(context): State<SharedContext>,
+    PathName(name): PathName,
+    _: NoForm,
+) -> Result<Response, Problem> {
     let answer = context.etude.learn(name.as_str(), Timestamp::now()).await?;
     let tag = format!("\"{}\"", answer.version);
     Ok(with_tag(json(StatusCode::OK, &WeightsBody::from(answer)), &tag))

@@ -1,13 +1,15 @@
 //! The HTTP contract: routes, bodies, and the only place with status codes.
 //!
 //! ```text
-//! connection -> observe (request id, log, metrics, panics) -> route -> handler -> Etude
+//! connection -> observe (request id, access, log, metrics, panics) -> route -> handler -> Etude
 //!                    ^                                                    |
 //!                    +---- Problem (RFC 9457), rendered with its id <-----+
 //! ```
 //!
 //! The OpenAPI description is generated from the handlers of this module; [`openapi`] gives it without a running service.
 
+mod access;
+mod answer;
 mod body;
 mod caller;
 mod connections;
@@ -23,6 +25,7 @@ mod problem;
 mod stream;
 mod trials;
 
+use std::collections::btree_map::Entry;
 use std::sync::Arc;
 
 use axum::Router;
@@ -32,12 +35,15 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use utoipa::OpenApi;
-use utoipa::openapi::{Content, Ref, ResponseBuilder};
+use utoipa::openapi::path::Operation;
+use utoipa::openapi::{Content, Ref, RefOr, ResponseBuilder};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::service::Etude;
 use crate::stream::Limits;
+pub use access::Access;
+pub(crate) use access::{allowed_host, allowed_origin};
 pub use connections::serve;
 use problem::{Problem, ProblemKind};
 
@@ -45,6 +51,8 @@ use problem::{Problem, ProblemKind};
 pub struct Context {
     /// The application.
     pub etude: Arc<Etude>,
+    /// Who is let in.
+    pub access: Access,
     /// Cancelled when the service starts to shut down: no longer ready.
     pub stopping: CancellationToken,
     /// Largest body that is read, in bytes.
@@ -138,33 +146,58 @@ fn routes() -> OpenApiRouter<SharedContext> {
 /// Never: every description can be written as YAML.
 #[must_use]
 pub fn openapi() -> String {
+    /// What is not the handlers' to name, as any of them may meet it.
+    const ANYWHERE: [(&str, &str); 4] = [
+        ("400", "`bad-host`: not one `Host` header, or one that names no host"),
+        ("403", "`foreign-origin`: the request comes from a web page that may not do this"),
+        ("421", "`unknown-host`: the service is not known by the host that is asked for"),
+        ("503", "`busy`: see `Retry-After`"),
+    ];
+    /// Nor a defect or a failing disk, which those for operators do not.
+    const IN_CONTRACT: (&str, &str) = ("500", "`internal`: what went wrong was logged under the request's id");
+    /// Nor this one, which any write may meet.
+    const WRITING: (&str, &str) =
+        ("507", "`storage-full`: no room is left for the database; what is there can be read");
     let mut description = routes().into_openapi();
-    // Not the handlers' to name, as any of them may meet a defect or a failing disk.
-    let internal = ResponseBuilder::new()
-        .description("`internal`: what went wrong was logged under the request's id")
-        .content("application/problem+json", Content::new(Some(Ref::from_schema_name("Problem"))))
-        .build();
-    // Nor this one, which any write may meet.
-    let full = ResponseBuilder::new()
-        .description("`storage-full`: no room is left for the database; what is there can be read")
-        .content("application/problem+json", Content::new(Some(Ref::from_schema_name("Problem"))))
-        .build();
-    let paths = description.paths.paths.iter_mut().filter(|(path, _)| path.starts_with("/v1/"));
-    for (_, path) in paths {
+    for (name, path) in &mut description.paths.paths {
+        let in_contract = name.starts_with("/v1/").then_some(IN_CONTRACT);
         for operation in [&mut path.get, &mut path.put, &mut path.post, &mut path.delete].into_iter().flatten() {
-            operation.responses.responses.insert("500".to_owned(), internal.clone().into());
+            ANYWHERE
+                .into_iter()
+                .chain(in_contract)
+                .for_each(|(status, meaning)| add_problem(operation, status, meaning));
         }
         for operation in [&mut path.put, &mut path.post, &mut path.delete].into_iter().flatten() {
-            operation.responses.responses.insert("507".to_owned(), full.clone().into());
+            add_problem(operation, WRITING.0, WRITING.1);
         }
     }
     description.to_yaml().expect("every description can be written as YAML")
 }
 
+/// Describes a problem of an operation that has others of this status, or none.
+fn add_problem(operation: &mut Operation, status: &str, meaning: &str) {
+    match operation.responses.responses.entry(status.to_owned()) {
+        Entry::Vacant(vacant) => {
+            let problem = Content::new(Some(Ref::from_schema_name("Problem")));
+            let response = ResponseBuilder::new().description(meaning).content("application/problem+json", problem);
+            vacant.insert(response.build().into());
+        }
+        Entry::Occupied(mut named) => {
+            let (kind, _) = meaning.split_once(':').unwrap_or((meaning, ""));
+            if let RefOr::T(response) = named.get_mut()
+                && !response.description.contains(kind)
+            {
+                response.description = format!("{kind}, {}", response.description);
+            }
+        }
+    }
+}
+
 /// The whole service as a router.
 pub fn router(context: Context) -> Router {
     let (router, _) = routes().split_for_parts();
-    router
+    let context = Arc::new(context);
+    let mut router = router
         .merge(operation::docs())
         .fallback(|| async { Problem::new(ProblemKind::NotFound, "there is nothing at this path") })
         .method_not_allowed_fallback(|| async {
@@ -172,7 +205,9 @@ pub fn router(context: Context) -> Router {
                 ProblemKind::MethodNotAllowed,
                 "this path does not support this method; `Allow` lists those it does",
             )
-        })
-        .layer(middleware::from_fn(observe::observe))
-        .with_state(Arc::new(context))
+        });
+    if let Some(cors) = context.access.cors() {
+        router = router.layer(cors);
+    }
+    router.layer(middleware::from_fn_with_state(Arc::clone(&context), observe::observe)).with_state(context)
 }

@@ -2,19 +2,21 @@
 
 use std::sync::Arc;
 
+use axum::body::Bytes;
 use axum::extract::{Request, State};
 use axum::http::StatusCode;
 use axum::response::Response;
+use futures_util::StreamExt;
 use futures_util::future::{self, OptionFuture};
 use futures_util::stream::{self, Stream};
-use futures_util::{FutureExt, StreamExt};
 use jiff::Timestamp;
 use serde::Serialize;
 use serde_json::value::RawValue;
 use utoipa::ToSchema;
 
 use super::SharedContext;
-use super::body::{Pump, SentLimit, SentModel, json, json_stream, read_model};
+use super::answer;
+use super::body::{NoForm, SentLimit, SentModel, json, json_stream, read_model};
 use super::encoding::DecodedLimit;
 use super::paging::{List, Paging};
 use super::path::PathName;
@@ -22,7 +24,7 @@ use super::problem::Problem;
 use crate::attribute::AttributeDocument;
 use crate::model::{ActionDocument, DefinitionDocument};
 use crate::service::{Caller, DefinitionReader, Etude, ModelAnswer, ModelDefinition, Registered, ServiceError};
-use crate::store::ModelSummary;
+use crate::store::{ModelSummary, PIECE_BYTES};
 
 /// A registered model.
 #[derive(Debug, Serialize, ToSchema)]
@@ -131,9 +133,11 @@ pub(super) async fn put_model(
         None => SentLimit { n_bytes: context.max_body_bytes, setting: "ETUDE_MAX_BODY_BYTES" },
     };
     let decoded = DecodedLimit { n_bytes: context.max_model_text_bytes, setting: "ETUDE_MAX_MODEL_TEXT_BYTES" };
-    let SentModel { text, format, pump } = read_model(request, sent, decoded).await?;
+    let SentModel { text, format, pump, held } = read_model(request, sent, decoded, &context).await?;
     let put = context.etude.put_model(&name, text, format, caller);
-    let (put, ()) = tokio::join!(put, OptionFuture::from(pump.map(Pump::run)).map(|_| ()));
+    let pumping = OptionFuture::from(pump.map(|pump| pump.run(&context)));
+    let (put, _) = tokio::join!(put, pumping);
+    drop(held);
     let (registered, summary) = put?;
     let status = match registered {
         Registered::New => StatusCode::CREATED,
@@ -169,15 +173,20 @@ fn whole_model(
     etude: Arc<Etude>,
     summary: &ModelBody,
     pieces: DefinitionReader,
-) -> Result<impl Stream<Item = Result<Vec<u8>, ServiceError>> + use<>, ServiceError> {
+) -> Result<impl Stream<Item = Result<Bytes, ServiceError>> + use<>, ServiceError> {
     let mut head = serde_json::to_vec(summary).map_err(ServiceError::Write)?;
     head.pop();
     head.extend_from_slice(b",\"definition\":");
     let pieces = stream::try_unfold(pieces, move |mut pieces| {
         let etude = Arc::clone(&etude);
-        async move { Ok(pieces.next(&etude).await?.map(|piece| (piece, pieces))) }
+        async move {
+            // A piece is kept until it is written. Where there is never room for one, it is not counted.
+            let held = etude.memory().take(PIECE_BYTES as u64).await.ok();
+            let piece = pieces.next(&etude).await?;
+            Ok(piece.map(|piece| (answer::holding(piece.into(), held), pieces)))
+        }
     });
-    let of = |bytes| stream::once(future::ready(Ok(bytes)));
+    let of = |bytes: Vec<u8>| stream::once(future::ready(Ok(bytes.into())));
     Ok(of(head).chain(pieces).chain(of(b"}".to_vec())))
 }
 
@@ -202,6 +211,7 @@ pub(super) async fn list_models(State(context): State<SharedContext>, paging: Pa
     responses(
         (status = 204, description = "It is deleted"),
         (status = 404, description = "`unknown-model`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-media-type`: it takes no body", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
@@ -209,6 +219,7 @@ pub(super) async fn list_models(State(context): State<SharedContext>, paging: Pa
 pub(super) async fn delete_model(
     State(context): State<SharedContext>,
     PathName(name): PathName,
+    _: NoForm,
 ) -> Result<StatusCode, Problem> {
     context.etude.delete_model(&name).await?;
     Ok(StatusCode::NO_CONTENT)

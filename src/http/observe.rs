@@ -6,7 +6,8 @@ use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use axum::extract::{MatchedPath, Request};
+use axum::extract::{MatchedPath, Request, State};
+use axum::http::header::ALLOW;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
@@ -16,9 +17,14 @@ use rustc_hash::FxHashMap;
 use tracing::{Instrument, Span};
 use uuid::Uuid;
 
+use super::SharedContext;
+use super::access::is_for_cors;
+use super::answer;
+use super::body::refuse;
 use super::problem::{Problem, ProblemKind};
 
-const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
+/// What names a request, in both directions.
+pub(super) const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 
 /// Longest request id that is taken from a client.
 const MAX_REQUEST_ID_BYTES: usize = 64;
@@ -27,8 +33,8 @@ const MAX_REQUEST_ID_BYTES: usize = 64;
 #[derive(Clone, Debug)]
 pub(super) struct RequestId(pub(super) Arc<str>);
 
-/// Gives the request an id, logs and measures it, turns panics into problems and problems into documents.
-pub(super) async fn observe(mut request: Request, next: Next) -> Response {
+/// Gives the request an id, lets it in or not, logs and measures it, turns panics into problems and problems into documents.
+pub(super) async fn observe(State(context): State<SharedContext>, mut request: Request, next: Next) -> Response {
     let id = request_id(request.headers());
     request.extensions_mut().insert(RequestId(Arc::clone(&id)));
     let route: Arc<str> = request.extensions().get::<MatchedPath>().map_or("(none)", MatchedPath::as_str).into();
@@ -37,7 +43,14 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
     let span = tracing::info_span!("request", request_id = %id, %method, path = request.uri().path());
     let mut unanswered = Unanswered { span: span.clone(), started: Instant::now(), is_answered: false };
 
-    let answered = AssertUnwindSafe(next.run(request).instrument(span.clone())).catch_unwind().await;
+    let let_in = context.access.check(&method, request.uri(), request.headers());
+    let answering = async {
+        match let_in {
+            Ok(()) => next.run(request).await,
+            Err(problem) => refuse(request, &context, problem).into_response(),
+        }
+    };
+    let answered = AssertUnwindSafe(answering.instrument(span.clone())).catch_unwind().await;
     let mut response = answered.unwrap_or_else(|panic| {
         span.in_scope(|| tracing::error!(panic = panic_message(panic.as_ref()), "a handler panicked"));
         Problem::new(ProblemKind::Internal, "an internal error was logged under this request id").into_response()
@@ -51,9 +64,13 @@ pub(super) async fn observe(mut request: Request, next: Next) -> Response {
         let headers = std::mem::take(response.headers_mut());
         response = problem.render(&id);
         // What the router added, such as `Allow`; the body's own headers are the document's.
-        for (name, value) in headers.iter().filter(|(name, _)| *name == axum::http::header::ALLOW) {
-            response.headers_mut().insert(name, value.clone());
+        for (name, value) in headers.iter().filter(|(name, _)| *name == ALLOW || is_for_cors(name)) {
+            response.headers_mut().append(name, value.clone());
         }
+    }
+    // Operators are to see what is going on when there is no room, too.
+    if !is_probe && let Err(error) = answer::count(&mut response, context.etude.memory()) {
+        response = Problem::new(ProblemKind::Busy, error.to_string()).render(&id);
     }
     if let Ok(id) = HeaderValue::from_str(&id) {
         response.headers_mut().insert(REQUEST_ID, id);

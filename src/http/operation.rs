@@ -51,8 +51,12 @@ pub(super) async fn readyz(State(context): State<SharedContext>) -> Result<&'sta
     responses((status = 200, description = "The measurements", body = String, content_type = "text/plain")),
 )]
 pub(super) async fn metrics(State(context): State<SharedContext>) -> impl IntoResponse {
-    #[expect(clippy::cast_precision_loss, reason = "there are few jobs")]
-    metrics::gauge!("etude_search_jobs").set(context.etude.pool().n_jobs() as f64);
+    #[expect(clippy::cast_precision_loss, reason = "there are few jobs, and less memory than would matter")]
+    {
+        metrics::gauge!("etude_search_jobs").set(context.etude.pool().n_jobs() as f64);
+        let memory = context.etude.memory();
+        metrics::gauge!("etude_memory_held_bytes").set(memory.room().saturating_sub(memory.free()) as f64);
+    }
     ([(CONTENT_TYPE, "text/plain; version=0.0.4")], context.metrics.render())
 }
 

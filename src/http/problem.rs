@@ -20,6 +20,9 @@ pub(super) enum ProblemKind {
     MalformedJson,
     IncompleteBody,
     BrokenEncoding,
+    BadHost,
+    ForeignOrigin,
+    UnknownHost,
     NotFound,
     UnknownModel,
     UnknownPolicy,
@@ -53,6 +56,9 @@ impl ProblemKind {
             Self::MalformedJson => ("malformed-json", "The body is not JSON", StatusCode::BAD_REQUEST),
             Self::IncompleteBody => ("incomplete-body", "The body ended early", StatusCode::BAD_REQUEST),
             Self::BrokenEncoding => ("broken-encoding", "The body cannot be decompressed", StatusCode::BAD_REQUEST),
+            Self::BadHost => ("bad-host", "The host is missing or unclear", StatusCode::BAD_REQUEST),
+            Self::ForeignOrigin => ("foreign-origin", "The web page may not do this", StatusCode::FORBIDDEN),
+            Self::UnknownHost => ("unknown-host", "This is not that host", StatusCode::MISDIRECTED_REQUEST),
             Self::NotFound => ("not-found", "There is nothing here", StatusCode::NOT_FOUND),
             Self::UnknownModel => ("unknown-model", "There is no such model", StatusCode::NOT_FOUND),
             Self::UnknownPolicy => ("unknown-policy", "There is no such policy", StatusCode::NOT_FOUND),
@@ -70,7 +76,7 @@ impl ProblemKind {
             Self::BatchFull => ("batch-full", "The answer is full", StatusCode::PAYLOAD_TOO_LARGE),
             Self::TooLarge => ("too-large", "The body is too large", StatusCode::PAYLOAD_TOO_LARGE),
             Self::UnsupportedMediaType => {
-                ("unsupported-media-type", "The body must be JSON", StatusCode::UNSUPPORTED_MEDIA_TYPE)
+                ("unsupported-media-type", "The type of the body is not supported", StatusCode::UNSUPPORTED_MEDIA_TYPE)
             }
             Self::UnsupportedEncoding => {
                 ("unsupported-encoding", "The body's compression is not supported", StatusCode::UNSUPPORTED_MEDIA_TYPE)
@@ -147,11 +153,16 @@ impl Problem {
         Self { request_id: id.0.to_string(), ..self }
     }
 
+    /// The document as JSON.
+    pub(super) fn text(&self) -> String {
+        serde_json::to_string(self).unwrap_or_default()
+    }
+
     /// The document, with the id of the request it answers.
     pub(super) fn render(mut self, request_id: &str) -> Response {
         request_id.clone_into(&mut self.request_id);
         let status = StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR);
-        let body = serde_json::to_vec(&self).unwrap_or_default();
+        let body = self.text();
         let mut response = (status, body).into_response();
         response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/problem+json"));
         let accepted = match self.of {

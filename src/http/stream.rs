@@ -21,7 +21,7 @@ use tracing::Instrument;
 use utoipa::ToSchema;
 
 use super::SharedContext;
-use super::body::json;
+use super::body::{is_ndjson, json, refuse};
 use super::encoding::Encoding;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
@@ -191,7 +191,7 @@ async fn write_frames(sink: &mut SplitSink<WebSocket, Message>, goes: &mut mpsc:
     request_body(content = String, content_type = "application/x-ndjson", description = "Client frames, one per line"),
     responses(
         (status = 200, description = "Server frames, one per line", body = String, content_type = "application/x-ndjson"),
-        (status = 415, description = "`unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "`unsupported-encoding`, `unsupported-media-type`: not NDJSON", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
@@ -204,6 +204,10 @@ pub(super) async fn ndjson(
     if Encoding::declared(request.headers()) != Ok(Encoding::Identity) {
         let detail = "the frames of a stream are sent as they are, without `Content-Encoding`";
         return Err(Problem::new(ProblemKind::CompressedStream, detail));
+    }
+    if !is_ndjson(request.headers()) {
+        let detail = "send frames, one per line, with the header `content-type: application/x-ndjson`";
+        return Err(refuse(request, &context, Problem::new(ProblemKind::UnsupportedMediaType, detail)));
     }
     let place = context.admit_stream()?;
     let (came, mut incoming) = mpsc::channel(MAX_WAITING);

@@ -27,13 +27,30 @@ impl Process {
     /// Starts the service with variables in its environment.
     pub(crate) fn start_under(variables: &[(&str, &Path)], flags: &[&str], database: &Path) -> Self {
         let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
+        command.envs(variables.iter().copied());
+        Self::start_as(command, flags, database)
+    }
+
+    /// Starts a service within the limits that `ulimit` sets with these options.
+    pub(crate) fn start_within(ulimit: &str, flags: &[&str], database: &Path) -> Self {
+        let mut shell = Command::new("sh");
+        let script = format!("ulimit {ulimit} && exec \"$0\" \"$@\"");
+        shell.args(["-c", &script, env!("CARGO_BIN_EXE_etude")]);
+        Self::start_as(shell, flags, database)
+    }
+
+    fn start_as(mut command: Command, flags: &[&str], database: &Path) -> Self {
         command.args(["serve", "--log-format", "text"]).args(flags).arg("--database").arg(database);
-        command.env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG").envs(variables.iter().copied());
+        command.env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG");
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
-        let listening = lines.find(|line| line.contains("listening on http://")).expect("the service starts");
-        let address = listening.split("http://").nth(1).unwrap().split(['"', ' ']).next().unwrap().to_owned();
         let (sender, log) = mpsc::unbounded_channel();
+        let listening = |line: &String| {
+            sender.send(line.clone()).unwrap();
+            line.contains("listening on http://")
+        };
+        let listening = lines.find(|line| listening(line)).expect("the service starts");
+        let address = listening.split("http://").nth(1).unwrap().split(['"', ' ']).next().unwrap().to_owned();
         // Nobody may listen any more.
         std::thread::spawn(move || lines.for_each(|line| drop(sender.send(line))));
         Self { child, address, log }

@@ -42,10 +42,20 @@ impl Service {
 
     /// Starts a service whose database is in `directory`.
     pub(crate) async fn start_in(directory: TempDir, flags: &[&str]) -> Self {
+        Self::start_set_up(directory, flags, |_| {}).await
+    }
+
+    /// Starts a service with `flags`, and with settings that no flag gives.
+    pub(crate) async fn start_set_up(
+        directory: TempDir,
+        flags: &[&str],
+        set_up: impl FnOnce(&mut ServeConfig),
+    ) -> Self {
         let database = directory.path().join("etude.db");
         let own = ["etude", "--listen", "127.0.0.1:0", "--database", database.to_str().unwrap()];
-        let flags = Flags::parse_from(own.iter().chain(flags));
-        let server = Server::start(&flags.config).await.unwrap();
+        let Flags { mut config } = Flags::parse_from(own.iter().chain(flags));
+        set_up(&mut config);
+        let server = Server::start(&config).await.unwrap();
         let address = server.address();
         let (stop, stopped) = oneshot::channel::<()>();
         let running = tokio::spawn(async move {

@@ -1,0 +1,192 @@
+//! Answers that are large: their memory is counted while they are written, and whoever reads them too slowly is cut off.
+
+use std::pin::Pin;
+use std::task::{Context, Poll, ready};
+use std::time::Duration;
+
+use axum::body::{Body, Bytes, HttpBody};
+use axum::response::Response;
+use hyper::body::{Frame, SizeHint};
+use tokio::time::Instant;
+
+use crate::memory::{Held, Memory, NoRoom};
+
+/// Bodies and answers up to this are not counted: the budget of memory keeps room for what is small.
+pub(super) const UNCOUNTED_BYTES: usize = 64 * 1024;
+
+/// How long a client may take to read an answer, however slowly it does.
+const READ_TIMEOUT: Duration = Duration::from_mins(1);
+
+/// Slowest that an answer may be read beyond [`READ_TIMEOUT`]: its memory is not there for others until then.
+const MIN_BYTES_PER_S: u64 = 64 * 1024;
+
+/// Takes the memory of an answer that is at hand, until it is written.
+///
+/// # Errors
+///
+/// If there is no room. Then the answer is what it was.
+pub(super) fn count(response: &mut Response, memory: &Memory) -> Result<(), NoRoom> {
+    let n_bytes = HttpBody::size_hint(response.body()).exact().unwrap_or(0);
+    if n_bytes > UNCOUNTED_BYTES as u64 {
+        let held = memory.try_take(n_bytes)?;
+        let body = std::mem::take(response.body_mut());
+        *response.body_mut() = Body::new(Paced { held: Some(held), ..Paced::new(body) });
+    }
+    Ok(())
+}
+
+/// An answer that is cut off if it is read too slowly.
+pub(super) fn paced(body: Body) -> Body {
+    Body::new(Paced::new(body))
+}
+
+/// Bytes that hold their memory, if there is some to be held, until the last part of them is dropped.
+pub(super) fn holding(bytes: Bytes, held: Option<Held>) -> Bytes {
+    struct Holding {
+        bytes: Bytes,
+        _held: Held,
+    }
+    impl AsRef<[u8]> for Holding {
+        fn as_ref(&self) -> &[u8] {
+            &self.bytes
+        }
+    }
+    match held {
+        Some(held) => Bytes::from_owner(Holding { bytes, _held: held }),
+        None => bytes,
+    }
+}
+
+/// A body that gives its data in pieces, each when the ones before are almost written.
+struct Paced {
+    body: Body,
+    held: Option<Held>,
+    /// What the body has given and this has not.
+    rest: Bytes,
+    n_given: u64,
+    /// How long the client was waited for.
+    waited: Duration,
+    given_at: Option<Instant>,
+}
+
+/// The client takes too long to read an answer.
+#[derive(Debug, thiserror::Error)]
+#[error("the answer was read slower than {MIN_BYTES_PER_S} bytes/s")]
+struct ReadTooSlowly;
+
+impl Paced {
+    fn new(body: Body) -> Self {
+        Self { body, held: None, rest: Bytes::new(), n_given: 0, waited: Duration::ZERO, given_at: None }
+    }
+}
+
+impl HttpBody for Paced {
+    type Data = Bytes;
+    type Error = axum::Error;
+
+    fn poll_frame(self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, axum::Error>>> {
+        let this = self.get_mut();
+        // Only the client's time counts, not the body's.
+        if let Some(given_at) = this.given_at.take() {
+            this.waited += given_at.elapsed();
+            if this.waited > READ_TIMEOUT + Duration::from_secs(this.n_given / MIN_BYTES_PER_S) {
+                return Poll::Ready(Some(Err(axum::Error::new(ReadTooSlowly))));
+            }
+        }
+        while this.rest.is_empty() {
+            match ready!(Pin::new(&mut this.body).poll_frame(cx)?) {
+                Some(frame) => match frame.into_data() {
+                    Ok(data) => this.rest = holding(data, this.held.take()),
+                    Err(frame) => return Poll::Ready(Some(Ok(frame))),
+                },
+                None => return Poll::Ready(None),
+            }
+        }
+        let piece = this.rest.split_to(this.rest.len().min(UNCOUNTED_BYTES));
+        this.n_given += piece.len() as u64;
+        this.given_at = Some(Instant::now());
+        Poll::Ready(Some(Ok(Frame::data(piece))))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.rest.is_empty() && self.body.is_end_stream()
+    }
+
+    fn size_hint(&self) -> SizeHint {
+        let n_left = self.rest.len() as u64;
+        let of_body = HttpBody::size_hint(&self.body);
+        let mut hint = SizeHint::new();
+        hint.set_lower(of_body.lower() + n_left);
+        if let Some(upper) = of_body.upper() {
+            hint.set_upper(upper + n_left);
+        }
+        hint
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use axum::response::IntoResponse;
+    use futures_util::{StreamExt, stream};
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_large_answer_holds_its_memory_until_the_last_piece_is_written() {
+        let memory = Memory::with_room(1 << 20);
+        let mut small = vec![b' '; UNCOUNTED_BYTES].into_response();
+        count(&mut small, &memory).unwrap();
+        assert_eq!(memory.free(), 1 << 20);
+        let mut large = vec![b' '; UNCOUNTED_BYTES * 3 + 1].into_response();
+        count(&mut large, &memory).unwrap();
+        let free = memory.free();
+        assert_eq!(free, (1 << 20) - (3 * UNCOUNTED_BYTES as u64 + 4096));
+        assert_eq!(HttpBody::size_hint(large.body()).exact(), Some(3 * UNCOUNTED_BYTES as u64 + 1));
+        let pieces: Vec<_> = large.into_body().into_data_stream().collect().await;
+        let sizes: Vec<_> = pieces.iter().map(|piece| piece.as_ref().unwrap().len()).collect();
+        assert_eq!((sizes, memory.free()), (vec![UNCOUNTED_BYTES, UNCOUNTED_BYTES, UNCOUNTED_BYTES, 1], free));
+        drop(pieces);
+        assert_eq!(memory.free(), 1 << 20);
+        let mut too_large = vec![b' '; 2 << 20].into_response();
+        assert!(count(&mut too_large, &memory).is_err());
+    }
+
+    #[tokio::test]
+    async fn an_answer_that_is_dropped_gives_its_memory_back() {
+        let memory = Memory::with_room(1 << 20);
+        let mut response = vec![b' '; 1 << 20].into_response();
+        count(&mut response, &memory).unwrap();
+        assert_eq!(memory.free(), 0);
+        drop(response);
+        assert_eq!(memory.free(), 1 << 20);
+    }
+
+    /// Reads an answer, a piece after each `pause`. Gives what was read of it, and for how long.
+    async fn read(body: Body, pause: Duration) -> (usize, Duration, bool) {
+        let (mut pieces, started, mut n_read) = (body.into_data_stream(), Instant::now(), 0);
+        while let Some(piece) = pieces.next().await {
+            let Ok(piece) = piece else { return (n_read, started.elapsed(), false) };
+            n_read += piece.len();
+            tokio::time::sleep(pause).await;
+        }
+        (n_read, started.elapsed(), true)
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_reads_an_answer_too_slowly_is_cut_off() {
+        let answer = || paced(Body::from(vec![b' '; UNCOUNTED_BYTES * 200]));
+        let (n_read, elapsed, is_whole) = read(answer(), Duration::from_millis(1500)).await;
+        assert!(!is_whole && n_read < UNCOUNTED_BYTES * 200, "{n_read}");
+        assert!(READ_TIMEOUT < elapsed && elapsed < READ_TIMEOUT * 4, "{elapsed:?}");
+        assert_eq!(read(answer(), Duration::from_millis(990)).await.0, UNCOUNTED_BYTES * 200);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn time_that_an_answer_takes_to_be_made_is_not_the_clients() {
+        let parts = stream::iter(0..10).then(|_| async {
+            tokio::time::sleep(READ_TIMEOUT).await;
+            Ok::<_, std::convert::Infallible>("part")
+        });
+        assert!(read(paced(Body::from_stream(parts)), Duration::ZERO).await.2);
+    }
+}
