@@ -8,7 +8,7 @@ use std::time::Duration;
 use axum::http::HeaderValue;
 use clap::Args;
 
-use crate::http;
+use crate::http::{self, ConnectionLimits};
 use crate::memory::{self, Memory};
 use crate::model;
 use crate::service::{PoolSettings, Settings, TimeLimits};
@@ -73,7 +73,12 @@ pub struct ServeConfig {
     /// How long compiling a model may take; beyond that, it is refused.
     #[arg(long, env = "ETUDE_MAX_COMPILE_TIME", default_value = "30s", value_parser = parse_period, value_name = "TIME")]
     pub max_compile_time: Duration,
-    /// Streams that may run at the same time; further ones are answered 503.
+    /// Connections at the same time; lowered to what the limits of files and of memory allow. Further ones are answered 503.
+    #[arg(
+        long, env = "ETUDE_MAX_CONNECTIONS", default_value_t = 10_000, value_parser = parse_connections, value_name = "N"
+    )]
+    pub max_connections: usize,
+    /// Streams that may run at the same time, of three quarters of the connections at most; further ones are answered 503.
     #[arg(long, env = "ETUDE_MAX_STREAMS", default_value_t = 4096, value_parser = parse_places, value_name = "N")]
     pub max_streams: usize,
     /// How long a session may be idle before it expires.
@@ -81,9 +86,9 @@ pub struct ServeConfig {
         long, env = "ETUDE_SESSION_IDLE_TIMEOUT", default_value = "1h", value_parser = parse_duration, value_name = "TIME"
     )]
     pub session_idle_timeout: Duration,
-    /// How long a stream's client may leave unread what waits for it.
+    /// How long a client may leave unread what waits for it.
     #[arg(
-        long, env = "ETUDE_SLOW_READER_TIMEOUT", default_value = "10s", value_parser = parse_duration, value_name = "TIME"
+        long, env = "ETUDE_SLOW_READER_TIMEOUT", default_value = "10s", value_parser = parse_period, value_name = "TIME"
     )]
     pub slow_reader_timeout: Duration,
     /// How often rewards are folded into the weights of their learners, such as 100ms or 1s; above 0.
@@ -130,12 +135,36 @@ impl ServeConfig {
 }
 
 impl ServeConfig {
+    /// What connections may use.
+    #[must_use]
+    pub fn connection_limits(&self) -> ConnectionLimits {
+        ConnectionLimits {
+            max_connections: self.max_connections,
+            head_timeout: self.head_timeout,
+            slow_reader_timeout: self.slow_reader_timeout,
+        }
+    }
+
+    /// The same settings, with no more connections than `max_files` open files and the memory that is kept for them allow.
+    #[must_use]
+    pub fn within(&self, max_files: u64) -> Self {
+        /// Files that are no connections: those of the database, of logs, of the runtime.
+        const OTHER_FILES: u64 = 64;
+        /// What an idle connection, or one that begins a request, uses at most.
+        const CONNECTION_BYTES: u64 = 64 * 1024;
+        let max_memory = self.max_memory.unwrap_or_else(memory::default_max_bytes);
+        let by_memory = max_memory.saturating_sub(Memory::new(max_memory).room()) / CONNECTION_BYTES;
+        let allowed = usize::try_from(max_files.saturating_sub(OTHER_FILES).min(by_memory)).unwrap_or(usize::MAX);
+        Self { max_connections: self.max_connections.min(allowed).max(MIN_CONNECTIONS), ..self.clone() }
+    }
+
     /// What a stream may use.
     #[must_use]
     pub fn stream_limits(&self) -> Limits {
         Limits {
             frame_bytes: STREAM_FRAME_BYTES,
-            streams: self.max_streams,
+            // Whatever streams there are, requests get through.
+            streams: self.max_streams.min(self.max_connections - self.max_connections / 4),
             slow_after: self.slow_reader_timeout,
             idle_after: self.session_idle_timeout,
         }
@@ -158,7 +187,10 @@ const MAX_THREADS: usize = 256;
 /// have half of these.
 const MAX_LONG_SEARCHES: usize = 256;
 
-/// Most searches that wait, and most streams: beyond what memory and files allow.
+/// Fewest connections, whatever the limits are.
+pub(crate) const MIN_CONNECTIONS: usize = 16;
+
+/// Most searches that wait, connections, and streams: beyond what memory and files allow.
 const MAX_PLACES: usize = 1_000_000;
 
 fn parse_at_most(text: &str, most: usize) -> Result<usize, String> {
@@ -168,6 +200,11 @@ fn parse_at_most(text: &str, most: usize) -> Result<usize, String> {
 
 fn parse_places(text: &str) -> Result<usize, String> {
     parse_at_most(text, MAX_PLACES)
+}
+
+fn parse_connections(text: &str) -> Result<usize, String> {
+    let count = parse_places(text)?;
+    if count >= MIN_CONNECTIONS { Ok(count) } else { Err(format!("expected at least {MIN_CONNECTIONS}")) }
 }
 
 fn parse_threads(text: &str) -> Result<NonZeroUsize, String> {
@@ -198,6 +235,23 @@ fn parse_period(text: &str) -> Result<Duration, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn there_are_no_more_connections_than_files_and_memory_allow() {
+        #[derive(clap::Parser)]
+        struct Flags {
+            #[command(flatten)]
+            config: ServeConfig,
+        }
+        let flags = ["etude", "--max-memory", "1G", "--max-connections"];
+        let config = |n: &'static str| <Flags as clap::Parser>::parse_from(flags.into_iter().chain([n])).config;
+        let allowed = |n: &'static str, max_files: u64| config(n).within(max_files).max_connections;
+        assert_eq!((allowed("1000", 1_000_000), allowed("1000", 1024), allowed("1000", 64)), (1000, 960, 16));
+        assert_eq!(allowed("10000", 1_000_000), 4096, "a quarter of the memory is theirs");
+        let few = config("16").within(1024);
+        assert_eq!((few.stream_limits().streams, few.connection_limits().max_connections), (12, 16));
+        assert!(parse_connections("15").is_err() && parse_connections("1000001").is_err());
+    }
 
     #[test]
     fn times_are_written_with_their_unit() {

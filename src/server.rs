@@ -10,13 +10,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use crate::config::ServeConfig;
-use crate::http::{self, Access, Context};
+use crate::http::{self, Access, ConnectionLimits, Context};
 use crate::service::Etude;
 use crate::store::StoreError;
 use crate::telemetry;
@@ -64,7 +65,7 @@ pub struct Server {
     streams: TaskTracker,
     stopping: CancellationToken,
     abort: CancellationToken,
-    head_timeout: Duration,
+    connections: ConnectionLimits,
     drain_timeout: Duration,
 }
 
@@ -75,6 +76,7 @@ impl Server {
     ///
     /// If the address, the database or the measurements cannot be had.
     pub async fn start(config: &ServeConfig) -> Result<Self, ServerError> {
+        let config = &within_limits(config);
         let (tasks, stopping, abort) = (TaskTracker::new(), CancellationToken::new(), CancellationToken::new());
         let metrics = telemetry::measurements()?;
         let not_usable = |source| ServerError::Store { database: config.database.display().to_string(), source };
@@ -89,6 +91,7 @@ impl Server {
         tasks.spawn(Arc::clone(&etude).expire_until(stopping.clone()));
         let streams = TaskTracker::new();
         tasks.spawn(Arc::clone(&etude).learn_periodically(config.learn_every, stopping.clone()));
+        let stream_limits = config.stream_limits();
         let router = http::router(Context {
             etude: Arc::clone(&etude),
             access: Access::new(&config.allow_host, &config.allow_origin),
@@ -97,8 +100,8 @@ impl Server {
             max_model_bytes: config.max_model_bytes,
             max_model_text_bytes: config.max_model_text_bytes,
             metrics,
-            stream_limits: config.stream_limits(),
-            stream_places: Arc::new(Semaphore::new(config.max_streams)),
+            stream_limits,
+            stream_places: Arc::new(Semaphore::new(stream_limits.streams)),
             streams: streams.clone(),
             tasks: tasks.clone(),
         });
@@ -111,7 +114,7 @@ impl Server {
             streams,
             stopping,
             abort,
-            head_timeout: config.head_timeout,
+            connections: config.connection_limits(),
             drain_timeout: config.drain_timeout,
         })
     }
@@ -125,7 +128,7 @@ impl Server {
     /// Serves until `stop` completes, then lets requests end within the drain time, aborts what is left, and closes the
     /// database.
     pub async fn run(self, stop: impl Future<Output = ()> + Send + 'static) {
-        let Self { listener, address, etude, router, tasks, streams, stopping, abort, head_timeout, drain_timeout } =
+        let Self { listener, address, etude, router, tasks, streams, stopping, abort, connections, drain_timeout } =
             self;
         tracing::info!(%address, "listening on http://{address}");
         let announce = async {
@@ -134,7 +137,7 @@ impl Server {
             stopping.cancel();
         };
         let serving = async {
-            tokio::join!(announce, http::serve(listener, router, head_timeout, &stopping));
+            tokio::join!(announce, http::serve(listener, router, connections, &stopping));
             // Websockets are no longer the listener's.
             streams.close();
             streams.wait().await;
@@ -161,6 +164,35 @@ impl Server {
         // A search that does not look up would keep the process; it ends without it.
         let ended = tokio::time::timeout(ABORT_GRACE, tasks.wait()).await;
         tracing::info!(is_clean = ended.is_ok(), "stopped");
+    }
+}
+
+/// The settings, with no more connections than the process may have.
+fn within_limits(config: &ServeConfig) -> ServeConfig {
+    let config_within = config.within(raise_file_limit());
+    let (wanted, max_connections) = (config.max_connections, config_within.max_connections);
+    if max_connections < wanted {
+        tracing::warn!(wanted, max_connections, "fewer connections, as files (ulimit -n) and memory are limited");
+    }
+    config_within
+}
+
+/// Raises the limit of open files, each of which a connection needs, as far as it goes. Gives what it is then.
+fn raise_file_limit() -> u64 {
+    let limit = getrlimit(Resource::Nofile);
+    let (Some(soft), hard) = (limit.current, limit.maximum) else { return u64::MAX };
+    if hard.is_some_and(|hard| hard <= soft) {
+        return soft;
+    }
+    match setrlimit(Resource::Nofile, Rlimit { current: hard, maximum: hard }) {
+        Ok(()) => {
+            tracing::info!(from = soft, to = hard, "the limit of open files is raised");
+            hard.unwrap_or(u64::MAX)
+        }
+        Err(error) => {
+            tracing::warn!(error = &error as &dyn std::error::Error, "the limit of open files cannot be raised");
+            soft
+        }
     }
 }
 

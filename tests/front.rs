@@ -1,4 +1,4 @@
-//! What stands before the contract: hosts, web pages, slow and silent clients, and what they may hold.
+//! What stands before the contract: hosts, web pages, slow and silent clients, and places for connections.
 
 #![expect(clippy::unwrap_used, reason = "tests may panic")]
 
@@ -12,9 +12,9 @@ use futures_util::future::join_all;
 use process::Process;
 use reqwest::Method;
 use serde_json::{Value, json};
-use service::{Service, example};
+use service::{Service, example, long_way, to_and_fro};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
+use tokio::net::{TcpSocket, TcpStream};
 use tokio_tungstenite::tungstenite;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 
@@ -368,4 +368,229 @@ async fn bodies_that_do_not_fit_into_the_memory_are_refused_and_others_are_not()
     let request = service.client.post(service.url("/v1/policies")).header("content-type", "application/json");
     let sent = request.header("content-encoding", "zstd").body(bomb).send().await.unwrap();
     assert_eq!(service::answer(sent).await.0, 503);
+}
+
+/// A connection with a small window, on which `GET path` was sent.
+async fn asking(address: SocketAddr, path: &str) -> TcpStream {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.set_recv_buffer_size(16 * 1024).unwrap();
+    let mut stream = socket.connect(address).await.unwrap();
+    stream.write_all(format!("GET {path} HTTP/1.1\r\nhost: localhost\r\n\r\n").as_bytes()).await.unwrap();
+    stream
+}
+
+#[tokio::test]
+async fn who_does_not_read_an_answer_is_closed_and_gives_its_memory_back() {
+    let directory = tempfile::tempdir().unwrap();
+    let flags = ["--slow-reader-timeout", "300ms"];
+    let service =
+        Service::start_set_up(directory, &flags, |config| config.max_memory = Some(BASE_BYTES + (24 << 20))).await;
+    assert_eq!(service.put("/v1/models/way", &long_way()).await.0, 201);
+    let request = json!({"model": "way", "demonstration": to_and_fro(32)});
+    let (status, policy) = service.post("/v1/policies", &request).await;
+    assert_eq!(status, 201, "{policy}");
+    let n_bytes = policy.to_string().len();
+    assert!((13 << 20..24 << 20).contains(&n_bytes), "one answer fits and two do not: {n_bytes}");
+    let path = format!("/v1/policies/{}", policy["id"].as_str().unwrap());
+    drop(policy);
+
+    let mut unread = asking(service.address, &path).await;
+    assert_eq!(status_of(&read_until(&mut unread, "\r\n\r\n").await), 200);
+    let (status, problem) = service.get(&path).await;
+    assert_eq!((status, &problem["type"]), (503, &json!("/problems/busy")), "no room for another");
+    // Operators see what is going on, and small answers are given.
+    assert_eq!(service.get("/metrics").await.0, 200);
+    assert_eq!(service.get("/v1/policies").await.0, 200);
+    let again = async {
+        while service.get(&path).await.0 != 200 {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, again).await.expect("it is closed");
+    assert!(read_to_end(&mut unread).await.len() < n_bytes, "the answer was cut off");
+}
+
+fn status_of(head: &str) -> u16 {
+    status(head)
+}
+
+/// A connection from another address of this machine.
+async fn connect_from(address: &str, to: SocketAddr) -> TcpStream {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.bind(SocketAddr::new(address.parse().unwrap(), 0)).unwrap();
+    socket.connect(to).await.unwrap()
+}
+
+/// Sends a request on a connection, and reads its answer.
+async fn livez(stream: &mut TcpStream) -> u16 {
+    stream.write_all(b"GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n").await.unwrap();
+    status(&read_until(stream, "\r\n\r\nalive\n").await)
+}
+
+/// Makes a connection busy: with a request whose body the service waits for.
+async fn make_busy(stream: &mut TcpStream) {
+    begin(stream, "POST /v1/policies", "content-type: application/json\r\nexpect: 100-continue\r\n").await;
+    assert!(read_until(stream, "\r\n\r\n").await.contains(" 100 "));
+}
+
+#[tokio::test]
+async fn where_all_places_are_taken_the_one_without_a_request_makes_room() {
+    let service = Service::start(&["--max-connections", "16"]).await;
+    let mut streams = Vec::new();
+    // Of one address as many as it may have, and as many of another as there are places left.
+    for n in 0..16 {
+        let from = if n < 12 { "127.0.0.1" } else { "127.0.0.2" };
+        let mut stream = connect_from(from, service.address).await;
+        assert_eq!(livez(&mut stream).await, 200);
+        streams.push(stream);
+    }
+    make_busy(&mut streams[0]).await;
+    // The second one has been without a request longest, then the third, which is of the address that has too many.
+    let mut newcomer = connect_from("127.0.0.3", service.address).await;
+    assert_eq!(livez(&mut newcomer).await, 200);
+    assert_eq!(read_to_end(&mut streams[1]).await, "", "it is closed");
+    streams.remove(1);
+    let mut another = connect_from("127.0.0.1", service.address).await;
+    assert_eq!(livez(&mut another).await, 200);
+    assert_eq!(read_to_end(&mut streams[1]).await, "");
+    streams.remove(1);
+    for stream in streams[1..].iter_mut().chain([&mut newcomer, &mut another]) {
+        assert_eq!(livez(stream).await, 200, "the others are as they were");
+    }
+    // So is the one that was busy.
+    streams[0].shutdown().await.unwrap();
+    assert_eq!(status(&read_to_end(&mut streams[0]).await), 400);
+}
+
+#[tokio::test]
+async fn where_nobody_makes_room_a_newcomer_is_told_so() {
+    let service = Service::start(&["--max-connections", "16"]).await;
+    let mut streams = Vec::new();
+    for n in 0..16 {
+        let from = if n < 12 { "127.0.0.1" } else { "127.0.0.2" };
+        let mut stream = connect_from(from, service.address).await;
+        make_busy(&mut stream).await;
+        streams.push(stream);
+    }
+    // Those who ask, whoever they are, and those who say nothing, more of them than are waited for.
+    let told = async |mut stream: TcpStream, text: &str| {
+        let _ = stream.write_all(text.as_bytes()).await;
+        read_to_end(&mut stream).await
+    };
+    for from in ["127.0.0.1", "127.0.0.3"] {
+        let answer =
+            told(connect_from(from, service.address).await, "GET /livez HTTP/1.1\r\nhost: localhost\r\n\r\n").await;
+        assert_eq!(status(&answer), 503, "{answer}");
+        assert!(answer.contains("retry-after: 1\r\n") && answer.contains("/problems/busy"), "{answer}");
+        let (head, body) = answer.split_once("\r\n\r\n").unwrap();
+        assert!(
+            head.contains(&format!("content-length: {}", body.len())) && head.contains("connection: close"),
+            "{head}"
+        );
+    }
+    let silent = join_all((0..40).map(|_| TcpStream::connect(service.address))).await;
+    for answer in join_all(silent.into_iter().map(|stream| told(stream.unwrap(), ""))).await {
+        assert_eq!(status(&answer), 503, "{answer}");
+    }
+    // An address that has few places gets one as soon as there is one, and is seen by operators.
+    drop(streams.pop());
+    let request = "GET /metrics HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
+    let metrics = loop {
+        let answer = told(connect_from("127.0.0.2", service.address).await, request).await;
+        if status(&answer) == 200 {
+            break answer;
+        }
+    };
+    for name in ["\netude_connections ", "\netude_connections_refused_total "] {
+        assert!(metrics.contains(name), "{metrics}");
+    }
+}
+
+#[tokio::test]
+async fn streams_leave_places_for_requests() {
+    let service = Service::start(&["--max-connections", "16"]).await;
+    let mut streams = Vec::new();
+    let open = async || tokio_tungstenite::connect_async(format!("ws://{}/v1/stream", service.address)).await;
+    for _ in 0..12 {
+        streams.push(open().await.unwrap());
+    }
+    // An address has no more than that.
+    assert!(open().await.is_err());
+    let mut other = connect_from("127.0.0.2", service.address).await;
+    assert_eq!(livez(&mut other).await, 200);
+    let upgrade = "GET /v1/stream HTTP/1.1\r\nhost: localhost\r\nconnection: upgrade\r\nupgrade: websocket\r\n\
+                   sec-websocket-version: 13\r\nsec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n";
+    other.write_all(upgrade.as_bytes()).await.unwrap();
+    assert_eq!(status(&read_until(&mut other, "}").await), 503);
+    // Its place is given back, and taken along by the next.
+    drop(streams.pop());
+    loop {
+        other.write_all(upgrade.as_bytes()).await.unwrap();
+        if read_until(&mut other, "\r\n\r\n").await.contains(" 101 ") {
+            break;
+        }
+        read_until(&mut other, "}").await;
+    }
+}
+
+#[tokio::test]
+async fn a_service_with_few_files_serves_on_refuses_and_says_so() {
+    let directory = tempfile::tempdir().unwrap();
+    let database = directory.path().join("etude.db");
+    let mut process = Process::start_within("-n 64", &["--listen", "127.0.0.1:0"], &database);
+    process.has_logged(&["fewer connections", "wanted=10000", "max_connections=16"]).await;
+    let address: SocketAddr = process.address.parse().unwrap();
+    // Many that say nothing, one after the other and at once.
+    let silent = join_all((0..200).map(|_| TcpStream::connect(address))).await;
+    assert_eq!(ask(address, "GET /readyz", &["host: localhost"]).await.0, 200);
+    drop(silent);
+    let mut busy = Vec::new();
+    for n in 0..16 {
+        let mut stream = connect_from(if n < 12 { "127.0.0.1" } else { "127.0.0.2" }, address).await;
+        make_busy(&mut stream).await;
+        busy.push(stream);
+    }
+    for _ in 0..3 {
+        let (status, answer) = ask(address, "GET /livez", &["host: localhost"]).await;
+        assert_eq!(status, 503, "{answer}");
+    }
+    process.has_logged(&["connections are refused", "n_refused=1", "n_taken=16"]).await;
+    let silent = join_all((0..200).map(|_| TcpStream::connect(address))).await;
+    process.has_logged(&["connections are refused"]).await;
+    drop((silent, busy));
+    let learner = reqwest::Client::builder().no_proxy().build().unwrap();
+    loop {
+        let request = learner.put(format!("http://{address}/v1/learners/gold")).json(&json!({"attributes": ["x"]}));
+        // Until those who went away are gone.
+        if request.send().await.is_ok_and(|answer| answer.status() == 201) {
+            break;
+        }
+    }
+    process.kill();
+}
+
+#[tokio::test]
+async fn the_limit_of_files_is_raised_as_far_as_it_goes() {
+    let directory = tempfile::tempdir().unwrap();
+    let database = directory.path().join("etude.db");
+    let mut process = Process::start_within("-Sn 64 && ulimit -Hn 1064", &["--listen", "127.0.0.1:0"], &database);
+    process.has_logged(&["the limit of open files is raised", "from=64", "to=1064"]).await;
+    process.has_logged(&["fewer connections", "max_connections=1000"]).await;
+    process.kill();
+}
+
+#[tokio::test]
+async fn a_peer_that_is_gone_without_a_word_is_noticed() {
+    let service = Service::start(&[]).await;
+    let mut stream = TcpStream::connect(service.address).await.unwrap();
+    assert_eq!(livez(&mut stream).await, 200);
+    // Of the service's end: addresses in hexadecimal, the state, the queues, and the timer, of which 2 is that of keepalive.
+    let (local, remote) = (service.address.port(), stream.local_addr().unwrap().port());
+    let sockets = std::fs::read_to_string("/proc/net/tcp").unwrap();
+    let own = sockets.lines().find_map(|line| {
+        let fields: Vec<&str> = line.split_whitespace().collect();
+        let is_own = fields[1].ends_with(&format!(":{local:04X}")) && fields[2].ends_with(&format!(":{remote:04X}"));
+        is_own.then(|| fields[5].to_owned())
+    });
+    assert!(own.as_deref().is_some_and(|timer| timer.starts_with("02:")), "{own:?}");
 }

@@ -20,8 +20,10 @@ mod observe;
 mod operation;
 mod paging;
 mod path;
+mod places;
 mod policies;
 mod problem;
+mod stalled;
 mod stream;
 mod trials;
 
@@ -44,7 +46,7 @@ use crate::service::Etude;
 use crate::stream::Limits;
 pub use access::Access;
 pub(crate) use access::{allowed_host, allowed_origin};
-pub use connections::serve;
+pub use connections::{ConnectionLimits, serve};
 use problem::{Problem, ProblemKind};
 
 /// What handlers work with.

@@ -22,6 +22,7 @@ use utoipa::ToSchema;
 
 use super::SharedContext;
 use super::body::{is_ndjson, json, refuse};
+use super::connections::IsStream;
 use super::encoding::Encoding;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
@@ -241,6 +242,7 @@ pub(super) async fn ndjson(
     streams.spawn(serving.instrument(tracing::Span::current()));
     let mut response = Body::from_stream(tokio_stream::wrappers::ReceiverStream::new(answer)).into_response();
     response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/x-ndjson"));
+    response.extensions_mut().insert(IsStream);
     Ok(response)
 }
 
