@@ -13,6 +13,7 @@ use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::attribute::AttributeDocument;
 use crate::interrupt::{Interrupt, Interrupted};
 use crate::mapping::Mapper;
+use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::model::{ActionDocument, Definition, Format, Limits, ReadError, hash_of, hex};
 use crate::store::{
     ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, PutModel, Store,
@@ -108,6 +109,54 @@ impl ModelText {
             }
         }
     }
+
+    /// The same text, of which what is kept is held against `memory` as it is read.
+    fn counted(self, memory: &Memory) -> Result<Self, NoRoom> {
+        let open = match self {
+            Self::Whole(text) if text.len() as u64 <= SMALL_BYTES => return Ok(Self::Whole(text)),
+            Self::Whole(text) => {
+                Box::new(move || -> io::Result<Box<dyn BufRead + Send>> { Ok(Box::new(io::Cursor::new(text))) })
+            }
+            Self::Packed(open) | Self::Arriving(open) => open,
+        };
+        let held = memory.try_take(SMALL_BYTES)?;
+        Ok(Self::Packed(Box::new(move || Ok(Box::new(Counted { inner: open()?, held, n_bytes: 0 })))))
+    }
+}
+
+/// A text of a model that is read, and what is kept of it.
+struct Counted {
+    inner: Box<dyn BufRead + Send>,
+    held: Held,
+    n_bytes: u64,
+}
+
+impl Counted {
+    /// Of a text, about twice as much is kept until it is compiled: values as numbers, and lists that grow.
+    const KEPT: u64 = 2;
+}
+
+impl io::Read for Counted {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let n_read = self.fill_buf()?.read(buffer)?;
+        self.consume(n_read);
+        Ok(n_read)
+    }
+}
+
+impl BufRead for Counted {
+    fn fill_buf(&mut self) -> io::Result<&[u8]> {
+        let needed = Self::KEPT * self.n_bytes;
+        if needed > self.held.n_bytes() {
+            self.held.grow_to(needed + SMALL_BYTES).map_err(io::Error::other)?;
+        }
+        self.inner.fill_buf()
+    }
+
+    fn consume(&mut self, n_bytes: usize) {
+        self.n_bytes += n_bytes as u64;
+        self.inner.consume(n_bytes);
+    }
 }
 
 /// Who sends models that are read as they come. A client that sends slowly keeps others from nothing but its own place.
@@ -177,7 +226,9 @@ impl Etude {
         let prepare = move |read: Result<Definition, ReadError>, interrupt: &mut dyn Interrupt| {
             prepare(read?, writer, is_new.then_some(&compiler), limits, interrupt)
         };
-        let (prepared, stored) = if let ModelText::Arriving(_) = text {
+        let is_arriving = matches!(text, ModelText::Arriving(_));
+        let text = text.counted(&self.memory)?;
+        let (prepared, stored) = if is_arriving {
             let _place = self.uploads.admit(caller.client)?;
             let read = self.pool.run_aside(move |interrupt| Ok(text.read(format, limits, interrupt))).await?;
             let job = move |interrupt: &mut dyn Interrupt| Ok(prepare(read, interrupt));
