@@ -18,6 +18,7 @@ use etude::interrupt::{Cancelled, Signal, Uninterrupted};
 use etude::mapping::{
     Budget, Grouping, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status, StoppedBy,
 };
+use etude::model::Limits;
 use problems::{cave, close, example, mapper, problem, solve, walked};
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -382,6 +383,43 @@ fn a_policy_that_is_not_optimal_says_what_ran_out_and_one_that_is_says_nothing()
         let small = Budget { max_bytes: 5000, ..Budget::DEFAULT };
         assert_eq!(map(small, Signal::Continue), (Some(StoppedBy::Memory), false), "{heuristic}");
     }
+}
+
+#[test]
+fn a_search_takes_as_much_memory_as_its_problem_is_large_and_its_budget_at_most() {
+    let bytes = |mapper: &Mapper, n_observations, heuristic: &str| {
+        let request = long_request(n_observations, &json!({"heuristic": heuristic}));
+        let mut faults = Faults::default();
+        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
+        let n_bytes = mapper.search_bytes(&request.problem, request.settings);
+        let within = Budget { max_bytes: n_bytes, ..Budget::DEFAULT };
+        let map =
+            |budget| mapper.map(&request.problem, Settings { budget, ..request.settings }, &mut Uninterrupted).unwrap();
+        assert_eq!(map(within), map(Budget::DEFAULT), "{n_observations}, {heuristic}");
+        n_bytes
+    };
+    let model = example("figure-4/model.json");
+    let figure_4 = mapper(&model);
+    assert!(bytes(&figure_4, 16, "default") < 1 << 19);
+    for heuristic in ["default", "none"] {
+        let [small, large] = [16, 500].map(|n_observations| bytes(&figure_4, n_observations, heuristic));
+        assert!(small < large && large < 100 << 20, "{heuristic}: {small} and {large}");
+    }
+    let lazy = problems::mapper_within(Limits { max_states: 0, ..Limits::DEFAULT }, &model);
+    assert_eq!(bytes(&lazy, 16, "default"), Budget::DEFAULT.max_bytes);
+}
+
+#[test]
+fn what_a_mapper_keeps_of_searches_counts_and_can_be_released() {
+    let mapper = mapper(&example("figure-4/model.json"));
+    let request = long_request(200, &json!({}));
+    let at_first = mapper.size_bytes();
+    let policy = solve_grouped(&mapper, &request, Grouping::Widest);
+    assert!(mapper.size_bytes() > 2 * at_first, "{} and {at_first}", mapper.size_bytes());
+    mapper.release();
+    assert_eq!(mapper.size_bytes(), at_first);
+    assert_eq!(solve_grouped(&mapper, &request, Grouping::Widest).search.expanded, policy.search.expanded);
 }
 
 #[test]

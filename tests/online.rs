@@ -212,6 +212,12 @@ fn where_time_or_expansions_are_up_what_a_lookahead_has_not_decided_is_followed_
         let mapping = request.solve(&mapper, &mut Uninterrupted).unwrap();
         check(&mapping, StoppedBy::Memory);
     }
+    let max_bytes = request.search_bytes(&mapper);
+    assert!(max_bytes < 1 << 17, "{max_bytes}");
+    let mut within =
+        read(&mapper, &json!({"model": "corridor", "demonstration": rush(29, 120), "lookahead": 4})).unwrap();
+    within.settings.budget.max_bytes = max_bytes;
+    assert!(within.solve(&mapper, &mut Uninterrupted).unwrap() == whole);
     for max_expansions in [0, 29, 30, 31, 1000, 2000] {
         let mut request = read(&mapper, &json!({"model": "corridor", "demonstration": rush(29, 120), "lookahead": 4}));
         let request = request.as_mut().unwrap();

@@ -147,6 +147,24 @@ impl<'m> Request<'m> {
         Ok(mapping)
     }
 
+    /// About how much memory [`Self::solve`] takes at most, in bytes: the budget, or less if the problem is small. With this as its
+    /// budget, it gives what it gives with the one in its settings.
+    ///
+    /// # Panics
+    ///
+    /// If the request is of another model than `mapper`.
+    #[must_use]
+    pub fn search_bytes(&self, mapper: &Mapper) -> usize {
+        let Self { problem, settings, lookahead, .. } = self;
+        let n_observations = problem.demonstration.len();
+        match lookahead {
+            None => mapper.search_bytes(problem, *settings),
+            Some(_) => {
+                OnlineMapping::most_bytes(mapper.model(), *lookahead, n_observations).min(settings.budget.max_bytes)
+            }
+        }
+    }
+
     /// A mapping that begins with `moves`, for which so many nodes and transitions were looked at, and goes on greedily, as `stopped_by`
     /// ran out.
     fn complete(

@@ -3,7 +3,7 @@
 use rustc_hash::FxHashMap;
 
 use super::wumpus::{Act, Cave, CaveState};
-use super::{ActionIdx, Graph, Space, StateIdx, States, Transition};
+use super::{ActionIdx, Graph, Space, StateIdx, States, Transition, make_room};
 use crate::interrupt::{Interrupted, Meter};
 
 /// The states of a cave that were found, numbered in the order in which they were, and the ways out of those that were explored.
@@ -128,6 +128,13 @@ impl Space for Explored<'_> {
 
     fn n_states(&self) -> Option<usize> {
         None
+    }
+
+    fn make_room(&mut self, growth: f64) {
+        make_room(&mut self.found, growth);
+        make_room(&mut self.bounds, growth);
+        make_room(&mut self.ways, growth);
+        self.states.make_room(growth);
     }
 
     #[inline]

@@ -34,7 +34,7 @@ pub use graph::{Graph, Transition};
 pub(crate) use operator::Operator;
 pub use reading::{Format, MAX_LINE_BYTES, ReadError};
 pub(crate) use rows::Rows;
-pub(crate) use space::{Space, Whole};
+pub(crate) use space::{Space, Whole, make_room, room_to_make};
 pub use states::{StateIdx, States};
 pub use table::{ActionReference, StartDocument, Table, TableDocument, TransitionDocument};
 pub use wumpus::{Act, Cave, CaveState, Cell, CellDocument, Heading, PoseDocument, WumpusDocument};

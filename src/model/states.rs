@@ -1,5 +1,6 @@
 //! The states of a model, interned.
 
+use super::make_room;
 use crate::attribute::Value;
 
 /// Index of a state in its model.
@@ -27,6 +28,11 @@ impl States {
     pub(super) fn push(&mut self, row: impl Iterator<Item = u32>) {
         self.rows.extend(row);
         debug_assert!(self.rows.len().is_multiple_of(self.domains.len()), "a whole row");
+    }
+
+    /// Makes room for `growth` times as many, once there is hardly any left.
+    pub(super) fn make_room(&mut self, growth: f64) {
+        make_room(&mut self.rows, growth);
     }
 
     /// How many states there are.

@@ -390,7 +390,7 @@ pub(super) fn follow(
 ///
 /// [`NoRoom`] if hardly anything is left.
 pub(super) fn take_for_search(mapper: &Mapper, request: &mut Request<'_>, memory: &Memory) -> Result<Held, NoRoom> {
-    let wanted = mapper.search_bytes(&request.problem, request.settings) as u64;
+    let wanted = request.search_bytes(mapper) as u64;
     // With less than what is small, a search would hardly begin.
     let held = memory.try_take(wanted.min((memory.free_for_large() / 2).max(SMALL_BYTES)))?;
     request.settings.budget.max_bytes = usize::try_from(held.n_bytes()).unwrap_or(usize::MAX);

@@ -46,6 +46,18 @@ pub(super) fn choose(model: &Model, interrupt: &mut dyn Interrupt) -> Result<Vec
     Ok(levels)
 }
 
+/// About how much memory that takes, in bytes: what is seen of the changes of some states.
+pub(super) fn bytes_for(model: &Model) -> usize {
+    /// A change, where it was seen and its place in a hash table.
+    const SIGHTING_BYTES: usize = 160;
+    /// How many attributes a transition changes, about.
+    const N_CHANGES: usize = 2;
+    let n_states = model.graph().n_states();
+    let n_sampled = n_states.min(MAX_STATES).min(MAX_LOOKS / model.schema().len().max(1));
+    let n_each = model.graph().n_transitions().div_ceil(n_states.max(1));
+    n_sampled * n_each * N_CHANGES * SIGHTING_BYTES
+}
+
 /// Merges the groups that restrict each other most as long as they have at most `most` classes; those with fewer classes
 /// among equals, then the earlier ones.
 fn merge(partition: &mut Partition, restrictions: &Restrictions, sizes: &[usize], most: usize) {

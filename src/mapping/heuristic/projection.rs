@@ -23,7 +23,7 @@
 //! Each attribute alone is projected for every problem. The groups of several that [`grouping`] chooses have many classes, and their
 //! tables are made for searches that take long ([`super::joint`]).
 
-use std::sync::OnceLock;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use rustc_hash::FxHashMap;
 
@@ -38,27 +38,66 @@ pub(crate) struct Projections {
     groups: Vec<Group>,
     /// Distinct sets of groups that some transition changes.
     change_sets: Vec<Vec<u16>>,
-    /// Partitions into larger and larger groups, chosen when a search is long enough.
-    levels: OnceLock<Vec<Level>>,
+    /// Partitions into larger and larger groups, chosen when a search is long enough; `None` until then, and once they were
+    /// [released](Self::release).
+    levels: Mutex<Option<Levels>>,
 }
+
+/// Shared with the searches that use them.
+type Levels = Arc<[Level]>;
 
 /// A partition of the attributes into groups.
 #[derive(Debug)]
 struct Level {
     partition: Partition,
     /// Its groups of several attributes, built when a search is long enough.
-    groups: OnceLock<Vec<Group>>,
+    groups: OnceLock<Arc<Groups>>,
 }
 
-/// A model, projected on some of its attributes.
+/// The groups of several attributes of a level.
+#[derive(Debug)]
+pub(super) struct Groups {
+    pub(super) groups: Vec<Group>,
+    /// How much memory it takes to build them.
+    bytes_to_build: usize,
+}
+
+impl Groups {
+    /// Approximate size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        self.groups.iter().map(Group::size_bytes).sum()
+    }
+}
+
+/// Why there are no groups.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Unbuilt {
+    /// They would take more memory than they may.
+    TooLarge,
+    Interrupted(Interrupted),
+}
+
+impl From<Interrupted> for Unbuilt {
+    fn from(interrupted: Interrupted) -> Self {
+        Self::Interrupted(interrupted)
+    }
+}
+
+/// The classes of states that have the same values of some attributes.
 ///
 /// The class of a state is a number in mixed radix, with the domain indices of the attributes' values as digits; some
 /// classes may have no states.
-#[derive(Debug)]
-pub(super) struct Group {
+#[derive(Clone, Debug)]
+pub(super) struct Classes {
     /// The attributes, ascending.
     digits: Vec<Digit>,
     n_classes: usize,
+}
+
+/// A model, projected on some of its attributes.
+#[derive(Debug)]
+pub(super) struct Group {
+    classes: Classes,
     /// Distinct ways to change the class, by where they lead; no rows if they do not fit.
     edges: Rows<ProjectedEdge>,
     /// Whether its edges fit.
@@ -135,7 +174,7 @@ impl Projections {
             let edges: Vec<(ClassIdx, ProjectedEdge)> = edges.into_iter().flatten().collect();
             group.set_edges(&edges, &mut meter)?;
         }
-        Ok(Self { groups, change_sets: change_sets.sets, levels: OnceLock::new() })
+        Ok(Self { groups, change_sets: change_sets.sets, levels: Mutex::default() })
     }
 
     /// The groups of a single attribute.
@@ -144,32 +183,49 @@ impl Projections {
     }
 
     /// The groups of several attributes at a level, from 0; they are the larger the higher the level. `None` if there is
-    /// no such level. They are made when they are first asked for, in time proportional to the transitions.
+    /// no such level. They are made when they are first asked for, in time proportional to the transitions, and kept.
     ///
     /// # Errors
     ///
-    /// What `interrupt` said, if that was not to continue.
+    /// [`Unbuilt::TooLarge`] if building them takes more than `max_bytes`, also where they are there already, so that a search does not
+    /// depend on those before it; what `interrupt` said, if that was not to continue.
     pub(super) fn level(
         &self,
         model: &Model,
         level: usize,
+        max_bytes: usize,
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Option<&[Group]>, Interrupted> {
+    ) -> Result<Option<Arc<Groups>>, Unbuilt> {
+        if grouping::bytes_for(model) > max_bytes {
+            return Err(Unbuilt::TooLarge);
+        }
         // Two searches that come at the same time may both do the work, with the same result.
-        let levels = if let Some(levels) = self.levels.get() {
+        let levels = self.levels().clone();
+        let levels = if let Some(levels) = levels {
             levels
         } else {
             let partitions = grouping::choose(model, interrupt)?;
             let levels = partitions.into_iter().map(|partition| Level { partition, groups: OnceLock::new() });
-            let levels = levels.collect();
-            self.levels.get_or_init(|| levels)
+            let levels: Levels = levels.collect();
+            Arc::clone(self.levels().get_or_insert(levels))
         };
         let Some(level) = levels.get(level) else { return Ok(None) };
-        if let Some(groups) = level.groups.get() {
-            return Ok(Some(groups));
-        }
-        let groups = self.joint_groups(model, &level.partition, MAX_EDGES, interrupt)?;
-        Ok(Some(level.groups.get_or_init(|| groups)))
+        let groups = if let Some(groups) = level.groups.get() {
+            groups
+        } else {
+            let groups = self.joint_groups(model, &level.partition, max_bytes, interrupt)?;
+            level.groups.get_or_init(|| Arc::new(groups))
+        };
+        if groups.bytes_to_build > max_bytes { Err(Unbuilt::TooLarge) } else { Ok(Some(Arc::clone(groups))) }
+    }
+
+    fn levels(&self) -> MutexGuard<'_, Option<Levels>> {
+        self.levels.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Gives back what was kept for searches that take long; the next one makes it anew.
+    pub(crate) fn release(&self) {
+        drop(self.levels().take());
     }
 
     /// Projects `model` on the groups of `partition` that have several attributes.
@@ -177,9 +233,11 @@ impl Projections {
         &self,
         model: &Model,
         partition: &Partition,
-        max_edges: usize,
+        max_bytes: usize,
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Vec<Group>, Interrupted> {
+    ) -> Result<Groups, Unbuilt> {
+        /// What an edge takes in a list, with the room for more, and then in rows.
+        const EDGE_BYTES: usize = 2 * size_of::<(ClassIdx, ProjectedEdge)>() + size_of::<ProjectedEdge>();
         /// How many classes are looked up between two looks at the interrupt: about a millisecond.
         const POLL_EVERY: u64 = 1 << 14;
         let mut meter = Meter::new(interrupt, POLL_EVERY);
@@ -188,6 +246,8 @@ impl Projections {
         let states = model.states();
         let joint = partition.iter().filter(|positions| positions.len() > 1);
         let mut groups: Vec<Group> = joint.map(|positions| Group::new(model, positions)).collect();
+        let n_classes = groups.iter().map(Group::n_classes).fold(0, usize::saturating_add);
+        let mut bytes_to_build = n_classes.saturating_mul(size_of::<u32>());
         let mut edges: Vec<Vec<(ClassIdx, ProjectedEdge)>> = vec![Vec::new(); groups.len()];
         let mut changed = Vec::new();
         for (from, transition) in model.graph().iter() {
@@ -203,20 +263,24 @@ impl Projections {
             for (group, edges) in groups.iter().zip(&mut edges).filter(|(group, _)| is_changed(group)) {
                 let kind = change_set * 2 + is_first;
                 is_first = 0;
-                if edges.len() <= max_edges {
+                if edges.len() <= MAX_EDGES {
+                    bytes_to_build += EDGE_BYTES;
                     #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
                     let [from, to] = [row, row_after].map(|row| group.class_of(row) as ClassIdx);
                     edges.push((to, ProjectedEdge { from, kind, action: transition.action }));
                 }
             }
+            if bytes_to_build > max_bytes {
+                return Err(Unbuilt::TooLarge);
+            }
         }
         for (group, edges) in groups.iter_mut().zip(edges) {
-            group.is_kept = edges.len() <= max_edges;
+            group.is_kept = edges.len() <= MAX_EDGES;
             if group.is_kept {
                 group.set_edges(&edges, &mut meter)?;
             }
         }
-        Ok(groups)
+        Ok(Groups { groups, bytes_to_build })
     }
 
     /// Distinct sets of groups that some transition changes.
@@ -228,9 +292,10 @@ impl Projections {
     pub(crate) fn size_bytes(&self) -> usize {
         let change_sets: usize =
             self.change_sets.iter().map(|set| size_of_val(set) + size_of_val(set.as_slice())).sum();
-        let levels = self.levels.get().into_iter().flatten();
-        let joint = levels.filter_map(|level| level.groups.get()).flatten();
-        change_sets + self.groups.iter().chain(joint).map(Group::size_bytes).sum::<usize>()
+        let levels = self.levels();
+        let joint = levels.iter().flat_map(|levels| levels.iter()).filter_map(|level| level.groups.get());
+        let joint: usize = joint.map(|groups| groups.size_bytes()).sum();
+        change_sets + joint + self.groups.iter().map(Group::size_bytes).sum::<usize>()
     }
 }
 
@@ -240,8 +305,21 @@ impl Projections {
     pub(super) fn with_levels(model: &Model, partitions: impl IntoIterator<Item = Partition>) -> Self {
         let projections = Self::new(model, usize::MAX, &mut crate::interrupt::Uninterrupted).unwrap();
         let levels = partitions.into_iter().map(|partition| Level { partition, groups: OnceLock::new() });
-        projections.levels.set(levels.collect()).unwrap();
+        *projections.levels() = Some(levels.collect());
         projections
+    }
+}
+
+impl Classes {
+    /// The class of a state with these domain indices, shape `[n_attributes]`.
+    #[inline]
+    pub(super) fn of(&self, values: &[u32]) -> usize {
+        self.digits.iter().map(|digit| values[digit.position] as usize * digit.stride).sum()
+    }
+
+    /// Whether the attribute at `position` tells them apart.
+    pub(super) fn has(&self, position: usize) -> bool {
+        self.digits.iter().any(|digit| digit.position == position)
     }
 }
 
@@ -254,13 +332,14 @@ impl Group {
             n_classes *= n_values;
             digit
         });
-        Self { digits: digits.collect(), n_classes, edges: Rows::default(), is_kept: true }
+        let digits = digits.collect();
+        Self { classes: Classes { digits, n_classes }, edges: Rows::default(), is_kept: true }
     }
 
     /// Takes the edges, each with the class that it leads to, and sorts them.
     fn set_edges(&mut self, edges: &[(ClassIdx, ProjectedEdge)], meter: &mut Meter<'_>) -> Result<(), Interrupted> {
-        self.edges = Rows::of_entries(self.n_classes, edges.iter().copied());
-        for class in 0..self.n_classes {
+        self.edges = Rows::of_entries(self.n_classes(), edges.iter().copied());
+        for class in 0..self.n_classes() {
             let into = self.edges.of_mut(class);
             meter.spend_or_stop(1 + into.len() as u64)?;
             into.sort_unstable();
@@ -273,7 +352,7 @@ impl Group {
     /// The classes from and to which `operator` changes, whatever the values of which it says nothing.
     pub(super) fn classes_of(&self, operator: &Operator) -> Vec<(ClassIdx, ClassIdx)> {
         let mut classes = vec![(0, 0)];
-        for Digit { position, stride, n_values } in &self.digits {
+        for Digit { position, stride, n_values } in &self.classes.digits {
             let kept = operator.kept.iter().find(|(at, _)| at == position).map(|(_, value)| (*value, *value));
             let changed = operator.changed.iter().find(|(at, _, _)| at == position).map(|(_, from, to)| (*from, *to));
             #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
@@ -289,14 +368,19 @@ impl Group {
         classes
     }
 
+    /// The classes.
+    pub(super) fn classes(&self) -> &Classes {
+        &self.classes
+    }
+
     /// The class of a state with these domain indices, shape `[n_attributes]`.
     #[inline]
     pub(super) fn class_of(&self, values: &[u32]) -> usize {
-        self.digits.iter().map(|digit| values[digit.position] as usize * digit.stride).sum()
+        self.classes.of(values)
     }
 
     pub(super) fn n_classes(&self) -> usize {
-        self.n_classes
+        self.classes.n_classes
     }
 
     /// The edges into a class, by where they come from.
@@ -316,7 +400,7 @@ impl Group {
 
     /// The positions of its attributes, and how many values they have: the digits of a class, the lowest first.
     pub(super) fn digits(&self) -> impl Iterator<Item = (usize, usize)> {
-        self.digits.iter().map(|digit| (digit.position, digit.n_values))
+        self.classes.digits.iter().map(|digit| (digit.position, digit.n_values))
     }
 
     pub(super) fn is_kept(&self) -> bool {
@@ -325,11 +409,7 @@ impl Group {
 
     /// Positions of its attributes.
     pub(super) fn positions(&self) -> impl Iterator<Item = usize> {
-        self.digits.iter().map(|digit| digit.position)
-    }
-
-    pub(super) fn has(&self, position: usize) -> bool {
-        self.positions().any(|at| at == position)
+        self.classes.digits.iter().map(|digit| digit.position)
     }
 
     fn size_bytes(&self) -> usize {

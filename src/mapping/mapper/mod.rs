@@ -1,10 +1,11 @@
 //! A model prepared for mapping.
 
 mod escalation;
+mod foretold;
 
 use std::any::Any;
 use std::iter::repeat_n;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, ThreadId};
 
 use rustc_hash::FxHashMap;
@@ -15,7 +16,7 @@ use super::Problem;
 use super::completion::{Allowance, Extras, complete};
 use super::cost::{Cost, ROUNDING, SLACK, cost_of};
 use super::heuristic::paper::Paper;
-use super::heuristic::projected::{self, MAX_ENTRIES, Projected};
+use super::heuristic::projected::{self, Projected, TableRoom};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
 use super::search::{Found, Move, astar, best_first, layered};
@@ -28,8 +29,12 @@ use escalation::Patience;
 pub struct Budget {
     /// Most nodes expanded.
     pub max_expansions: u64,
-    /// Most memory for the nodes and states that it finds, in bytes. The tables of the default heuristic come on top: up to 256 MB,
-    /// and as much again where attributes are projected together, twice while other groups replace those.
+    /// About the most memory that it takes, in bytes: for the nodes and states that it finds, for tables of estimates, half of it at most
+    /// before groups of attributes are projected together, and for what these take; for ways and for the mapping. What does not fit is
+    /// left out, and when nothing is left, the search ends.
+    ///
+    /// Not counted are the problem itself, the model, what its mapper [keeps](Mapper::size_bytes) of searches before, and about a
+    /// hundred bytes for each observation and step of mappings with many actions for an observation.
     pub max_bytes: usize,
 }
 
@@ -39,6 +44,11 @@ impl Budget {
 }
 
 impl Budget {
+    /// What is left of it if `n_bytes` are taken.
+    pub(in crate::mapping) fn beside(self, n_bytes: usize) -> Self {
+        Self { max_bytes: self.max_bytes.saturating_sub(n_bytes), ..self }
+    }
+
     /// Whether there is no more memory: for `n_bytes`, and what was found in `space`.
     #[inline]
     pub(in crate::mapping) fn is_full(self, n_bytes: usize, space: &impl Space) -> bool {
@@ -160,10 +170,15 @@ struct Buffers {
 }
 
 impl Buffers {
-    /// Whether they are small enough to be kept.
-    fn are_small(&self) -> bool {
-        const MAX_BYTES: usize = 16 << 20;
-        self.solving.kept_bytes() + self.searching.kept_bytes() + self.layered.kept_bytes() <= MAX_BYTES
+    /// Most that are kept of a search.
+    const MAX_KEPT_BYTES: usize = 16 << 20;
+
+    /// And no more than this part of what it may take.
+    const PART_KEPT: usize = 8;
+
+    /// How much memory they take, in bytes.
+    fn size_bytes(&self) -> usize {
+        size_of::<Self>() + self.solving.kept_bytes() + self.searching.kept_bytes() + self.layered.kept_bytes()
     }
 }
 
@@ -206,19 +221,22 @@ impl Mapper {
         Arc::clone(&self.model)
     }
 
-    /// Approximate size in memory, in bytes.
+    /// Approximate size in memory, in bytes: that of the model, and of what is kept for searches, which grows with these. Of as many
+    /// searches as ran at the same time, up to 16 MB each are kept; and the groups of attributes that long ones have made.
     #[must_use]
     pub fn size_bytes(&self) -> usize {
-        self.model.size_bytes() + self.projections.size_bytes()
+        let buffers: usize = self.buffers().iter().map(|(_, buffers)| buffers.size_bytes()).sum();
+        self.model.size_bytes() + self.projections.size_bytes() + buffers
     }
 
-    /// At most how much memory a search for a mapping of `problem` takes, in bytes.
-    #[must_use]
-    pub fn search_bytes(&self, problem: &Problem<'_>, settings: Settings) -> usize {
-        const NODE_BYTES: usize = 64;
-        let n_states = if self.model.is_lazy() { usize::MAX } else { self.model.states().len() as usize };
-        let n_bytes = n_states.saturating_mul(problem.demonstration.len()).saturating_mul(NODE_BYTES);
-        n_bytes.min(settings.budget.max_bytes)
+    /// Gives back what was kept of searches. The next ones take longer, and find the same.
+    pub fn release(&self) {
+        drop(std::mem::take(&mut *self.buffers()));
+        self.projections.release();
+    }
+
+    fn buffers(&self) -> MutexGuard<'_, Vec<(ThreadId, Box<Buffers>)>> {
+        self.buffers.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the
@@ -231,7 +249,8 @@ impl Mapper {
     /// model, as all but the start of one that is searched lazily.
     pub fn lower_bounds<'p>(&'p self, problem: &'p Problem<'p>) -> impl Fn(u32, StateIdx) -> f64 + 'p {
         self.check(problem);
-        let solved = self.solve(problem, Grouping::WhenItPays, MAX_ENTRIES, &mut Uninterrupted);
+        let room = TableRoom::within(usize::MAX);
+        let solved = self.solve(problem, Grouping::WhenItPays, room, &mut Uninterrupted);
         let projected = solved.ok().flatten();
         let projected = projected.expect("nothing interrupts");
         move |observation, state| projected.cost_to_go(observation as usize, self.model.states().row(state))
@@ -271,6 +290,8 @@ impl Mapper {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
         let Settings { budget, upper_bound, .. } = settings;
+        let budget = budget.beside(way_bytes(problem));
+        let settings = Settings { budget, ..settings };
         // Sums in another order may be a little larger; a little room costs nothing.
         let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
         match settings.heuristic {
@@ -286,7 +307,7 @@ impl Mapper {
                 let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, space.row(problem.start));
-                match self.solve(problem, settings.grouping, MAX_ENTRIES, interrupt)? {
+                match self.solve(problem, settings.grouping, TableRoom::within(budget.max_bytes), interrupt)? {
                     Some(projected) => {
                         let least_f = first + projected.cost_to_go(0, space.row(problem.start));
                         conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
@@ -316,9 +337,9 @@ impl Mapper {
         if n_nodes > self.patience.max_layered_nodes || !layered::is_within(budget, &self.model, n_nodes) {
             return Ok(None);
         }
-        let solved = self.solve(problem, grouping, MAX_ENTRIES, interrupt)?;
+        let solved = self.solve(problem, grouping, TableRoom::within(budget.max_bytes), interrupt)?;
         let Some(projected) = solved.filter(Projected::are_all_in_columns) else { return Ok(None) };
-        let found = self.with_buffers(|Buffers { layered, .. }| {
+        let found = self.with_buffers(budget.max_bytes, |Buffers { layered, .. }| {
             layered::search(problem, &projected, budget, most_f, layered, interrupt)
         })?;
         conclude(problem, space, &projected, within(most_f, found, problem), interrupt).map(Some)
@@ -329,26 +350,30 @@ impl Mapper {
         &'p self,
         problem: &'p Problem<'p>,
         grouping: Grouping,
-        max_entries: usize,
+        room: TableRoom,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Projected<'p>>, Cancelled> {
-        self.with_buffers(|Buffers { solving, .. }| {
-            Projected::solve(&self.projections, problem, grouping, max_entries, solving, interrupt)
+        self.with_buffers(room.max_bytes, |Buffers { solving, .. }| {
+            Projected::solve(&self.projections, problem, grouping, room, solving, interrupt)
         })
     }
 
-    /// Does `work` with buffers of work that was done before, if there are any.
-    fn with_buffers<T>(&self, work: impl FnOnce(&mut Buffers) -> Result<T, Cancelled>) -> Result<T, Cancelled> {
-        let lock = || self.buffers.lock().unwrap_or_else(PoisonError::into_inner);
+    /// Does `work`, which may take so much memory, with buffers of work that was done before, if there are any.
+    fn with_buffers<T>(
+        &self,
+        max_bytes: usize,
+        work: impl FnOnce(&mut Buffers) -> Result<T, Cancelled>,
+    ) -> Result<T, Cancelled> {
         let thread = thread::current().id();
         let take = |kept: &mut Vec<(ThreadId, Box<Buffers>)>| {
             let own = kept.iter().position(|(user, _)| *user == thread);
             own.or(kept.len().checked_sub(1)).map(|at| kept.swap_remove(at).1)
         };
-        let mut buffers = take(&mut lock()).unwrap_or_default();
+        let mut buffers = take(&mut self.buffers()).unwrap_or_default();
         let done = work(&mut buffers)?;
-        if buffers.are_small() {
-            lock().push((thread, buffers));
+        // What is kept is there beside what a search goes on to do.
+        if buffers.size_bytes() <= Buffers::MAX_KEPT_BYTES.min(max_bytes / Buffers::PART_KEPT) {
+            self.buffers().push((thread, buffers));
         }
         Ok(done)
     }
@@ -381,6 +406,12 @@ impl Mapper {
         let mapping = conclude(problem, &mut Whole::of(&self.model), &Blind, found, interrupt)?;
         Ok(Mapping { status: Status::Local, lower_bound: None, stopped_by: Some(stopped_by), ..mapping })
     }
+}
+
+/// How much memory ways take that are found, and the mapping, in bytes: some copies of some steps for each observation.
+fn way_bytes(problem: &Problem<'_>) -> usize {
+    const N_STEPS: usize = 8;
+    problem.demonstration.len() * N_STEPS * size_of::<Move>()
 }
 
 /// Numbers the states of `moves` anew, in the order in which they are first passed. Gives their former numbers, by the new ones.

@@ -194,7 +194,7 @@ impl OnlineMapping {
             + n_terms * size_of::<f64>()
             + Predecessors::bytes_for(model.graph());
         let moves = n_observations.saturating_mul(MOVES_PER_OBSERVATION * size_of::<Move>());
-        n_layers.saturating_mul(each).saturating_add(once).saturating_add(moves)
+        n_layers.saturating_mul(each).saturating_add(once).saturating_add(moves + BASE_BYTES)
     }
 
     /// How many observations have come.
@@ -444,8 +444,11 @@ fn keeps(n_states: usize, n_terms: usize, lookahead: Option<NonZeroU32>) -> bool
 /// What an observed attribute takes, besides its terms.
 const OBSERVED_BYTES: usize = 64;
 
+/// What there is however small the model.
+const BASE_BYTES: usize = 1 << 12;
+
 /// About how many steps an observation has at most, with the room for more: bodies that need more are rare.
-const MOVES_PER_OBSERVATION: usize = 4;
+const MOVES_PER_OBSERVATION: usize = 8;
 
 #[cfg(test)]
 mod tests {

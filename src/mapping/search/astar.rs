@@ -9,7 +9,7 @@ use super::{Found, Move, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::heuristic::Heuristic;
 use crate::mapping::{Budget, Problem, StoppedBy};
-use crate::model::{ActionIdx, Space, StateIdx};
+use crate::model::{ActionIdx, Space, StateIdx, make_room, room_to_make};
 
 /// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows, among those of at most `most_f`. If there is
 /// none, it comes to its end without one. A node is expanded again if a cheaper
@@ -28,8 +28,10 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
 ) -> Result<Found, Cancelled> {
     let last = problem.last();
     let actions = problem.model.actions();
-    let mut nodes = Nodes::new(problem.demonstration.len(), space.n_states());
+    let mut nodes = Nodes::new(problem.demonstration.len(), space.n_states(), budget);
     let mut open = BinaryHeap::new();
+    // With what was taken out.
+    let mut most_open = 0;
     let (mut n_expanded, mut n_generated) = (0, 0);
     let mut meter = Meter::new(interrupt, POLL_EVERY);
 
@@ -61,7 +63,9 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             Signal::Cancel => return Err(Cancelled),
             Signal::Finish => Some(StoppedBy::Deadline),
             Signal::Continue if n_expanded >= budget.max_expansions => Some(StoppedBy::MaxExpansions),
-            Signal::Continue if budget.is_full(nodes.size_bytes(), space) => Some(StoppedBy::Memory),
+            Signal::Continue if is_out_of_memory(budget, &mut nodes, &mut open, most_open, space) => {
+                Some(StoppedBy::Memory)
+            }
             Signal::Continue => None,
         };
         if let Some(stopped_by) = stopped_by {
@@ -98,10 +102,35 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
                 }
             }
         }
+        most_open = most_open.max(open.len());
     }
     // Whatever is left costs more than `most_f`: there is no such mapping.
     let paths = [farthest.id, 0].map(|id| nodes.path(id)).to_vec();
     Ok(Found { paths, is_complete: true, stopped_by: None, least_f: f64::INFINITY, n_expanded, n_generated })
+}
+
+/// Whether there is no memory left. `most_open` nodes were open at the same time.
+fn is_out_of_memory(
+    budget: Budget,
+    nodes: &mut Nodes,
+    open: &mut BinaryHeap<Open>,
+    most_open: usize,
+    space: &mut impl Space,
+) -> bool {
+    /// As in [`best_first`](super::best_first).
+    const SMALL: usize = 16;
+    let n_bytes = nodes.size_bytes() + most_open * size_of::<Open>();
+    let all_bytes = n_bytes + space.found_bytes();
+    if all_bytes > budget.max_bytes / SMALL {
+        let fixed_bytes = nodes.fixed_bytes();
+        let most = budget.beside(fixed_bytes).max_bytes;
+        #[expect(clippy::cast_precision_loss, reason = "about")]
+        let growth = most as f64 / (all_bytes - fixed_bytes) as f64;
+        make_room(&mut nodes.ways, growth);
+        let _ = open.try_reserve_exact(room_to_make(open.len(), open.capacity(), growth));
+        space.make_room(growth);
+    }
+    budget.is_full(n_bytes, space)
 }
 
 /// The cheapest way found so far to a node.
@@ -119,6 +148,9 @@ struct Way {
 
 type NodeId = u32;
 
+/// The least part of the memory that is taken at once.
+const PAGE_BYTES: usize = 4096;
+
 /// The nodes that were found, and where each is.
 struct Nodes {
     ways: Vec<Way>,
@@ -135,25 +167,45 @@ enum NodeIndex {
     Sparse(FxHashMap<u64, NodeId>),
 }
 
-/// Most entries of a dense index: 256 MB.
+/// Most entries of a dense index: 256 MB, and no more than this part of the memory.
 const MAX_DENSE_INDEX: usize = 1 << 26;
+const DENSE_INDEX_PART: usize = 4;
+
+/// About how much memory a search takes at most, in bytes, if it finds so many nodes.
+pub(in crate::mapping) fn most_bytes(n_nodes: usize) -> usize {
+    /// How often a node is open, at different costs.
+    const N_TIMES_OPEN: usize = 4;
+    n_nodes.saturating_mul(size_of::<Way>() + size_of::<NodeId>() + N_TIMES_OPEN * size_of::<Open>())
+}
 
 impl Nodes {
-    fn new(n_observations: usize, n_states: Option<usize>) -> Self {
+    fn new(n_observations: usize, n_states: Option<usize>, budget: Budget) -> Self {
         let n_keys = n_states.unwrap_or(1 << StateIdx::BITS);
         let n_nodes = n_observations.saturating_mul(n_keys);
-        let index = if n_nodes <= MAX_DENSE_INDEX {
-            NodeIndex::Dense(vec![0; n_nodes])
-        } else {
-            NodeIndex::Sparse(FxHashMap::default())
-        };
+        let most = MAX_DENSE_INDEX.min(budget.max_bytes / DENSE_INDEX_PART / size_of::<NodeId>());
+        let index =
+            if n_nodes <= most { NodeIndex::Dense(vec![0; n_nodes]) } else { NodeIndex::Sparse(FxHashMap::default()) };
         Self { ways: Vec::new(), index, n_keys }
     }
 
-    /// How much memory they take, in bytes, with their places in the index and in the open list.
+    /// How much memory they take, in bytes, with their places in the index.
     fn size_bytes(&self) -> usize {
-        const NODE_BYTES: usize = size_of::<Way>() + size_of::<NodeId>() + size_of::<Open>();
-        self.ways.len() * NODE_BYTES
+        /// Of a hash table, while it grows to twice its size.
+        const ENTRY_BYTES: usize = 4 * size_of::<(u64, NodeId)>();
+        let index = match &self.index {
+            NodeIndex::Dense(_) => self.fixed_bytes(),
+            NodeIndex::Sparse(ids) => ids.len() * ENTRY_BYTES,
+        };
+        size_of_val(self.ways.as_slice()) + index
+    }
+
+    /// What of this becomes no more.
+    fn fixed_bytes(&self) -> usize {
+        match &self.index {
+            // A page of the memory is taken for the first node in it.
+            NodeIndex::Dense(ids) => size_of_val(ids.as_slice()).min(self.ways.len().saturating_mul(PAGE_BYTES)),
+            NodeIndex::Sparse(_) => 0,
+        }
     }
 
     fn get(&self, id: NodeId) -> &Way {

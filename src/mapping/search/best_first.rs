@@ -26,7 +26,7 @@ use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{Deepened, Projected};
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::{Budget, Problem, StoppedBy};
-use crate::model::Space;
+use crate::model::{Model, Space};
 
 /// How many times as wide each probe is as the one before.
 const PROBE_WIDENING: u64 = 8;
@@ -53,6 +53,16 @@ struct Open {
     probed: BinaryHeap<CheapestFirst>,
     /// and those that it has found of the next.
     ahead: Vec<CheapestFirst>,
+}
+
+/// About how much memory a search of `model` takes at most, in bytes, if it finds every node at so many observations.
+pub(in crate::mapping) fn most_bytes(model: &Model, n_observations: usize) -> usize {
+    /// How often a node is open, at different costs.
+    const N_TIMES_OPEN: usize = 4;
+    let (n_states, n_nodes) = (model.graph().n_states(), model.graph().n_states().saturating_mul(n_observations));
+    let nodes = n_states.saturating_mul(Nodes::bytes_for(n_observations));
+    let seen = Seen::bytes_for(n_states, model.graph().n_transitions(), model.schema().len());
+    nodes.saturating_add(n_nodes.saturating_mul(N_TIMES_OPEN * Buckets::ENTRY_BYTES)).saturating_add(seen)
 }
 
 impl Buffers {
@@ -150,6 +160,8 @@ impl<S: Space> Search<'_, '_, S> {
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
     fn probe(&mut self, width: u64, Open { buckets, probed, ahead }: &mut Open) -> Result<End, Cancelled> {
+        // With the room for more, as they come.
+        let max_known = self.left_bytes(buckets) / (2 * size_of::<(CheapestFirst, Option<u32>)>());
         // Of each observation, the last of those that are open, and where the one before it is.
         let mut last_of: Vec<Option<u32>> = vec![None; self.problem.last()];
         let mut known = Vec::new();
@@ -162,6 +174,10 @@ impl<S: Space> Search<'_, '_, S> {
             if let Some(last) = last_of.get_mut(self.nodes.step(id).observation as usize) {
                 #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
                 let before = last.replace(known.len() as u32);
+                if known.len() >= max_known {
+                    // There is no memory for a probe.
+                    return Ok(End::Done);
+                }
                 known.push((CheapestFirst { cost: f, id }, before));
             }
         }
@@ -220,7 +236,7 @@ impl<S: Space> Search<'_, '_, S> {
                 continue;
             }
             let step = self.nodes.step(id);
-            let ways = match self.spend(step.state, &open.buckets)? {
+            let ways = match self.spend(step.state, &mut open.buckets)? {
                 Ok(ways) => ways,
                 Err(stopped_by) => return Ok(End::CutShort(stopped_by)),
             };
@@ -263,7 +279,8 @@ impl<S: Space> Search<'_, '_, S> {
     /// Has better estimates made, if there are any, and gives them to all nodes.
     #[cold]
     fn deepen(&mut self, open: &mut Open) -> Result<End, Cancelled> {
-        match self.projected.deepen(self.limit, self.n_expanded, &mut self.meter)? {
+        let max_bytes = self.left_bytes(&open.buckets);
+        match self.projected.deepen(self.limit, self.n_expanded, max_bytes, &mut self.meter)? {
             Deepened::CutShort => return Ok(OUT_OF_TIME),
             Deepened::No => return Ok(End::Done),
             Deepened::Yes => {}
@@ -296,7 +313,7 @@ impl<S: Space> Search<'_, '_, S> {
     /// be.
     #[expect(clippy::inline_always, reason = "it is done for every expansion")]
     #[inline(always)]
-    fn spend(&mut self, state: SeenIdx, buckets: &Buckets) -> Result<Result<Range<usize>, StoppedBy>, Cancelled> {
+    fn spend(&mut self, state: SeenIdx, buckets: &mut Buckets) -> Result<Result<Range<usize>, StoppedBy>, Cancelled> {
         let ways = self
             .seen
             .explored(state)
@@ -311,12 +328,23 @@ impl<S: Space> Search<'_, '_, S> {
 
     /// Looks whether there are expansions left, and memory; gives what there is not.
     #[cold]
-    fn check_budget(&mut self, buckets: &Buckets) -> Result<(), StoppedBy> {
+    fn check_budget(&mut self, buckets: &mut Buckets) -> Result<(), StoppedBy> {
         /// How many expansions may be done between two looks at the memory,
         const LOOK_EVERY: u64 = 16;
         /// and how many ways may be followed: they find as many nodes, and twice as many where blocks begin.
         const N_WAYS: u64 = 1 << 10;
-        let n_bytes = self.nodes.size_bytes(self.seen.n_states()) + self.seen.size_bytes() + buckets.size_bytes();
+        /// Beyond this part of the memory, what grows takes at once what may be left for it: to grow bit by bit, it would be copied.
+        const SMALL: usize = 16;
+        let n_bytes = self.size_bytes(buckets);
+        let found_bytes = self.space.found_bytes();
+        if n_bytes + found_bytes > self.budget.max_bytes / SMALL {
+            #[expect(clippy::cast_precision_loss, reason = "about")]
+            let growth = self.budget.max_bytes as f64 / (n_bytes + found_bytes) as f64;
+            self.nodes.make_room(growth);
+            self.seen.make_room(growth);
+            buckets.make_room(growth);
+            self.space.make_room(growth);
+        }
         let n_actions = self.problem.model.actions().len() as u64;
         let look_every = (N_WAYS / n_actions.max(1)).clamp(1, LOOK_EVERY);
         self.unspent_until = (self.n_expanded + look_every).min(self.budget.max_expansions);
@@ -327,6 +355,17 @@ impl<S: Space> Search<'_, '_, S> {
         } else {
             Ok(())
         }
+    }
+
+    /// How much memory this takes, in bytes, with what better estimates take, without the states that were found.
+    fn size_bytes(&self, buckets: &Buckets) -> usize {
+        let nodes = self.nodes.size_bytes(self.seen.n_states());
+        nodes + self.seen.size_bytes() + buckets.size_bytes() + self.projected.deepened_bytes()
+    }
+
+    /// How much memory is left.
+    fn left_bytes(&self, buckets: &Buckets) -> usize {
+        self.budget.beside(self.size_bytes(buckets)).beside(self.space.found_bytes()).max_bytes
     }
 
     /// Follows the moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper

@@ -1,6 +1,7 @@
 //! An open list of buckets: nodes in the order of `f`, but for differences that do not matter.
 
 use super::nodes::{NodeId, Reached};
+use crate::model::make_room;
 
 /// An open list for nodes of `f` below a known limit. A bucket holds the nodes whose `f` agree in their first
 /// [`MANTISSA_BITS`] binary digits, so its width is about a thousandth of `f`; of the nodes in one bucket, the one that came last is
@@ -10,6 +11,8 @@ pub(super) struct Buckets {
     /// The entry that came last to each bucket, plus 1; 0 for none.
     heads: Vec<u32>,
     entries: Vec<Entry>,
+    /// The entry that was taken last, plus 1, to be filled again; 0 for none.
+    free: u32,
     /// Added to every `f`, so that no range of costs has too many binary orders of magnitude.
     offset: f64,
     /// The leading bits of what is in the first bucket.
@@ -23,7 +26,7 @@ struct Entry {
     g: f64,
     f: f64,
     id: NodeId,
-    /// The entry before it in its bucket, as in the heads.
+    /// The entry before it in its bucket, as in the heads, or before it among those that are free.
     next: u32,
 }
 
@@ -38,16 +41,25 @@ impl Buckets {
     pub(super) fn clear(&mut self) {
         self.heads.clear();
         self.entries.clear();
+        self.free = 0;
     }
 
-    /// How much memory the nodes take that were added, in bytes.
+    /// How much memory the nodes take that were there at the same time, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
         size_of_val(self.entries.as_slice())
     }
 
+    /// How much memory a node takes that was added, in bytes.
+    pub(super) const ENTRY_BYTES: usize = size_of::<Entry>();
+
+    /// Makes room for `growth` times as many nodes, once there is hardly any left.
+    pub(super) fn make_room(&mut self, growth: f64) {
+        make_room(&mut self.entries, growth);
+    }
+
     /// How much memory is kept for them, in bytes.
     pub(super) fn kept_bytes(&self) -> usize {
-        self.entries.capacity() * size_of::<Entry>()
+        self.entries.capacity() * size_of::<Entry>() + self.heads.capacity() * size_of::<u32>()
     }
 
     /// Empties the list, which is then for nodes of `least <= f < limit`.
@@ -58,6 +70,7 @@ impl Buckets {
         self.heads.clear();
         self.heads.resize(self.bucket_of(limit) + 1, 0);
         self.entries.clear();
+        self.free = 0;
         self.current = 0;
     }
 
@@ -74,10 +87,16 @@ impl Buckets {
         let bucket = self.bucket_of(node.f).max(self.current);
         let Some(head) = self.heads.get_mut(bucket) else { return };
         let Reached { id, g, f } = node;
-        self.entries.push(Entry { g, f, id, next: *head });
-        #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
-        let entry = self.entries.len() as u32;
-        *head = entry;
+        let entry = Entry { g, f, id, next: *head };
+        if let Some(free) = (self.free as usize).checked_sub(1) {
+            *head = self.free;
+            self.free = std::mem::replace(&mut self.entries[free], entry).next;
+        } else {
+            self.entries.push(entry);
+            #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
+            let entry = self.entries.len() as u32;
+            *head = entry;
+        }
     }
 
     /// Takes a node of the first bucket that has one.
@@ -86,6 +105,8 @@ impl Buckets {
         while let Some(head) = self.heads.get_mut(self.current) {
             if let Some(entry) = (*head as usize).checked_sub(1) {
                 let Entry { g, f, id, next } = self.entries[entry];
+                self.entries[entry].next = self.free;
+                self.free = *head;
                 *head = next;
                 return Some(Reached { id, g, f });
             }
@@ -114,11 +135,14 @@ mod tests {
     }
 
     #[test]
-    fn what_was_taken_takes_memory_until_the_list_is_emptied() {
+    fn as_much_memory_is_taken_as_for_the_most_nodes_at_a_time_until_the_list_is_emptied() {
         let mut open = Buckets::default();
         open.reset(1.0, 2.0);
         (0..3).for_each(|id| open.push(Reached { id, g: 0.0, f: 1.5 }));
-        open.pop();
+        for id in 3..100 {
+            assert_eq!(open.pop().map(|node| node.id), Some(id - 1));
+            open.push(Reached { id, g: 0.0, f: 1.5 });
+        }
         assert_eq!(open.size_bytes(), 3 * size_of::<Entry>());
         open.clear();
         assert_eq!((open.size_bytes(), open.pop()), (0, None));

@@ -37,6 +37,9 @@ const SLOTS_PER_BLOCK: usize = 8;
 const FIRST_BITS: u32 = 12;
 
 impl Index {
+    /// How much memory it takes for a block at most, in bytes: a hash table that has just grown.
+    pub(super) const BLOCK_BYTES: usize = 2 * SLOTS_PER_BLOCK * size_of::<u32>();
+
     /// Forgets the blocks, which are `keys`, and keeps the memory, of which it clears no more than was in use: there may be rows for
     /// many more states than those of a search. There will be at most `row_len` for each state.
     pub(super) fn clear(&mut self, keys: &[Key], row_len: usize) {

@@ -106,19 +106,33 @@ impl Buffers {
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
         let Self { body, parts, nodes } = self;
+        let joined: usize = parts.joined.iter().map(|classes| classes.len() * size_of::<u32>()).sum();
         body.ways.capacity() * size_of::<Way>()
+            + body.ends.capacity() * STATE_BYTES
+            + joined
             + parts.entries.capacity() * size_of::<Estimate>()
             + nodes.costs.capacity() * NODE_BYTES
     }
 }
 
-/// How much memory a node takes, in bytes.
-const NODE_BYTES: usize = size_of::<f64>() + size_of::<Link>() + size_of::<bool>() + size_of::<StateIdx>();
+/// How much memory a node takes, in bytes: with its place among those that are open, and with the room for more of these.
+const NODE_BYTES: usize = size_of::<f64>() + size_of::<Link>() + size_of::<bool>() + 2 * size_of::<StateIdx>();
+
+/// How much memory a state takes, in bytes: where its ways end, its classes, and as many distinct ones.
+const STATE_BYTES: usize = size_of::<usize>() + size_of::<[u32; 2]>() + 2 * size_of::<Vec<u32>>();
+
+/// How much memory a search takes of `n_nodes` of `model`, in bytes.
+pub(in crate::mapping) fn bytes_for(model: &Model, n_nodes: usize) -> usize {
+    let ways = model.graph().n_transitions() * size_of::<Way>();
+    // There are no more than two distinct classes of each state, and an entry of these for each observation.
+    let nodes = n_nodes.saturating_mul(NODE_BYTES + 2 * size_of::<Estimate>());
+    nodes.saturating_add(ways + model.graph().n_states() * STATE_BYTES)
+}
 
 /// Most transitions of a model: their copies take 6 MB.
 const MAX_WAYS: usize = 1 << 18;
 
-/// Whether `n_nodes` of `model`, its states at so many observations, may be searched: there is memory for all of them, and
+/// Whether `n_nodes` of `model`, its states at so many observations, may be searched: there is memory for all of them beside tables, and
 /// each may be expanded and expanded again.
 pub(in crate::mapping) fn is_within(budget: Budget, model: &Model, n_nodes: usize) -> bool {
     let attributes = 0..model.schema().len();
@@ -127,7 +141,7 @@ pub(in crate::mapping) fn is_within(budget: Budget, model: &Model, n_nodes: usiz
     let are_countable = attributes.map(n_values).try_fold(1, u128::checked_mul).is_some();
     model.graph().n_transitions() <= MAX_WAYS
         && are_countable
-        && n_nodes.saturating_mul(NODE_BYTES) <= budget.max_bytes
+        && bytes_for(model, n_nodes) <= budget.max_bytes / 2
         && 2 * n_nodes as u64 <= budget.max_expansions
 }
 

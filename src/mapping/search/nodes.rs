@@ -9,7 +9,7 @@ use super::seen::{Estimates, Seen, SeenIdx};
 use super::{Move, MoveKind, NO_ACTION};
 use crate::mapping::cost::SLACK;
 use crate::mapping::heuristic::projected::{CHUNK_LEN, Estimate};
-use crate::model::{ActionIdx, Space};
+use crate::model::{ActionIdx, Space, make_room};
 
 /// Where a node is in [`Nodes`]: its block, and its place in that.
 pub(super) type NodeId = u32;
@@ -135,6 +135,20 @@ impl Nodes {
     /// How much memory they take, in bytes, if they are of `n_states` states.
     pub(super) fn size_bytes(&self, n_states: usize) -> usize {
         self.keys.len() * BLOCK_BYTES + self.index.size_bytes(n_states)
+    }
+
+    /// How much memory they take, in bytes, if they are all of a state at so many observations.
+    pub(super) fn bytes_for(n_observations: usize) -> usize {
+        n_observations.div_ceil(BLOCK_LEN) * (BLOCK_BYTES + Index::BLOCK_BYTES)
+    }
+
+    /// Makes room for `growth` times as many, once there is hardly any left.
+    pub(super) fn make_room(&mut self, growth: f64) {
+        make_room(&mut self.keys, growth);
+        make_room(&mut self.marks, growth);
+        make_room(&mut self.costs, growth);
+        make_room(&mut self.estimates, growth);
+        make_room(&mut self.links, growth);
     }
 
     /// How much memory is kept for them, in bytes.

@@ -6,7 +6,7 @@ use rustc_hash::FxHashMap;
 
 use super::nodes::BLOCK_LEN;
 use crate::mapping::heuristic::projected::{ChangingColumn, Estimate, Projected};
-use crate::model::{Action, ActionIdx, Space, StateIdx};
+use crate::model::{Action, ActionIdx, Space, StateIdx, make_room};
 
 /// A state's number among those that a search has seen, in the order in which it did.
 pub(super) type SeenIdx = u32;
@@ -62,6 +62,9 @@ const MAX_KEPT_STATES: usize = 1 << 16;
 /// What a state takes, besides its ways, its entry in the index and its classes.
 const STATE_BYTES: usize = size_of::<StateIdx>() + size_of::<Bounds>() + size_of::<SearchNumber>();
 
+/// What an entry of the index takes, which is at most half empty just after it has grown.
+const ENTRY_BYTES: usize = 2 * size_of::<(StateIdx, SeenIdx)>();
+
 impl Seen {
     /// Makes room for a search in `space`, with estimates by `projected`: keeps the states that mean the same to it, unless they are
     /// too many.
@@ -88,10 +91,22 @@ impl Seen {
 
     /// How much memory those take that this search came to, in bytes: the same whether or not others were there before.
     pub(super) fn size_bytes(&self) -> usize {
-        /// Of the index, which is at most half empty just after it has grown.
-        const ENTRY_BYTES: usize = 2 * size_of::<(StateIdx, SeenIdx)>();
         let state_bytes = STATE_BYTES + self.columns.len() * size_of::<u32>();
         self.n_states * (state_bytes + ENTRY_BYTES) + self.n_ways * size_of::<Way>()
+    }
+
+    /// How much memory those take, in bytes, if they are all of a model, of so many transitions and attributes.
+    pub(super) fn bytes_for(n_states: usize, n_transitions: usize, n_attributes: usize) -> usize {
+        n_states * (STATE_BYTES + n_attributes * size_of::<u32>() + ENTRY_BYTES) + n_transitions * size_of::<Way>()
+    }
+
+    /// Makes room for `growth` times as many, once there is hardly any left.
+    pub(super) fn make_room(&mut self, growth: f64) {
+        make_room(&mut self.states, growth);
+        make_room(&mut self.bounds, growth);
+        make_room(&mut self.came, growth);
+        make_room(&mut self.ways, growth);
+        make_room(&mut self.classes, growth);
     }
 
     /// How much memory is kept for them, in bytes.

@@ -9,7 +9,7 @@ use super::{Found, Move, MoveKind};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::backward::{self, Arriving, GoOn, Graph, Link, Links, NoLinks, Price};
 use crate::mapping::{Budget, Problem};
-use crate::model::Transition;
+use crate::model::{self, Model, Transition};
 
 /// What a sweep came to.
 #[derive(Debug)]
@@ -88,13 +88,24 @@ fn in_sections(problem: &Problem<'_>, section_len: usize, meter: Meter<'_>) -> R
     }
 }
 
+/// How much memory a sweep takes at most, in bytes: if all layers are one section.
+pub(in crate::mapping) fn most_bytes(model: &Model, n_observations: usize) -> usize {
+    let n_states = model.graph().n_states();
+    let links = n_observations.saturating_mul(n_states).saturating_mul(size_of::<Link>());
+    links.saturating_add(basis_bytes(model.graph())).saturating_add(n_states * size_of::<f64>())
+}
+
+/// What a sweep takes besides its sections: the graph, distances, two layers and one to be told if it is cut short, and as much in
+/// buffers.
+fn basis_bytes(graph: &model::Graph) -> usize {
+    Graph::bytes_for(graph.n_states(), graph.n_transitions()) + 8 * graph.n_states() * size_of::<f64>()
+}
+
 /// How many layers a section has, as many as there is room for; `None` if there is not even for the shortest.
 fn section_len(problem: &Problem<'_>, budget: Budget) -> Option<usize> {
     let (n_observations, graph) = (problem.demonstration.len(), problem.model.graph());
     let n_states = graph.n_states();
-    // Besides the graph, distances, two layers and one to be told if it is cut short, and as much in buffers.
-    let basis = Graph::bytes_for(n_states, graph.n_transitions()) + 8 * n_states * size_of::<f64>();
-    let room = budget.max_bytes.checked_sub(basis)? / n_states.max(1);
+    let room = budget.max_bytes.checked_sub(basis_bytes(graph))? / n_states.max(1);
     // The more sections, the shorter they are, but the more layers are kept from which they begin.
     let mut divisions = (1..=n_observations.isqrt() + 1).map(|n| (n, n_observations.div_ceil(n)));
     let fits = |(n_sections, len): &(usize, usize)| n_sections * size_of::<f64>() + len * size_of::<Link>() <= room;

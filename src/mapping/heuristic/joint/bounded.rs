@@ -24,13 +24,13 @@ use std::collections::BinaryHeap;
 
 use super::{Basis, Unsolved};
 use crate::interrupt::Meter;
-use crate::mapping::heuristic::projection::{ClassIdx, Group};
+use crate::mapping::heuristic::projection::{ClassIdx, Classes, Group};
 use crate::mapping::open_list::CheapestFirst;
 
 /// The table of a group: hash tables with linear probing, one per observation.
 #[derive(Debug)]
-pub(in crate::mapping::heuristic) struct Bounded<'p> {
-    group: &'p Group,
+pub(in crate::mapping::heuristic) struct Bounded {
+    classes: Classes,
     layers: Vec<Layer>,
     slots: Vec<Slot>,
 }
@@ -63,15 +63,21 @@ struct Entry {
 /// Marks classes that have no entry in the layer.
 const NO_PLACE: u32 = u32::MAX;
 
-impl<'p> Bounded<'p> {
+impl Bounded {
     /// What an entry takes at most, with the room in hash tables.
     pub(super) const ENTRY_BYTES: usize = 4 * size_of::<Slot>();
 
+    /// What making the table takes besides, in bytes; but for the entries of two layers.
+    pub(super) fn bytes_to_make(basis: &Basis<'_>) -> usize {
+        basis.group.n_classes() * size_of::<u32>() + basis.least_terms.len() * size_of::<Layer>()
+    }
+
     /// Makes the table, with at most `n_left` entries, of which it takes its own.
-    pub(super) fn solve(basis: &Basis<'p, '_>, n_left: &mut usize, meter: &mut Meter<'_>) -> Result<Self, Unsolved> {
+    pub(super) fn solve(basis: &Basis<'_>, n_left: &mut usize, meter: &mut Meter<'_>) -> Result<Self, Unsolved> {
         let Basis { group, parts, .. } = basis;
         let n_observations = basis.least_terms.len();
-        let mut table = Self { group, layers: vec![Layer::default(); n_observations], slots: Vec::new() };
+        let classes = group.classes().clone();
+        let mut table = Self { classes, layers: vec![Layer::default(); n_observations], slots: Vec::new() };
         let mut here =
             Making { group, basis, observation: 0, places: vec![NO_PLACE; group.n_classes()], entries: Vec::new() };
         let mut open = BinaryHeap::new();
@@ -118,7 +124,7 @@ impl<'p> Bounded<'p> {
     #[inline]
     pub(super) fn cost_to_go(&self, observation: usize, values: &[u32]) -> f64 {
         #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
-        let class = self.group.class_of(values) as ClassIdx;
+        let class = self.classes.of(values) as ClassIdx;
         let layer = self.layers[observation];
         let mut place = layer.place_of(class);
         loop {
@@ -133,8 +139,13 @@ impl<'p> Bounded<'p> {
         }
     }
 
-    pub(super) fn group(&self) -> &'p Group {
-        self.group
+    pub(super) fn classes(&self) -> &Classes {
+        &self.classes
+    }
+
+    /// Size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        self.layers.len() * size_of::<Layer>() + self.slots.capacity() * size_of::<Slot>()
     }
 
     fn finish_layer(&mut self, i: usize, entries: &[Entry], n_left: &mut usize) -> Result<(), Unsolved> {
@@ -171,7 +182,7 @@ impl Layer {
 /// The layer in the making.
 struct Making<'b> {
     group: &'b Group,
-    basis: &'b Basis<'b, 'b>,
+    basis: &'b Basis<'b>,
     /// The observation.
     observation: usize,
     /// By class, where it is in `entries`, or [`NO_PLACE`].

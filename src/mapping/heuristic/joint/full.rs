@@ -12,26 +12,34 @@ use super::{Basis, Unsolved};
 use crate::interrupt::Meter;
 use crate::mapping::backward::{self, Arriving, Graph, NoLinks, PriceIdx};
 use crate::mapping::heuristic::projected::Table;
-use crate::mapping::heuristic::projection::{ClassIdx, Group};
+use crate::mapping::heuristic::projection::{ClassIdx, Classes, Group};
 use crate::mapping::heuristic::shares::{Parts, Way, Ways};
 
 /// The table of a group.
 #[derive(Debug)]
-pub(in crate::mapping::heuristic) struct Full<'p> {
-    group: &'p Group,
+pub(in crate::mapping::heuristic) struct Full {
+    classes: Classes,
     costs: Table<f64>,
 }
 
-impl<'p> Full<'p> {
+impl Full {
     pub(super) const ENTRY_BYTES: usize = size_of::<f64>();
 
     /// How many entries the table would have.
-    pub(super) fn n_entries(basis: &Basis<'_, '_>) -> usize {
+    pub(super) fn n_entries(basis: &Basis<'_>) -> usize {
         Table::<f64>::n_entries_for(basis.group.n_classes(), basis.least_terms.len())
     }
 
+    /// What making the table takes besides, in bytes: the ways between classes, in three forms, and what these cost.
+    pub(super) fn bytes_to_make(basis: &Basis<'_>) -> usize {
+        const CLASS_BYTES: usize = 8 * size_of::<f64>();
+        let (n_classes, n_edges) = (basis.group.n_classes(), basis.group.n_edges());
+        let way_bytes = size_of::<Way>() + size_of::<(ClassIdx, ClassIdx, PriceIdx)>();
+        Graph::bytes_for(n_classes, n_edges) + n_edges * way_bytes + n_classes * CLASS_BYTES
+    }
+
     /// Makes the table.
-    pub(super) fn solve(basis: &Basis<'p, '_>, meter: &mut Meter<'_>) -> Result<Self, Unsolved> {
+    pub(super) fn solve(basis: &Basis<'_>, meter: &mut Meter<'_>) -> Result<Self, Unsolved> {
         let group = basis.group;
         let graph = graph(group, &basis.parts).ok_or(Unsolved::Impossible)?;
         let (n_classes, last) = (group.n_classes(), basis.least_terms.len() - 1);
@@ -53,17 +61,22 @@ impl<'p> Full<'p> {
                 *costs.at_mut(class, i) = *cost;
             }
         }
-        Ok(Self { group, costs })
+        Ok(Self { classes: group.classes().clone(), costs })
     }
 
     /// The cost-to-go of the class of a state with these domain indices.
     #[inline]
     pub(super) fn cost_to_go(&self, observation: usize, values: &[u32]) -> f64 {
-        self.costs.at(self.group.class_of(values), observation)
+        self.costs.at(self.classes.of(values), observation)
     }
 
-    pub(super) fn group(&self) -> &'p Group {
-        self.group
+    pub(super) fn classes(&self) -> &Classes {
+        &self.classes
+    }
+
+    /// Size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        self.costs.size_bytes()
     }
 }
 
@@ -88,7 +101,7 @@ fn graph(group: &Group, parts: &Parts<'_>) -> Option<Graph> {
 }
 
 /// What the classes of a group cost at an observation.
-fn distances(basis: &Basis<'_, '_>, i: usize) -> Vec<f64> {
+fn distances(basis: &Basis<'_>, i: usize) -> Vec<f64> {
     basis.group.digits().zip(&basis.columns).fold(vec![0.0], |distances, ((_, n_values), column)| {
         let term = |value: usize| column.map_or(0.0, |column| basis.table.at(column + value, i).distance);
         (0..n_values).map(term).flat_map(|term| distances.iter().map(move |distance| distance + term)).collect()

@@ -9,7 +9,7 @@ mod bounded;
 mod full;
 
 use super::projected::{Estimate, Table};
-use super::projection::Group;
+use super::projection::{Group, Unbuilt};
 use super::shares::Parts;
 use crate::interrupt::{Meter, Signal};
 use crate::model::States;
@@ -17,8 +17,8 @@ use bounded::Bounded;
 use full::Full;
 
 /// What the table of a group is made from.
-pub(super) struct Basis<'p, 'b> {
-    pub(super) group: &'p Group,
+pub(super) struct Basis<'b> {
+    pub(super) group: &'b Group,
     pub(super) parts: Parts<'b>,
     pub(super) states: &'b States,
     /// By the group's digits: where the attribute's values begin in the tables; `None` if it is not in them.
@@ -35,18 +35,22 @@ pub(super) struct Basis<'p, 'b> {
     pub(super) limit: f64,
 }
 
-/// How many entries all tables of a level may have.
+/// How large all tables of a level may be.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Room {
+    /// In entries of tables that are bounded,
     pub(super) bounded: usize,
+    /// and of those that are full.
     pub(super) full: usize,
+    /// In bytes, with what it takes to make them. Tables take no more than [`MAX_BYTES`] of these.
+    pub(super) bytes: usize,
 }
 
 /// The table of a group.
 #[derive(Debug)]
-pub(super) enum Joint<'p> {
-    Bounded(Bounded<'p>),
-    Full(Full<'p>),
+pub(super) enum Joint {
+    Bounded(Bounded),
+    Full(Full),
 }
 
 /// Why there are no tables.
@@ -60,16 +64,23 @@ pub(super) enum Unsolved {
     Interrupted(Signal),
 }
 
+impl From<Unbuilt> for Unsolved {
+    fn from(unbuilt: Unbuilt) -> Self {
+        match unbuilt {
+            Unbuilt::TooLarge => Self::TooLarge,
+            Unbuilt::Interrupted(interrupted) => Self::Interrupted(interrupted.into()),
+        }
+    }
+}
+
 /// Most bytes of the tables of a level, 256 MB, whatever room they are given.
 const MAX_BYTES: usize = 1 << 28;
 
 /// Makes the tables of all groups, or of none. Those that have too many entries if they are [`bounded`] are made [`full`].
-pub(super) fn solve<'p>(
-    bases: &[Basis<'p, '_>],
-    room: Room,
-    meter: &mut Meter<'_>,
-) -> Result<Vec<Joint<'p>>, Unsolved> {
-    let mut n_left = room.bounded.min(MAX_BYTES / Bounded::ENTRY_BYTES);
+pub(super) fn solve(bases: &[Basis<'_>], room: Room, meter: &mut Meter<'_>) -> Result<Vec<Joint>, Unsolved> {
+    let making = bases.iter().map(Bounded::bytes_to_make).max().unwrap_or_default();
+    let max_bytes = room.bytes.checked_sub(making).ok_or(Unsolved::TooLarge)?.min(MAX_BYTES);
+    let mut n_left = room.bounded.min(max_bytes / Bounded::ENTRY_BYTES);
     let (mut joint, mut too_large) = (Vec::new(), Vec::new());
     let mut n_bytes = 0;
     for basis in bases {
@@ -87,7 +98,11 @@ pub(super) fn solve<'p>(
         }
     }
     let n_full = too_large.iter().map(|basis| Full::n_entries(basis)).fold(0, usize::saturating_add);
-    if n_full > room.full.min((MAX_BYTES - n_bytes) / Full::ENTRY_BYTES) {
+    if n_full > room.full.min((max_bytes - n_bytes) / Full::ENTRY_BYTES) {
+        return Err(Unsolved::TooLarge);
+    }
+    let making = too_large.iter().map(|basis| Full::bytes_to_make(basis)).max().unwrap_or_default();
+    if n_bytes + n_full * Full::ENTRY_BYTES + making > room.bytes {
         return Err(Unsolved::TooLarge);
     }
     for basis in too_large {
@@ -96,7 +111,7 @@ pub(super) fn solve<'p>(
     Ok(joint)
 }
 
-impl<'p> Joint<'p> {
+impl Joint {
     /// The cost-to-go of the class of a state with these domain indices; infinite if no mapping through it is worth finding.
     #[inline]
     pub(super) fn cost_to_go(&self, observation: usize, values: &[u32]) -> f64 {
@@ -106,10 +121,19 @@ impl<'p> Joint<'p> {
         }
     }
 
-    pub(super) fn group(&self) -> &'p Group {
+    /// Whether the attribute at `position` is in the group.
+    pub(super) fn has(&self, position: usize) -> bool {
         match self {
-            Self::Bounded(table) => table.group(),
-            Self::Full(table) => table.group(),
+            Self::Bounded(table) => table.classes().has(position),
+            Self::Full(table) => table.classes().has(position),
+        }
+    }
+
+    /// Size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        match self {
+            Self::Bounded(table) => table.size_bytes(),
+            Self::Full(table) => table.size_bytes(),
         }
     }
 }

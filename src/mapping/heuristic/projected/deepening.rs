@@ -25,6 +25,8 @@ pub(super) struct Deepening<'p> {
     grouping: Grouping,
     patience: GroupingPatience,
     forward: Option<Forward>,
+    /// How much memory the groups take that were used. The model keeps them.
+    group_bytes: usize,
 }
 
 impl<'p> Deepening<'p> {
@@ -36,7 +38,13 @@ impl<'p> Deepening<'p> {
         grouping: Grouping,
     ) -> Self {
         let patience = GroupingPatience::DEFAULT;
-        Self { projections, used, level: 0, due: patience.due(grouping, problem), grouping, patience, forward: None }
+        let due = patience.due(grouping, problem);
+        Self { projections, used, level: 0, due, grouping, patience, forward: None, group_bytes: 0 }
+    }
+
+    /// Size in memory, in bytes, with the groups that were used.
+    pub(super) fn size_bytes(&self) -> usize {
+        self.group_bytes + self.forward.as_ref().map_or(0, |forward| forward.costs.size_bytes())
     }
 }
 
@@ -54,12 +62,12 @@ impl GroupingPatience {
         }
     }
 
-    /// What tables may be made after `n_expanded` expansions.
-    fn room(self, n_expanded: u64) -> Room {
+    /// What tables may be made in `max_bytes` after `n_expanded` expansions.
+    fn room(self, n_expanded: u64, max_bytes: usize) -> Room {
         let bounded = n_expanded.checked_div(self.expansions_per_entry).unwrap_or(u64::MAX);
         let full = n_expanded.saturating_mul(self.full_entries_per_expansion);
         let [bounded, full] = [bounded, full].map(|n_entries| usize::try_from(n_entries).unwrap_or(usize::MAX));
-        Room { bounded, full }
+        Room { bounded, full, bytes: max_bytes }
     }
 }
 
@@ -98,7 +106,7 @@ impl<'p> Projected<'p> {
     }
 
     /// Makes the estimates better for those nodes that may be on a mapping cheaper than `limit`, and infinite for others, if
-    /// that is not much more work than the `n_expanded` expansions that were done.
+    /// that is not much more work than the `n_expanded` expansions that were done, and takes no more than `max_bytes` besides.
     ///
     /// # Errors
     ///
@@ -107,12 +115,13 @@ impl<'p> Projected<'p> {
         &mut self,
         limit: f64,
         n_expanded: u64,
+        max_bytes: usize,
         meter: &mut Meter<'_>,
     ) -> Result<Deepened, Cancelled> {
         let Some(mut deepening) = self.deepening.take() else { return Ok(Deepened::No) };
         let room = match deepening.grouping {
-            Grouping::Widest => Room { bounded: usize::MAX, full: usize::MAX },
-            Grouping::WhenItPays => deepening.patience.room(n_expanded),
+            Grouping::Widest => Room { bounded: usize::MAX, full: usize::MAX, bytes: max_bytes },
+            Grouping::WhenItPays => deepening.patience.room(n_expanded, max_bytes),
         };
         match self.solve_level(&mut deepening, limit, room, meter) {
             Ok(None) | Err(Unsolved::Impossible) => Ok(Deepened::No),
@@ -147,7 +156,7 @@ impl<'p> Projected<'p> {
     fn divide_columns(&mut self, deepening: &Deepening<'p>, meter: &mut Meter<'_>) -> Result<(), Signal> {
         for number in 0..self.columns.len() {
             let Column { group, position, offset, is_joined } = self.columns[number];
-            let is_joined_now = self.joint.iter().any(|table| table.group().has(position));
+            let is_joined_now = self.joint.iter().any(|table| table.has(position));
             self.columns[number].is_joined = is_joined_now;
             if is_joined_now {
                 for class in 0..group.n_classes() {
@@ -170,35 +179,38 @@ impl<'p> Projected<'p> {
         &self,
         deepening: &mut Deepening<'p>,
         limit: f64,
-        room: Room,
+        mut room: Room,
         meter: &mut Meter<'_>,
-    ) -> Result<Option<Vec<Joint<'p>>>, Unsolved> {
-        let Deepening { projections, used, level, forward, .. } = deepening;
-        let projections: &'p Projections = projections;
+    ) -> Result<Option<Vec<Joint>>, Unsolved> {
+        let Deepening { projections, used, level, forward, group_bytes, .. } = deepening;
         let mut poll = || meter.spend(u64::MAX);
-        let groups = projections
-            .level(self.problem.model, *level, &mut poll)
-            .map_err(|interrupted| Unsolved::Interrupted(interrupted.into()))?;
-        let Some(groups) = groups else { return Ok(None) };
+        let Some(groups) = projections.level(self.problem.model, *level, room.bytes, &mut poll)? else {
+            return Ok(None);
+        };
+        room.bytes = room.bytes.saturating_sub(groups.size_bytes());
         if forward.is_none() {
+            let n_bytes = self.forward_bytes();
+            room.bytes = room.bytes.checked_sub(n_bytes).ok_or(Unsolved::TooLarge)?;
             *forward = Some(self.solve_forward(projections, used, meter).map_err(Unsolved::Interrupted)?);
         }
         let Some(forward) = forward else { return Ok(None) };
-        let bases = groups.iter().filter(|group| group.is_kept());
-        let bases: Vec<Basis<'p, '_>> =
+        let bases = groups.groups.iter().filter(|group| group.is_kept());
+        let bases: Vec<Basis<'_>> =
             bases.filter_map(|group| self.basis(group, projections, used, forward, limit)).collect();
-        joint::solve(&bases, room, meter).map(Some)
+        let joint = joint::solve(&bases, room, meter)?;
+        *group_bytes += groups.size_bytes();
+        Ok(Some(joint))
     }
 
     /// What the table of a group is made from; `None` if its attributes have no tables.
     fn basis<'b>(
         &'b self,
-        group: &'p Group,
+        group: &'b Group,
         projections: &Projections,
         used: &[bool],
         forward: &'b Forward,
         limit: f64,
-    ) -> Option<Basis<'p, 'b>> {
+    ) -> Option<Basis<'b>> {
         let column_of = |position: usize| self.columns.iter().position(|column| column.position == position);
         let columns: Vec<Option<usize>> = group.positions().map(column_of).collect();
         let is_tabled = |position| !self.untabled.contains(&position);
@@ -222,6 +234,15 @@ impl<'p> Projected<'p> {
             // A little more than the others leave, as sums differ by rounding.
             limit: limit * (1.0 + SLACK) - others,
         })
+    }
+
+    /// How much memory costs from the start take, in bytes, with what it takes to make them: the ways of a column, in both directions.
+    fn forward_bytes(&self) -> usize {
+        let groups = self.columns.iter().map(|column| column.group);
+        let width = groups.clone().map(Group::n_classes).sum();
+        let n_ways = groups.map(Group::n_edges).max().unwrap_or_default();
+        let n_entries = Table::<f64>::n_entries_for(width, self.problem.demonstration.len());
+        n_entries * size_of::<f64>() + 2 * n_ways * size_of::<Way>()
     }
 
     /// Costs from the start, forwards over the demonstration: with `F_i(v)` as in [`bounded`](crate::mapping::heuristic::joint),

@@ -13,7 +13,7 @@ use table::stride_for;
 
 use super::joint::Joint;
 use super::projection::{Group, Projections};
-use super::shares::{Parts, Ways};
+use super::shares::{Parts, Way, Ways};
 use super::{Grouping, Heuristic};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
@@ -60,7 +60,7 @@ pub(crate) struct Projected<'p> {
     /// The least term of each column. Shape `[n_observations, n_columns]`.
     least_terms: Vec<f64>,
     /// The tables of groups of several attributes. The columns of these have no costs-to-go of their own any more.
-    joint: Vec<Joint<'p>>,
+    joint: Vec<Joint>,
     /// What deeper estimates are made of; `None` if there can be none.
     deepening: Option<Deepening<'p>>,
 }
@@ -144,13 +144,13 @@ impl<'p> Projected<'p> {
         projections: &'p Projections,
         problem: &'p Problem<'p>,
         grouping: Grouping,
-        max_entries: usize,
+        room: TableRoom,
         buffers: &mut Buffers,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
         /// How many classes are looked at between two looks at the interrupt: tens of microseconds.
         const POLL_EVERY: u64 = 1 << 11;
-        let (used, n_left_out) = used_groups(projections, problem, max_entries);
+        let (used, n_left_out) = used_groups(projections, problem, room);
         let mut projected = Self { n_left_out, ..Self::blind(problem) };
         let (mut width, n_observations) = (0, problem.demonstration.len());
         for (group, _) in projections.groups().iter().zip(&used).filter(|(_, is_used)| **is_used) {
@@ -210,6 +210,20 @@ impl<'p> Projected<'p> {
             deepening: None,
             n_left_out: 0,
         }
+    }
+
+    /// How much memory the tables take, in bytes, but for those that deeper estimates are made of.
+    pub(in crate::mapping) fn size_bytes(&self) -> usize {
+        self.table.size_bytes()
+            + size_of_val(self.unchanged.as_slice())
+            + size_of_val(self.least_distances.as_slice())
+            + size_of_val(self.least_terms.as_slice())
+    }
+
+    /// The same of those.
+    pub(in crate::mapping) fn deepened_bytes(&self) -> usize {
+        let forward = self.deepening.as_ref().map_or(0, Deepening::size_bytes);
+        forward + self.joint.iter().map(Joint::size_bytes).sum::<usize>()
     }
 
     /// How many entries the tables would have that were left out, because only few were asked for.
@@ -444,16 +458,67 @@ impl Heuristic for Projected<'_> {
     }
 }
 
-/// Which groups have tables, the smallest first as far as `max_entries` go; and how many entries the others would have, as far
-/// as all together go.
-fn used_groups(projections: &Projections, problem: &Problem<'_>, max_entries: usize) -> (Vec<bool>, u64) {
+/// How much memory tables for `problem` take at most, in bytes, of two attempts to make them within `room`, and whether these have all
+/// distances.
+pub(in crate::mapping) fn most_bytes(
+    projections: &Projections,
+    problem: &Problem<'_>,
+    room: TableRoom,
+) -> (usize, bool) {
+    /// Two tables; beside each, the least terms take half as much at most.
+    const N_TIMES: usize = 3;
+    let (used, _) = used_groups(projections, problem, TableRoom { few: room.most, ..room });
+    let groups = projections.groups().iter().zip(&used).filter(|(_, is_used)| **is_used).map(|(group, _)| group);
+    let n_observations = problem.demonstration.len();
+    let n_classes: usize = groups.clone().map(Group::n_classes).sum();
+    let n_entries = Table::<Estimate>::n_entries_for(n_classes, n_observations);
+    let n_edges: usize = groups.clone().map(Group::n_edges).sum();
+    let n_bytes = N_TIMES * n_entries * size_of::<Estimate>()
+        + 2 * n_edges * size_of::<Way>()
+        + 2 * stride_for(n_observations) * (size_of::<Estimate>() + size_of::<f64>());
+    let has = |position| groups.clone().any(|group| group.positions().any(|at| at == position));
+    let mut active = (0..problem.model.schema().len()).filter(|position| problem.distances.is_active(*position));
+    (n_bytes, active.all(has))
+}
+
+/// How large tables may be.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::mapping) struct TableRoom {
+    /// How many entries those may have that are made now,
+    pub(in crate::mapping) few: usize,
+    /// and those that may be made instead, if the search takes long.
+    pub(in crate::mapping) most: usize,
+    /// How many ways there may be between the classes of a group.
+    max_ways: usize,
+    /// What the search may take in all.
+    pub(in crate::mapping) max_bytes: usize,
+}
+
+impl TableRoom {
+    /// Any that take a quarter of `max_bytes`, and no more while they are made. So two of them leave half.
+    pub(in crate::mapping) fn within(max_bytes: usize) -> Self {
+        const PART: usize = 4;
+        let most = MAX_ENTRIES.min(max_bytes / PART / size_of::<Estimate>());
+        Self { few: most, most, max_ways: max_bytes / PART / size_of::<Way>(), max_bytes }
+    }
+
+    /// At first at most so many entries.
+    pub(in crate::mapping) fn at_first(self, few: usize) -> Self {
+        Self { few: few.min(self.most), ..self }
+    }
+}
+
+/// Which groups have tables, the smallest first as far as there is room for a few; and how many entries the others would have, as far
+/// as there is room for most.
+fn used_groups(projections: &Projections, problem: &Problem<'_>, room: TableRoom) -> (Vec<bool>, u64) {
     let groups = projections.groups();
     // A group whose attributes weigh nothing would take its share of the actions' costs to no purpose.
-    let mut wanted: Vec<usize> = (0..groups.len())
-        .filter(|number| {
-            groups[*number].is_kept() && groups[*number].positions().any(|at| problem.distances.is_active(at))
-        })
-        .collect();
+    let is_wanted = |group: &Group| {
+        group.is_kept()
+            && group.n_edges() <= room.max_ways
+            && group.positions().any(|at| problem.distances.is_active(at))
+    };
+    let mut wanted: Vec<usize> = (0..groups.len()).filter(|number| is_wanted(&groups[*number])).collect();
     wanted.sort_by_key(|number| groups[*number].n_classes());
     let mut used = vec![false; groups.len()];
     let mut n_entries = 0_usize;
@@ -462,8 +527,8 @@ fn used_groups(projections: &Projections, problem: &Problem<'_>, max_entries: us
         let of_group = stride_for(problem.demonstration.len()).saturating_mul(groups[number].n_classes());
         n_entries = n_entries.saturating_add(of_group);
         match n_entries {
-            n if n <= max_entries => used[number] = true,
-            n if n <= MAX_ENTRIES => n_left_out += of_group as u64,
+            n if n <= room.few => used[number] = true,
+            n if n <= room.most => n_left_out += of_group as u64,
             _ => break,
         }
     }

@@ -36,6 +36,11 @@ impl<T: Copy> Table<T> {
         n_classes.saturating_mul(stride_for(n_observations))
     }
 
+    /// Size in memory, in bytes.
+    pub(in crate::mapping::heuristic) fn size_bytes(&self) -> usize {
+        size_of_val(self.entries.as_slice())
+    }
+
     /// How many there are, with the room.
     #[cfg(test)]
     pub(super) fn n_entries(&self) -> usize {

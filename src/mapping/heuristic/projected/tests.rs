@@ -82,7 +82,7 @@ proptest! {
         let close = 1e-9 * (1.0 + optimum);
 
         let grouping = if is_full { Grouping::WhenItPays } else { Grouping::Widest };
-        let solved = Projected::solve(&projections, &problem, grouping, MAX_ENTRIES, &mut Buffers::default(), &mut Uninterrupted).unwrap();
+        let solved = Projected::solve(&projections, &problem, grouping, TableRoom::within(usize::MAX), &mut Buffers::default(), &mut Uninterrupted).unwrap();
         let mut projected = solved.unwrap();
         projected.set_patience(GroupingPatience {
             min_expansions: 0,
@@ -99,7 +99,7 @@ proptest! {
             if is_deep {
                 let mut interrupt = Uninterrupted;
                 let mut meter = Meter::new(&mut interrupt, 1);
-                prop_assert_eq!(projected.deepen(limit, 1, &mut meter), Ok(Deepened::Yes));
+                prop_assert_eq!(projected.deepen(limit, 1, usize::MAX, &mut meter), Ok(Deepened::Yes));
             }
             for (number, (i, state)) in reached.iter().copied().enumerate() {
                 let estimate = estimate_of(&projected, i, problem.model.states().row(state));
@@ -143,9 +143,15 @@ fn tables_have_no_more_entries_than_allowed_however_short_the_demonstration() {
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         for max_entries in [0, 7, 107, 856, 1_000, 1_712] {
             let grouping = Grouping::WhenItPays;
-            let solved =
-                Projected::solve(&projections, &problem, grouping, max_entries, &mut buffers, &mut Uninterrupted)
-                    .unwrap();
+            let solved = Projected::solve(
+                &projections,
+                &problem,
+                grouping,
+                TableRoom::within(usize::MAX).at_first(max_entries),
+                &mut buffers,
+                &mut Uninterrupted,
+            )
+            .unwrap();
             let n_entries = solved.unwrap().table.n_entries();
             assert!(n_entries <= max_entries, "{n_entries}, not {max_entries}, of {n_observations} observations");
         }
@@ -173,7 +179,14 @@ fn buffers_of_other_problems_change_no_table() {
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         let table = |buffers| {
             let grouping = Grouping::WhenItPays;
-            let solved = Projected::solve(&projections, &problem, grouping, MAX_ENTRIES, buffers, &mut Uninterrupted);
+            let solved = Projected::solve(
+                &projections,
+                &problem,
+                grouping,
+                TableRoom::within(usize::MAX),
+                buffers,
+                &mut Uninterrupted,
+            );
             format!("{:?}", solved.unwrap().unwrap().table)
         };
         assert_eq!(table(&mut buffers), table(&mut Buffers::default()), "weights {a} and {b}");

@@ -3,7 +3,7 @@
 use super::{Budget, Buffers, Mapper, Mapping, Settings, conclude, within};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::cost::SLACK;
-use crate::mapping::heuristic::projected::{MAX_ENTRIES, Projected};
+use crate::mapping::heuristic::projected::{Projected, TableRoom};
 use crate::mapping::heuristic::{GroupingPatience, Heuristic};
 use crate::mapping::search::sweep::{Layer, Swept, sweep};
 use crate::mapping::search::{Found, best_first};
@@ -31,17 +31,20 @@ impl Mapper {
         let is_small_budget = budget.max_expansions < n_observations as u64;
         let patience = self.patience;
         let few_entries = patience.few_entries.max(n_observations * patience.few_entries_per_observation);
-        let few_entries = few_entries.min(MAX_ENTRIES);
+        let room = TableRoom::within(budget.max_bytes);
         let mut before: Option<(Projected<'_>, Found)> = None;
-        for max_entries in [if is_small_budget { MAX_ENTRIES } else { few_entries }, MAX_ENTRIES] {
-            let solved = self.solve(problem, grouping, max_entries, interrupt)?;
+        for room in [if is_small_budget { room } else { room.at_first(few_entries) }, room] {
+            let solved = self.solve(problem, grouping, room, interrupt)?;
             // No time for estimates, so none for a search with them.
             let Some(mut projected) = solved else { break };
             projected.set_patience(patience.grouping);
-            let n_before = before.as_ref().map_or(0, |(_, found)| found.n_expanded);
+            // The tables of the first attempt are of no more use.
+            let found_before = before.take().map(|(_, found)| found);
+            let n_before = found_before.as_ref().map_or(0, |found| found.n_expanded);
+            let budget = budget.beside(projected.size_bytes());
             let max_expansions = budget.max_expansions - n_before;
             // What would be done instead, should it take that long.
-            let n_untabled = if max_entries < MAX_ENTRIES { projected.n_left_out() } else { 0 };
+            let n_untabled = if room.few < room.most { projected.n_left_out() } else { 0 };
             let before_sweep = patience.min_expansions_before_sweep.max(n_nodes / patience.nodes_per_expansion);
             let may_sweep = may_be_swept && before_sweep.saturating_add(n_nodes) <= max_expansions;
             let enough = match n_untabled {
@@ -52,14 +55,17 @@ impl Mapper {
             let capped = Budget { max_expansions: max_expansions.min(enough), ..budget };
             let mut found = self.search(space, problem, &mut projected, capped, most_f, interrupt)?;
             let is_enough = !found.is_complete && enough < max_expansions && found.n_expanded >= enough;
-            if let Some((_, before)) = before.take() {
+            let is_out_of_memory = found.stopped_by == Some(StoppedBy::Memory);
+            if let Some(before) = found_before {
                 found = joined(before, found);
             }
-            if is_enough && n_untabled > 0 {
+            if (is_enough || is_out_of_memory) && n_untabled > 0 {
                 before = Some((projected, found));
                 continue;
             }
-            if is_enough {
+            // A sweep takes less memory for a node.
+            let may_sweep_instead = may_be_swept && n_nodes <= budget.max_expansions.saturating_sub(found.n_expanded);
+            if is_enough || (is_out_of_memory && may_sweep_instead) {
                 match sweep(problem, budget, interrupt)? {
                     Swept::Done(swept) => found = joined(Found { paths: Vec::new(), ..found }, swept),
                     Swept::CutShort { known, n_expanded, n_generated } => {
@@ -68,6 +74,7 @@ impl Mapper {
                         found.n_generated += n_generated;
                         found.stopped_by = Some(StoppedBy::Deadline);
                     }
+                    Swept::TooLarge if is_out_of_memory => {}
                     Swept::TooLarge => {
                         let max_expansions = budget.max_expansions - found.n_expanded;
                         let rest = Budget { max_expansions, ..budget };
@@ -98,7 +105,7 @@ impl Mapper {
         most_f: f64,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Found, Cancelled> {
-        self.with_buffers(|Buffers { searching, .. }| {
+        self.with_buffers(budget.max_bytes, |Buffers { searching, .. }| {
             best_first::search(problem, space, projected, budget, most_f, searching, interrupt)
         })
     }

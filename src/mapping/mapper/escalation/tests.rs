@@ -5,6 +5,7 @@ use super::*;
 use crate::document::{Faults, Place};
 use crate::interrupt::{Signal, Uninterrupted};
 use crate::mapping::Request;
+use crate::mapping::heuristic::projected::MAX_ENTRIES;
 use crate::mapping::heuristic::{Grouping, HeuristicName};
 use crate::mapping::mapper::Status;
 use crate::model::{Definition, Limits, Model};
@@ -169,6 +170,10 @@ proptest! {
 
         let mapping = map(Budget::DEFAULT, &mut Uninterrupted);
         prop_assert!(mapping.status == Status::Optimal && close(mapping.cost.total), "{mapping:?}, not {optimum}");
+        let max_bytes = mapper.search_bytes(&request.problem, settings);
+        prop_assert!(max_bytes < Budget::DEFAULT.max_bytes);
+        let within = map(Budget { max_bytes, ..Budget::DEFAULT }, &mut Uninterrupted);
+        prop_assert!(within.status == Status::Optimal && close(within.cost.total), "{within:?}, not {optimum}");
         let mapping = map(Budget { max_expansions: few, ..Budget::DEFAULT }, &mut Uninterrupted);
         prop_assert!(is_true(&mapping) && mapping.n_expanded <= few, "{mapping:?}, of {optimum} and {few}");
         let max_bytes = 64 * usize::try_from(few).unwrap();
@@ -279,7 +284,8 @@ fn tables_left_out_at_first_come_to_the_same_cost_as_a_search_without_heuristic(
     let (mapper, request) = belt(3_000, 30);
     let request = read(&mapper, &request);
     let few_entries = Patience::DEFAULT.few_entries;
-    let few = mapper.solve(&request.problem, Grouping::WhenItPays, few_entries, &mut Uninterrupted);
+    let few = TableRoom::within(usize::MAX).at_first(few_entries);
+    let few = mapper.solve(&request.problem, Grouping::WhenItPays, few, &mut Uninterrupted);
     assert!(few.unwrap().unwrap().n_left_out() >= 90_000);
     let map = |heuristic| {
         let settings = Settings { heuristic, ..Settings::default() };
@@ -375,7 +381,7 @@ fn a_search_goes_on_where_there_is_no_room_for_a_sweep_and_none_is_begun_that_wo
     };
     let swept = map(Budget::DEFAULT);
     assert_eq!((swept.status, swept.n_expanded), (Status::Optimal, 100 + 30_000 * 30));
-    let searched = map(Budget { max_bytes: 20_000 * 64, ..Budget::DEFAULT });
+    let searched = map(Budget { max_bytes: 98_000 * 64, ..Budget::DEFAULT });
     assert_eq!((searched.status, searched.cost.total), (Status::Optimal, swept.cost.total));
     assert!(searched.n_expanded < swept.n_expanded / 4, "a search alone: {}", searched.n_expanded);
 
