@@ -28,8 +28,8 @@ pub struct Access {
 }
 
 impl Access {
-    /// Allows IP addresses, `localhost` and the names below it, the names of the machine, `hosts` as [`allowed_host`] gives them,
-    /// and `origins` as [`allowed_origin`] gives them.
+    /// Allows IP addresses, `localhost` and the names below it, the names of the machine, `hosts`, which are names in lower case or `*`
+    /// for all, and `origins`, as browsers write them.
     #[must_use]
     pub fn new(hosts: &[String], origins: &[HeaderValue]) -> Self {
         let any_host = hosts.iter().any(|host| host == "*");
