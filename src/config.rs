@@ -97,7 +97,8 @@ pub struct ServeConfig {
     /// How long a client may take to send a request up to its body, or keep a connection without one.
     #[arg(long, env = "ETUDE_HEAD_TIMEOUT", default_value = "2m", value_parser = parse_period, value_name = "TIME")]
     pub head_timeout: Duration,
-    /// How long requests may go on after SIGTERM or SIGINT, such as 500ms, 10s or 1m.
+    /// How long requests may go on after SIGTERM, SIGINT or SIGHUP, such as 500ms, 10s or 1m; a second SIGTERM or SIGINT ends them at
+    /// once.
     #[arg(long, env = "ETUDE_DRAIN_TIMEOUT", default_value = "10s", value_parser = parse_duration, value_name = "TIME")]
     pub drain_timeout: Duration,
 }

@@ -12,6 +12,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
+use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -206,18 +207,44 @@ async fn upkeep(metrics: metrics_exporter_prometheus::PrometheusHandle, stopping
     }
 }
 
-/// Completes at SIGTERM or SIGINT.
+/// The signals that stop the service.
 ///
-/// # Errors
-///
-/// If signals cannot be listened for.
-pub fn stop_signal() -> std::io::Result<impl Future<Output = ()> + Send + 'static> {
-    use tokio::signal::unix::{SignalKind, signal};
-    let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
-    Ok(async move {
-        tokio::select! {
-            _ = terminate.recv() => {}
-            _ = interrupt.recv() => {}
+/// SIGTERM, SIGINT and SIGHUP stop it in good order; a second SIGTERM or SIGINT is for those who do not want to wait for that.
+/// A second SIGHUP is none of these, as service managers send it along with SIGTERM.
+#[derive(Debug)]
+pub struct StopSignals {
+    terminate: Signal,
+    interrupt: Signal,
+    hangup: Signal,
+}
+
+impl StopSignals {
+    /// Listens for them from now on, also as the first process of a container, where they would be ignored otherwise.
+    ///
+    /// # Errors
+    ///
+    /// If signals cannot be listened for.
+    pub fn listen() -> std::io::Result<Self> {
+        let [terminate, interrupt, hangup] =
+            [SignalKind::terminate(), SignalKind::interrupt(), SignalKind::hangup()].map(signal);
+        Ok(Self { terminate: terminate?, interrupt: interrupt?, hangup: hangup? })
+    }
+
+    /// Cancels `stop` at the first of them. Completes at the second SIGTERM or SIGINT, with its number.
+    pub async fn insist(mut self, stop: CancellationToken) -> i32 {
+        let mut n_before = 0;
+        loop {
+            let kind = tokio::select! {
+                _ = self.terminate.recv() => Some(SignalKind::terminate()),
+                _ = self.interrupt.recv() => Some(SignalKind::interrupt()),
+                _ = self.hangup.recv() => None,
+            };
+            stop.cancel();
+            match kind {
+                Some(kind) if n_before > 0 => return kind.as_raw_value(),
+                Some(_) => n_before += 1,
+                None => {}
+            }
         }
-    })
+    }
 }

@@ -119,6 +119,9 @@ enum CliError {
     /// Input or output failed.
     #[error(transparent)]
     Io(#[from] io::Error),
+    /// A second signal has stopped the service before its work was done.
+    #[error("stopped by signal {0}")]
+    Signal(i32),
     /// Nothing can be logged.
     #[error(transparent)]
     Log(#[from] crate::telemetry::LogError),
@@ -145,6 +148,8 @@ pub fn run() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         // Whoever read our output has seen enough.
         Err(CliError::Io(error)) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
+        // As a shell tells of who was killed by it. To tell more could take as long as what was cut short.
+        Err(CliError::Signal(signal)) => ExitCode::from(u8::try_from(128 + signal).unwrap_or(u8::MAX)),
         Err(error) => {
             report(&error);
             ExitCode::FAILURE

@@ -1,10 +1,11 @@
 //! `etude serve`.
 
 use clap::Args;
+use tokio_util::sync::CancellationToken;
 
 use super::{CliError, runtime};
 use crate::config::ServeConfig;
-use crate::server::{Server, stop_signal};
+use crate::server::{Server, StopSignals};
 
 #[derive(Args, Debug)]
 pub(super) struct Serve {
@@ -17,10 +18,20 @@ impl Serve {
         let runtime = runtime()?;
         let served = runtime.block_on(async {
             // Listened for before anything is started, so that no signal is missed.
-            let stop = stop_signal()?;
-            let server = Server::start(&self.config).await?;
-            server.run(stop).await;
-            Ok(())
+            let signals = StopSignals::listen()?;
+            let stop = CancellationToken::new();
+            let serving = async {
+                let server = Server::start(&self.config).await?;
+                server.run(stop.clone().cancelled_owned()).await;
+                Ok(())
+            };
+            tokio::select! {
+                served = serving => served,
+                signal = signals.insist(stop.clone()) => {
+                    tracing::warn!(signal, "stopped at once, as a second signal asks for it");
+                    Err(CliError::Signal(signal))
+                }
+            }
         });
         // A job that does not look up must not keep the process: the store is closed, and nobody waits any more.
         runtime.shutdown_background();

@@ -1,0 +1,151 @@
+//! The program as its surroundings treat it: signals, and logs that nobody reads.
+
+#![expect(clippy::unwrap_used, reason = "tests may panic")]
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::process::{Child, ChildStderr, Command, ExitStatus, Stdio};
+use std::sync::mpsc;
+use std::time::Duration;
+
+use tempfile::TempDir;
+
+/// Longer than anything here takes; what is not done by then is killed, and its test fails.
+const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A service in a process of its own, whose log is read only when a test reads it.
+struct Process {
+    child: Child,
+    address: String,
+    log: BufReader<ChildStderr>,
+    /// Dropped once it has ended.
+    _watched: mpsc::Sender<()>,
+    _directory: TempDir,
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        // It has ended already, unless the test failed.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn serve(address: &str, directory: &TempDir, flags: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
+    command.args(["serve", "--log-format", "text", "--listen", address]).args(flags);
+    command.arg("--database").arg(directory.path().join("etude.db"));
+    command.env_remove("ETUDE_LOG").stdout(Stdio::null());
+    command
+}
+
+fn send_signal(signal: &str, process: u32) {
+    assert!(Command::new("kill").args([signal, &process.to_string()]).status().unwrap().success());
+}
+
+/// Kills the process if what is returned is not dropped in time.
+fn watch(process: u32) -> mpsc::Sender<()> {
+    let (watched, ended) = mpsc::channel();
+    std::thread::spawn(move || {
+        if ended.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout) {
+            send_signal("-KILL", process);
+        }
+    });
+    watched
+}
+
+impl Process {
+    fn start(flags: &[&str]) -> Self {
+        let directory = tempfile::tempdir().unwrap();
+        let mut child = serve("127.0.0.1:0", &directory, flags).stderr(Stdio::piped()).spawn().unwrap();
+        let log = BufReader::new(child.stderr.take().unwrap());
+        let watched = watch(child.id());
+        let mut process = Self { child, address: String::new(), log, _watched: watched, _directory: directory };
+        let listening = process.until_logged("listening on http://");
+        process.address = listening.split("http://").nth(1).unwrap().split(' ').next().unwrap().trim().to_owned();
+        process
+    }
+
+    /// Reads the log up to a line that has `part`.
+    fn until_logged(&mut self, part: &str) -> String {
+        loop {
+            let mut line = String::new();
+            assert_ne!(self.log.read_line(&mut line).unwrap(), 0, "it has ended without {part:?}");
+            if line.contains(part) {
+                return line;
+            }
+        }
+    }
+
+    fn signal(&self, signal: &str) {
+        send_signal(signal, self.child.id());
+    }
+
+    fn ended(&mut self) -> ExitStatus {
+        self.child.wait().unwrap()
+    }
+}
+
+/// Sends a request, and gives the answer, on a connection that stays open.
+fn ask(connection: &mut BufReader<TcpStream>, request: &str) -> String {
+    connection.get_mut().write_all(request.as_bytes()).unwrap();
+    let (mut head, mut n_bytes) = (String::new(), 0);
+    loop {
+        let start = head.len();
+        assert_ne!(connection.read_line(&mut head).unwrap(), 0, "{head}");
+        match head[start..].trim().split_once(": ") {
+            Some(("content-length", value)) => n_bytes = value.parse().unwrap(),
+            Some(_) => {}
+            None if head[start..].trim().is_empty() => break,
+            None => {}
+        }
+    }
+    let mut body = vec![0; n_bytes];
+    connection.read_exact(&mut body).unwrap();
+    head + &String::from_utf8(body).unwrap()
+}
+
+fn connect(address: &str) -> BufReader<TcpStream> {
+    let connection = TcpStream::connect(address).unwrap();
+    connection.set_read_timeout(Some(PATIENCE)).unwrap();
+    BufReader::new(connection)
+}
+
+/// A request that is being served until `rest` is sent.
+fn begin_request(process: &Process) -> (BufReader<TcpStream>, &'static str) {
+    let mut connection = connect(&process.address);
+    let body = r#"{"attributes": ["x"]}"#;
+    let head = format!(
+        "PUT /v1/learners/slow HTTP/1.1\r\nhost: {}\r\ncontent-type: application/json\r\ncontent-length: {}\r\n\
+         expect: 100-continue\r\n\r\n",
+        process.address,
+        body.len()
+    );
+    assert!(ask(&mut connection, &head).starts_with("HTTP/1.1 100"));
+    (connection, body)
+}
+
+#[test]
+fn a_second_sigterm_or_sigint_ends_the_service_at_once() {
+    for (first, second, code) in [("-TERM", "-TERM", 143), ("-INT", "-INT", 130), ("-TERM", "-INT", 130)] {
+        let mut process = Process::start(&["--drain-timeout", "1h"]);
+        let _waiting = begin_request(&process);
+        process.signal(first);
+        process.until_logged("stopping");
+        process.signal(second);
+        assert_eq!(process.ended().code(), Some(code), "{first}, {second}");
+    }
+}
+
+#[test]
+fn sighup_lets_requests_end_as_sigterm_does_and_a_second_one_changes_nothing() {
+    let mut process = Process::start(&["--drain-timeout", "1h"]);
+    let (mut connection, rest) = begin_request(&process);
+    process.signal("-HUP");
+    process.until_logged("stopping");
+    process.signal("-HUP");
+    let answer = ask(&mut connection, rest);
+    assert!(answer.starts_with("HTTP/1.1 201"), "{answer}");
+    process.until_logged("stopped");
+    assert_eq!(process.ended().code(), Some(0));
+}
