@@ -111,6 +111,64 @@ fn connect(address: &str) -> BufReader<TcpStream> {
     BufReader::new(connection)
 }
 
+/// Sends requests until far more is logged of them than fits into a pipe and what waits before it.
+fn fill_log(process: &Process) {
+    let mut connection = connect(&process.address);
+    let request = format!("GET /{} HTTP/1.1\r\nhost: {}\r\n\r\n", "x".repeat(4000), process.address);
+    for _ in 0..3000 {
+        assert!(ask(&mut connection, &request).starts_with("HTTP/1.1 404"));
+    }
+    let measured = ask(&mut connection, &format!("GET /metrics HTTP/1.1\r\nhost: {}\r\n\r\n", process.address));
+    let dropped = measured.lines().find_map(|line| line.strip_prefix("etude_log_lines_dropped_total "));
+    let n_dropped = dropped.expect("it is measured").parse::<u64>().unwrap();
+    assert!((1000..3000).contains(&n_dropped), "{n_dropped}");
+}
+
+#[test]
+fn a_log_that_nobody_reads_holds_up_neither_requests_nor_the_end() {
+    let mut process = Process::start(&["--log", "info"]);
+    fill_log(&process);
+    process.signal("-TERM");
+    assert_eq!(process.ended().code(), Some(0));
+}
+
+#[test]
+fn how_many_log_lines_were_dropped_is_logged_once_the_log_is_read_again() {
+    let mut process = Process::start(&["--log", "info"]);
+    fill_log(&process);
+    let line = process.until_logged("log lines were dropped");
+    assert!(line.contains("WARN") && line.contains("n_dropped="), "{line}");
+    process.signal("-TERM");
+    process.until_logged("stopped");
+    assert_eq!(process.ended().code(), Some(0));
+}
+
+#[test]
+fn without_standard_error_requests_are_answered_and_signals_heard() {
+    let directory = tempfile::tempdir().unwrap();
+    // An address that is this process's alone, as nothing tells which one was taken.
+    let [.., high, low] = std::process::id().to_be_bytes();
+    let address = format!("127.77.{high}.{}:8080", low.max(1));
+    let plain = serve(&address, &directory, &["--log", "info"]);
+    let mut command = Command::new("sh");
+    command.args(["-c", r#"exec "$0" "$@" 2>&-"#]).arg(plain.get_program()).args(plain.get_args());
+    let mut child = command.stdout(Stdio::null()).spawn().unwrap();
+    let _watched = watch(child.id());
+    while TcpStream::connect(&address).is_err() {
+        assert_eq!(child.try_wait().unwrap(), None, "it runs");
+        std::thread::yield_now();
+    }
+    let mut connection = connect(&address);
+    for _ in 0..3000 {
+        let answer = ask(&mut connection, &format!("GET /v1/models HTTP/1.1\r\nhost: {address}\r\n\r\n"));
+        assert!(answer.starts_with("HTTP/1.1 200"), "{answer}");
+    }
+    send_signal("-TERM", child.id());
+    assert_eq!(child.wait().unwrap().code(), Some(0));
+    let log = std::fs::read(directory.path().join("etude.db")).unwrap();
+    assert!(log.starts_with(b"SQLite format 3"), "nothing was logged into what was opened next");
+}
+
 /// A request that is being served until `rest` is sent.
 fn begin_request(process: &Process) -> (BufReader<TcpStream>, &'static str) {
     let mut connection = connect(&process.address);

@@ -6,6 +6,7 @@ use tokio_util::sync::CancellationToken;
 use super::{CliError, runtime};
 use crate::config::ServeConfig;
 use crate::server::{Server, StopSignals};
+use crate::telemetry::log_panics;
 
 #[derive(Args, Debug)]
 pub(super) struct Serve {
@@ -15,6 +16,7 @@ pub(super) struct Serve {
 
 impl Serve {
     pub(super) fn run(&self) -> Result<(), CliError> {
+        log_panics();
         let runtime = runtime()?;
         let served = runtime.block_on(async {
             // Listened for before anything is started, so that no signal is missed.

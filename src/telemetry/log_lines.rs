@@ -1,13 +1,20 @@
 //! Log lines on their way out.
 //!
 //! A line that is written at once costs a system call, and threads that log at the same time wait for each other in it. So lines
-//! gather, and a thread writes all that there are: the first one at once, the next ones not before some time has passed. What
-//! warns of something takes all before it along and is out before its thread goes on; so is what was logged before the end.
+//! gather in memory, and one thread writes all that there are: the first one at once, the next ones not before some time has
+//! passed, or at once if one of them warns of something.
 //!
 //! ```text
-//! lines --> gathered --(thread, every WRITE_EVERY)--> out
-//!              +---(a warning, the end, too many)------^
+//! lines --> waiting (bounded) --(a thread, every WRITE_EVERY)--> out
+//!              +--> dropped and counted, while nobody takes them away
 //! ```
+//!
+//! Nobody who logs ever waits for whoever reads the log: a pipe that is full would stop the whole service. Lines for which there is
+//! no room are dropped, also those that warn of something. How many is measured (`etude_log_lines_dropped_total`) and, once
+//! lines are taken away again, logged.
+//!
+//! This is not `tracing-appender`, which does the same as fast: where lines are stuck at the end of the process, it says so on
+//! standard output, and waits for ever if that leads into the same pipe.
 
 use std::io::{self, Write};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -19,23 +26,34 @@ use tracing_subscriber::fmt::MakeWriter;
 /// How long a line may wait for others. Whoever reads along does not notice it.
 const WRITE_EVERY: Duration = Duration::from_millis(10);
 
-/// Lines are written by whoever logs once they take this much: where they are not taken away as fast as they come, logging waits.
-const MAX_GATHERED_BYTES: usize = 256 * 1024;
+/// Most bytes of lines that wait to be written, some 16,000 lines: a second of a busy service. While they are written, as many wait again.
+const MAX_WAITING_BYTES: usize = 4 << 20;
+
+/// How long the end of the process waits for lines to be written.
+const FLUSH_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Where log lines are written to.
 #[derive(Clone)]
 pub(super) struct LogLines(Arc<Lines>);
 
+#[derive(Default)]
 struct Lines {
-    gathered: Mutex<Vec<u8>>,
+    waiting: Mutex<Waiting>,
+    /// Some wait that are to be written.
     has_some: Condvar,
-    out: Mutex<Out>,
+    /// Some were written.
+    has_written: Condvar,
 }
 
-struct Out {
-    writer: Box<dyn Write + Send>,
-    /// What is just being written; empty, but with the space that it took, between two times.
+#[derive(Default)]
+struct Waiting {
     lines: Vec<u8>,
+    /// Lines that found no room since this was last told.
+    n_dropped: u64,
+    /// Whether what waits is written without waiting for more.
+    is_urgent: bool,
+    /// Whether lines that were taken out are not written yet.
+    is_writing: bool,
 }
 
 impl LogLines {
@@ -44,56 +62,89 @@ impl LogLines {
     /// # Errors
     ///
     /// If there can be no thread that writes them.
-    pub(super) fn start(writer: impl Write + Send + 'static) -> io::Result<Self> {
-        let out = Mutex::new(Out { writer: Box::new(writer), lines: Vec::new() });
-        let lines = Arc::new(Lines { gathered: Mutex::default(), has_some: Condvar::new(), out });
+    pub(super) fn start(mut writer: impl Write + Send + 'static) -> io::Result<Self> {
+        let lines = Arc::new(Lines::default());
         let writing = Arc::clone(&lines);
         // It ends with the process.
         std::thread::Builder::new().name("log".to_owned()).spawn(move || {
+            let mut taken = Vec::new();
             loop {
-                let is_empty = |gathered: &mut Vec<u8>| gathered.is_empty();
-                drop(writing.has_some.wait_while(lock(&writing.gathered), is_empty));
-                writing.flush();
-                std::thread::sleep(WRITE_EVERY);
+                writing.take(&mut taken);
+                if writer.write_all(&taken).and_then(|()| writer.flush()).is_err() {
+                    // There is nowhere to tell that nothing can be told, but for the measurements.
+                    count_dropped(taken.iter().filter(|byte| **byte == b'\n').count() as u64);
+                }
+                writing.wait_for_more();
             }
         })?;
         Ok(Self(lines))
     }
 
-    /// Writes all that was logged.
+    /// Waits until all that was logged is written, but not for long.
     pub(super) fn flush(&self) {
         self.0.flush();
     }
 }
 
 impl Lines {
+    /// Adds a line if there is room for it. Never waits for a writer.
     fn add(&self, line: &[u8], is_urgent: bool) {
-        let mut gathered = lock(&self.gathered);
-        let was_empty = gathered.is_empty();
-        gathered.extend_from_slice(line);
-        let is_full = gathered.len() >= MAX_GATHERED_BYTES;
-        drop(gathered);
-        if is_urgent || is_full {
-            self.flush();
-        } else if was_empty {
+        let mut waiting = self.lock();
+        if waiting.lines.len() + line.len() > MAX_WAITING_BYTES {
+            waiting.n_dropped += 1;
+            drop(waiting);
+            return count_dropped(1);
+        }
+        let is_first = waiting.lines.is_empty();
+        let becomes_urgent = is_urgent && !waiting.is_urgent;
+        waiting.lines.extend_from_slice(line);
+        waiting.is_urgent |= is_urgent;
+        drop(waiting);
+        if is_first || becomes_urgent {
             self.has_some.notify_one();
         }
     }
 
+    /// Waits for lines, and exchanges them for `taken`, which is emptied.
+    fn take(&self, taken: &mut Vec<u8>) {
+        taken.clear();
+        let is_empty = |waiting: &mut Waiting| waiting.lines.is_empty();
+        let mut waiting = self.has_some.wait_while(self.lock(), is_empty).unwrap_or_else(PoisonError::into_inner);
+        std::mem::swap(&mut waiting.lines, taken);
+        waiting.is_urgent = false;
+        waiting.is_writing = true;
+        let n_dropped = std::mem::take(&mut waiting.n_dropped);
+        drop(waiting);
+        if n_dropped > 0 {
+            // It finds room, as all that waited was just taken.
+            tracing::warn!(n_dropped, "log lines were dropped, as those before them were not taken away");
+        }
+    }
+
+    /// Tells that what was taken is written, and gives further lines some time to gather.
+    fn wait_for_more(&self) {
+        let mut waiting = self.lock();
+        waiting.is_writing = false;
+        self.has_written.notify_all();
+        drop(self.has_some.wait_timeout_while(waiting, WRITE_EVERY, |waiting| !waiting.is_urgent));
+    }
+
     fn flush(&self) {
-        // Before the lines are taken, so that those taken later are written later.
-        let mut out = lock(&self.out);
-        let Out { writer, lines } = &mut *out;
-        std::mem::swap(lines, &mut lock(&self.gathered));
-        // There is nowhere to tell that nothing can be told.
-        let _ = writer.write_all(lines).and_then(|()| writer.flush());
-        lines.clear();
+        let mut waiting = self.lock();
+        waiting.is_urgent = true;
+        self.has_some.notify_one();
+        let is_on_its_way = |waiting: &mut Waiting| waiting.is_writing || !waiting.lines.is_empty();
+        drop(self.has_written.wait_timeout_while(waiting, FLUSH_TIMEOUT, is_on_its_way));
+    }
+
+    /// What a panic has left behind is whole lines.
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
-/// What a panic has left behind is whole lines.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+fn count_dropped(n_lines: u64) {
+    metrics::counter!("etude_log_lines_dropped_total").increment(n_lines);
 }
 
 /// Writes a line.
@@ -109,7 +160,6 @@ impl Write for LineWriter<'_> {
     }
 
     fn flush(&mut self) -> io::Result<()> {
-        self.lines.flush();
         Ok(())
     }
 }
@@ -132,8 +182,8 @@ mod tests {
 
     use super::*;
 
-    /// Tells what is written at a time.
-    struct Told(mpsc::Sender<String>);
+    /// Tells what is written at a time, as soon as that is taken.
+    struct Told(mpsc::SyncSender<String>);
 
     impl Write for Told {
         fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
@@ -146,14 +196,15 @@ mod tests {
         }
     }
 
-    fn told() -> (LogLines, mpsc::Receiver<String>) {
-        let (sender, written) = mpsc::channel();
+    /// Lines of which so many writes are taken before somebody reads.
+    fn told(n_taken: usize) -> (LogLines, mpsc::Receiver<String>) {
+        let (sender, written) = mpsc::sync_channel(n_taken);
         (LogLines::start(Told(sender)).unwrap(), written)
     }
 
     #[test]
     fn a_line_is_written_without_another_one() {
-        let (lines, written) = told();
+        let (lines, written) = told(1);
         lines.0.add(b"listening\n", false);
         assert_eq!(written.recv().unwrap(), "listening\n");
         lines.0.add(b"stopped\n", false);
@@ -161,22 +212,37 @@ mod tests {
     }
 
     #[test]
-    fn a_warning_and_all_before_it_is_out_before_its_thread_goes_on() {
-        let (lines, written) = told();
+    fn all_lines_are_out_in_order_once_they_are_flushed() {
+        let (lines, written) = told(2000);
         for n in 0..1000 {
-            lines.0.add(format!("line {n}\n").as_bytes(), false);
+            lines.0.add(format!("line {n}\n").as_bytes(), n % 100 == 0);
         }
-        lines.0.add(b"warning\n", true);
+        lines.flush();
         let out: String = written.try_iter().collect();
-        let expected: Vec<_> = (0..1000).map(|n| format!("line {n}")).chain(["warning".to_owned()]).collect();
+        let expected: Vec<_> = (0..1000).map(|n| format!("line {n}")).collect();
         assert_eq!(out.lines().collect::<Vec<_>>(), expected);
     }
 
+    /// With a writer that is stuck for good, this would not end if anybody waited for it.
     #[test]
-    fn whoever_logs_more_than_is_taken_away_waits() {
-        let (lines, written) = told();
-        let line = vec![b'x'; MAX_GATHERED_BYTES];
-        lines.0.add(&line, false);
-        assert_eq!(written.try_iter().map(|out| out.len()).sum::<usize>(), MAX_GATHERED_BYTES);
+    fn who_logs_what_nobody_takes_away_does_not_wait_and_what_finds_no_room_is_dropped() {
+        let (lines, written) = told(0);
+        lines.0.add(b"first\n", false);
+        while !lines.0.lock().is_writing {
+            std::thread::yield_now();
+        }
+        let line = vec![b'x'; MAX_WAITING_BYTES / 4];
+        for n in 0..10 {
+            lines.0.add(&line, n % 2 == 0);
+        }
+        let (n_bytes, n_dropped) = {
+            let waiting = lines.0.lock();
+            (waiting.lines.len(), waiting.n_dropped)
+        };
+        assert_eq!((n_bytes, n_dropped), (MAX_WAITING_BYTES, 6));
+        lines.flush();
+        // Once somebody reads, what has found room is there.
+        assert_eq!(written.recv().unwrap(), "first\n");
+        assert_eq!(written.recv().unwrap().len(), MAX_WAITING_BYTES);
     }
 }

@@ -43,7 +43,7 @@ pub enum LogError {
     Start(#[from] io::Error),
 }
 
-/// Logging, as long as this is there: when it is dropped, all lines are written.
+/// Logging, as long as this is there: when it is dropped, all lines are written, unless nobody takes them away for a second.
 #[must_use]
 pub struct Logging(LogLines);
 
@@ -53,7 +53,8 @@ impl Drop for Logging {
     }
 }
 
-/// Starts logging; what `default_filter` says if `config` says nothing. Lines that warn of nothing may be written a moment later.
+/// Starts logging; what `default_filter` says if `config` says nothing. Lines are written by a thread of their own, a moment later, and
+/// dropped where nobody takes them away.
 ///
 /// # Errors
 ///
@@ -67,6 +68,15 @@ pub fn start_logging(config: &LogConfig, default_filter: &str) -> Result<Logging
         LogFormat::Json => builder.json().flatten_event(true).with_current_span(true).with_span_list(false).init(),
     }
     Ok(Logging(lines))
+}
+
+/// Has panics logged, not written to standard error by whoever panics, who would wait where nobody reads that.
+pub fn log_panics() {
+    std::panic::set_hook(Box::new(|panic| {
+        let backtrace = std::backtrace::Backtrace::capture();
+        let is_captured = backtrace.status() == std::backtrace::BacktraceStatus::Captured;
+        tracing::error!(backtrace = is_captured.then(|| tracing::field::display(backtrace)), "{panic}");
+    }));
 }
 
 /// Seconds. From a search of a small world to one that takes minutes.
