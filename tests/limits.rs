@@ -1,5 +1,7 @@
 //! What one request may take of the service: time, memory, and the patience of others.
 
+#![expect(clippy::unwrap_used, reason = "tests may panic")]
+
 mod service;
 
 use std::time::Instant;

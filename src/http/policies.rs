@@ -133,7 +133,7 @@ pub(super) struct BatchAnswer {
 /// What became of an item.
 #[derive(Serialize, ToSchema)]
 #[serde(untagged)]
-#[expect(dead_code, reason = "as above")]
+#[expect(dead_code, clippy::large_enum_variant, reason = "as above")]
 enum BatchItem {
     /// Its policy, stored.
     Policy(Policy),
