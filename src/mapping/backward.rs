@@ -149,25 +149,30 @@ pub(super) struct Buffers {
 impl Graph {
     /// `ways` gives each way as where it leaves, where it leads and the number of its price. `None` if more leave one vertex than can be
     /// numbered.
+    ///
+    /// # Errors
+    ///
+    /// What the interrupt of `meter` said, if that was not to continue.
     pub(super) fn new(
         n_vertices: usize,
         ways: impl Iterator<Item = (u32, u32, PriceIdx)> + Clone,
         prices: Vec<Price>,
-    ) -> Option<Self> {
-        let mut out =
-            Rows::of_entries(n_vertices, ways.map(|(from, to, price)| (from, Way { vertex: to, price, number: 0 })));
+        meter: &mut Meter<'_>,
+    ) -> Result<Option<Self>, Signal> {
+        let ways = ways.map(|(from, to, price)| (from, Way { vertex: to, price, number: 0 }));
+        let mut out = Rows::try_of_entries(n_vertices, ways, || meter.go_on(1))?;
         for vertex in 0..n_vertices {
             let ways = out.of_mut(vertex);
             if ways.len() > MAX_WAYS_OUT {
-                return None;
+                return Ok(None);
             }
             ways.iter_mut().zip(0..).for_each(|(way, number)| way.number = number);
         }
         let rows = out.iter().zip(0..);
         let reversed =
             rows.flat_map(|(ways, from)| ways.iter().map(move |way| (way.vertex, Way { vertex: from, ..*way })));
-        let into = Rows::of_entries(n_vertices, reversed);
-        Some(Self { out, into, prices })
+        let into = Rows::try_of_entries(n_vertices, reversed, || meter.go_on(1))?;
+        Ok(Some(Self { out, into, prices }))
     }
 
     /// How much memory one takes, in bytes.

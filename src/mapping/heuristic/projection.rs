@@ -338,7 +338,8 @@ impl Group {
 
     /// Takes the edges, each with the class that it leads to, and sorts them.
     fn set_edges(&mut self, edges: &[(ClassIdx, ProjectedEdge)], meter: &mut Meter<'_>) -> Result<(), Interrupted> {
-        self.edges = Rows::of_entries(self.n_classes(), edges.iter().copied());
+        let entries = edges.iter().copied();
+        self.edges = Rows::try_of_entries(self.n_classes(), entries, || meter.spend_or_stop(1))?;
         for class in 0..self.n_classes() {
             let into = self.edges.of_mut(class);
             meter.spend_or_stop(1 + into.len() as u64)?;

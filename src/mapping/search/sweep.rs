@@ -52,12 +52,21 @@ pub(in crate::mapping) fn sweep(
 }
 
 /// The same, in sections of so many layers.
-fn in_sections(problem: &Problem<'_>, section_len: usize, meter: Meter<'_>) -> Result<Swept, Cancelled> {
+fn in_sections(problem: &Problem<'_>, section_len: usize, mut meter: Meter<'_>) -> Result<Swept, Cancelled> {
     let model = problem.model;
     let n_states = model.graph().n_states();
     let ways = model.graph().iter().map(|(from, transition)| (from, transition.to, transition.action));
     let prices = model.actions().iter().map(|action| Price { share: action.cost, part: 0.0 });
-    let Some(graph) = Graph::new(n_states, ways, prices.collect()) else { return Ok(Swept::TooLarge) };
+    let graph = match Graph::new(n_states, ways, prices.collect(), &mut meter) {
+        Ok(Some(graph)) => graph,
+        Ok(None) => return Ok(Swept::TooLarge),
+        Err(Signal::Cancel) => return Err(Cancelled),
+        Err(_) => {
+            // Nothing is less.
+            let known = Layer { observation: problem.last(), costs: vec![0.0; n_states] };
+            return Ok(Swept::CutShort { known, n_expanded: 0, n_generated: 0 });
+        }
+    };
     let mut sweep = Sweep {
         problem,
         graph: &graph,

@@ -41,7 +41,7 @@ impl Full {
     /// Makes the table.
     pub(super) fn solve(basis: &Basis<'_>, meter: &mut Meter<'_>) -> Result<Self, Unsolved> {
         let group = basis.group;
-        let graph = graph(group, &basis.parts).ok_or(Unsolved::Impossible)?;
+        let graph = graph(group, &basis.parts, meter)?.ok_or(Unsolved::Impossible)?;
         let (n_classes, last) = (group.n_classes(), basis.least_terms.len() - 1);
         let mut costs = Table::filled_with(0.0, n_classes, last + 1);
         let mut buffers = backward::Buffers::default();
@@ -81,14 +81,14 @@ impl Full {
 }
 
 /// The ways between the classes of a group. `None` if it has more prices than can be numbered, or more ways out of a class.
-fn graph(group: &Group, parts: &Parts<'_>) -> Option<Graph> {
+fn graph(group: &Group, parts: &Parts<'_>, meter: &mut Meter<'_>) -> Result<Option<Graph>, Unsolved> {
     let ways = Ways::into_classes(group, parts);
     let mut prices = Vec::new();
     let mut numbers: FxHashMap<[u64; 2], PriceIdx> = FxHashMap::default();
     let mut numbered: Vec<(ClassIdx, ClassIdx, PriceIdx)> = Vec::with_capacity(ways.len());
     for (to, into) in (0..).zip(ways.iter()) {
         for Way { class: from, price } in into {
-            let next = PriceIdx::try_from(prices.len()).ok()?;
+            let Ok(next) = PriceIdx::try_from(prices.len()) else { return Ok(None) };
             let number = *numbers.entry([price.share, price.part].map(f64::to_bits)).or_insert(next);
             if number == next {
                 prices.push(*price);
@@ -97,7 +97,7 @@ fn graph(group: &Group, parts: &Parts<'_>) -> Option<Graph> {
         }
     }
     drop(ways);
-    Graph::new(group.n_classes(), numbered.iter().copied(), prices)
+    Graph::new(group.n_classes(), numbered.iter().copied(), prices, meter).map_err(Unsolved::Interrupted)
 }
 
 /// What the classes of a group cost at an observation.
