@@ -168,12 +168,16 @@ impl ServeConfig {
             streams: self.max_streams.min(self.max_connections - self.max_connections / 4),
             slow_after: self.slow_reader_timeout,
             idle_after: self.session_idle_timeout,
+            ping_every: STREAM_PING_INTERVAL,
         }
     }
 }
 
 /// Largest frame of a stream: a thousand observations of a dozen attributes.
 const STREAM_FRAME_BYTES: usize = 262_144;
+
+/// How often a silent client of a stream is asked for a sign of life: a peer that is gone without a word is noticed within two minutes.
+const STREAM_PING_INTERVAL: Duration = Duration::from_secs(30);
 
 /// Most memory for models by default.
 const MAX_MODEL_CACHE_BYTES: u64 = 1 << 30;

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use etude::document::Place;
 use etude::service::{Caller, Etude};
-use etude::stream::{Closed, Incoming, Outgoing};
+use etude::stream::{Closed, Incoming, Outgoing, Receiver, Sender, queue};
 use futures_util::{SinkExt, StreamExt};
 use jiff::Timestamp;
 use process::Process;
@@ -18,14 +18,15 @@ use reqwest::{Body, Method};
 use serde_json::{Value, json};
 use service::{Service, example, long_way, to_and_fro};
 use tempfile::TempDir;
-use tokio::net::TcpStream;
+use tokio::net::{TcpSocket, TcpStream};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
+use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 use tokio_tungstenite::tungstenite::protocol::frame::Frame;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
-use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -36,7 +37,7 @@ const NDJSON: &str = "application/x-ndjson";
 
 /// A websocket client.
 struct Client {
-    socket: WebSocketStream<MaybeTlsStream<TcpStream>>,
+    socket: WebSocketStream<TcpStream>,
 }
 
 impl Client {
@@ -46,9 +47,21 @@ impl Client {
     }
 
     async fn connect_to(address: &str) -> Self {
+        Self::over(TcpStream::connect(address).await.unwrap(), address).await
+    }
+
+    /// A client that soon has no room for what it does not read.
+    async fn connect_narrowly(service: &Service) -> Self {
+        Self::over(narrow(service).await, &service.address.to_string()).await
+    }
+
+    async fn over(stream: TcpStream, address: &str) -> Self {
         let mut request = format!("ws://{address}/v1/stream").into_client_request().unwrap();
         request.headers_mut().insert("sec-websocket-protocol", "etude.v1+json".parse().unwrap());
-        let (socket, response) = tokio_tungstenite::connect_async(request).await.unwrap();
+        // As many clients do, it closes where a message is longer than announced.
+        let config = WebSocketConfig::default().max_message_size(Some(262_144));
+        let (socket, response) =
+            tokio_tungstenite::client_async_with_config(request, stream, Some(config)).await.unwrap();
         assert_eq!(response.headers()["sec-websocket-protocol"], "etude.v1+json");
         let mut client = Self { socket };
         let hello = client.receive().await;
@@ -105,6 +118,13 @@ impl Client {
         assert_eq!((&opened["type"], &opened["received"]), (&json!("opened"), &json!(0)), "{opened}");
         opened["session"].as_str().unwrap().to_owned()
     }
+}
+
+/// A connection that soon has no room for what is not read.
+async fn narrow(service: &Service) -> TcpStream {
+    let socket = TcpSocket::new_v4().unwrap();
+    socket.set_recv_buffer_size(16 * 1024).unwrap();
+    socket.connect(service.address).await.unwrap()
 }
 
 async fn figure_4() -> (Service, Vec<Value>) {
@@ -173,13 +193,16 @@ async fn a_local_policy_is_refined_after_the_stream() {
     let done = client.receive_until("done").await.pop().unwrap();
     assert_eq!(done["status"], "local");
     let path = format!("/v1/policies/{}", done["policy_id"].as_str().unwrap());
-    let refined_by = loop {
-        let (_, local) = service.get(&path).await;
-        if let Some(refined_by) = local["refined_by"].as_str() {
-            break refined_by.to_owned();
+    let refined_by = async {
+        loop {
+            let (_, local) = service.get(&path).await;
+            if let Some(refined_by) = local["refined_by"].as_str() {
+                return refined_by.to_owned();
+            }
+            tokio::task::yield_now().await;
         }
-        tokio::task::yield_now().await;
     };
+    let refined_by = tokio::time::timeout(PATIENCE, refined_by).await.unwrap();
     let (_, refined) = service.get(&format!("/v1/policies/{refined_by}")).await;
     assert_eq!((&refined["refines"], &refined["status"]), (&done["policy_id"], &json!("optimal")));
     assert_eq!(refined["weights"]["gold"], 1.5);
@@ -519,9 +542,9 @@ async fn a_thousand_observations_fit_into_a_frame() {
     assert_eq!(steps(&frames).last().unwrap()["observation"], 999);
 }
 
-/// With thousands of actions of long names, `done` is larger than any frame that a client may send.
+/// With thousands of actions of long names, `done` would be larger than any message may be.
 #[tokio::test]
-async fn the_policy_of_a_long_session_arrives_over_a_websocket() {
+async fn no_message_is_longer_than_announced_though_the_actions_of_a_long_session_are() {
     let service = Service::start(&[]).await;
     // Four bytes a character, of which a name has 64 at most.
     let step = "\u{1f463}".repeat(64);
@@ -531,20 +554,56 @@ async fn the_policy_of_a_long_session_arrives_over_a_websocket() {
         "dynamics": {"kind": "table", "states": [[0], [1]], "transitions": [[0, step, 1], [1, step, 0]], "start": 0},
     });
     assert_eq!(service.put("/v1/models/toggle", &toggle).await.0, 201);
+    // As many as fit, and more.
+    for n_states in [1000, 6000] {
+        let mut client = Client::connect(&service).await;
+        let session = client.open(json!({"type": "open", "model": "toggle", "lookahead": 1})).await;
+        let states: Vec<Value> = (0..n_states).map(|n| json!([n % 2])).collect();
+        client.send(json!({"type": "observe", "seq": 0, "states": states})).await;
+        client.send(json!({"type": "end", "seq": n_states})).await;
+        let done = client.receive_until("done").await.pop().unwrap();
+        assert_eq!(client.closed().await, 1000);
+        let (_, policy) = service.get(&format!("/v1/policies/{}", done["policy_id"].as_str().unwrap())).await;
+        assert_eq!(policy["actions"].as_array().unwrap().len(), n_states - 1);
+        let told = if n_states == 1000 { &policy["actions"] } else { &Value::Null };
+        assert_eq!((&done["actions"], &done["cost"]["total"]), (told, &policy["cost"]["total"]));
+        // And once more to who has lost it.
+        let mut client = Client::connect(&service).await;
+        client.send(json!({"type": "resume", "session": session, "step": n_states - 1})).await;
+        assert_eq!(client.receive_until("done").await.last().unwrap(), &done);
+        assert_eq!(client.closed().await, 1000);
+    }
+}
+
+/// As many attributes of as long names and values as a model may have.
+#[tokio::test]
+async fn a_model_whose_steps_are_longer_than_a_message_ends_the_stream_and_says_so() {
+    let service = Service::start(&[]).await;
+    let name = |n: usize| format!("{n:0>3}{}", "\u{1f463}".repeat(61));
+    let attributes: Vec<Value> = (0..256).map(|n| json!({"name": name(n), "kind": "category"})).collect();
+    let state = |letter: &str| vec![letter.repeat(1024); 256];
+    let wide = json!({
+        "attributes": attributes, "actions": [{"name": "on", "cost": 1}],
+        "dynamics": {"kind": "table", "states": [state("a"), state("b")], "transitions": [[0, "on", 1]], "start": 0},
+    });
+    let (status, answer) = service.put("/v1/models/wide", &wide).await;
+    assert_eq!(status, 201, "{answer}");
     let mut client = Client::connect(&service).await;
-    let session = client.open(json!({"type": "open", "model": "toggle", "lookahead": 1})).await;
-    let states: Vec<Value> = (0..6000).map(|n| json!([n % 2])).collect();
-    client.send(json!({"type": "observe", "seq": 0, "states": states})).await;
-    client.send(json!({"type": "end", "seq": states.len()})).await;
-    let done = client.receive_until("done").await.pop().unwrap();
-    assert_eq!(done["actions"].as_array().unwrap().len(), states.len() - 1);
-    assert!(done.to_string().len() > 4 * 262_144);
-    assert_eq!(client.closed().await, 1000);
-    // And once more to who has lost it.
+    client.open(json!({"type": "open", "model": "wide", "lookahead": 1})).await;
+    client.send(json!({"type": "observe", "seq": 0, "states": [{}]})).await;
+    assert_eq!(client.receive().await, json!({"type": "received", "seq": 1}));
+    let error = client.receive().await;
+    assert_eq!(error["problem"]["type"], "/problems/too-large", "{error}");
+    assert_eq!(client.closed().await, 1009);
+    // Faults are told as far as they fit.
     let mut client = Client::connect(&service).await;
-    client.send(json!({"type": "resume", "session": session, "step": states.len() - 1})).await;
-    assert_eq!(client.receive_until("done").await.last().unwrap(), &done);
-    assert_eq!(client.closed().await, 1000);
+    client.open(json!({"type": "open", "model": "wide"})).await;
+    let faulty: serde_json::Map<_, _> = (0..256).map(|n| (name(n), json!([]))).collect();
+    client.send(json!({"type": "observe", "seq": 0, "states": [faulty, faulty, faulty]})).await;
+    let error = client.receive().await;
+    let n_told = error["problem"]["errors"].as_array().unwrap().len();
+    assert!((100..768).contains(&n_told), "{n_told}");
+    assert!(error["problem"]["detail"].as_str().unwrap().contains("768 faults"), "{}", error["problem"]["detail"]);
 }
 
 #[tokio::test]
@@ -555,36 +614,101 @@ async fn pings_are_answered() {
     assert_eq!(client.next().await, Message::Pong(b"there?".as_slice().into()));
 }
 
+/// Sends frames that have answers by the thousand, and reads none, until the service closes the connection.
+async fn send_and_never_read(client: &mut Client) {
+    let demonstration = example("figure-4/demonstration.json");
+    let states: Vec<&Value> = demonstration.as_array().unwrap().iter().cycle().take(800).collect();
+    let mut seq = 0;
+    loop {
+        let frame = json!({"type": "observe", "seq": seq, "states": states});
+        if client.socket.send(Message::text(frame.to_string())).await.is_err() {
+            return;
+        }
+        seq += states.len();
+    }
+}
+
 #[tokio::test]
-async fn a_client_that_never_reads_is_closed_and_holds_up_nobody() {
+async fn a_client_that_never_reads_is_closed_and_its_session_is_free_again() {
     let service = Service::start(&["--slow-reader-timeout", "200ms"]).await;
     service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
-    let demonstration = example("figure-4/demonstration.json");
-    let mut stuck = Client::connect(&service).await;
+    let mut stuck = Client::connect_narrowly(&service).await;
     let session = stuck.open(json!({"type": "open", "model": "figure-4", "lookahead": 1})).await;
-    // Steps by the thousand, which fill the buffers on the way.
-    let states: Vec<&Value> = demonstration.as_array().unwrap().iter().cycle().take(800).collect();
-    for n in 0..40 {
-        let frame = json!({"type": "observe", "seq": n * states.len(), "states": states});
-        let sent = stuck.socket.send(Message::text(frame.to_string()));
-        // Once the server waits for this client, it takes nothing more from it.
-        if !matches!(tokio::time::timeout(Duration::from_secs(2), sent).await, Ok(Ok(()))) {
-            break;
-        }
-        if n == 20 {
-            let mut other = Client::connect(&service).await;
-            other.open(json!({"type": "open", "model": "figure-4"})).await;
-            other.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
-            other.send(json!({"type": "end", "seq": 16})).await;
-            other.receive_until("done").await;
-        }
-    }
-    // The session is free again: it can be resumed by one who reads.
+    tokio::time::timeout(PATIENCE, send_and_never_read(&mut stuck)).await.unwrap();
     let mut reader = Client::connect(&service).await;
     reader.send(json!({"type": "resume", "session": session})).await;
     let opened = reader.receive().await;
     assert!(opened["received"].as_u64().unwrap() >= 800, "{opened}");
     drop(stuck);
+}
+
+#[tokio::test]
+async fn a_client_that_never_reads_holds_up_nobody() {
+    let service = Service::start(&["--slow-reader-timeout", "1h", "--drain-timeout", "0s"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let demonstration = example("figure-4/demonstration.json");
+    let mut stuck = Client::connect_narrowly(&service).await;
+    stuck.open(json!({"type": "open", "model": "figure-4", "lookahead": 1})).await;
+    // Long enough for the service to wait for this client. Where it is not, the others have less to be held up by.
+    let sent = tokio::time::timeout(Duration::from_secs(2), send_and_never_read(&mut stuck)).await;
+    assert!(sent.is_err(), "it is waited for");
+    for _ in 0..3 {
+        let mut other = Client::connect(&service).await;
+        other.open(json!({"type": "open", "model": "figure-4"})).await;
+        other.send(json!({"type": "observe", "seq": 0, "states": demonstration})).await;
+        other.send(json!({"type": "end", "seq": 16})).await;
+        other.receive_until("done").await;
+    }
+    drop(stuck);
+}
+
+/// Every ping has an answer, which nobody reads.
+#[tokio::test]
+async fn a_client_that_sends_pings_and_never_reads_is_closed() {
+    use tokio::io::AsyncWriteExt;
+    let service = Service::start(&["--slow-reader-timeout", "200ms"]).await;
+    let mut client = Client::connect_narrowly(&service).await;
+    let ping = [&[0x89, 0x80 | 125, 0, 0, 0, 0][..], &[b'x'; 125]].concat().repeat(100);
+    let sending = async {
+        let stream = client.socket.get_mut();
+        while stream.write_all(&ping).await.is_ok() {}
+    };
+    tokio::time::timeout(PATIENCE, sending).await.unwrap();
+}
+
+/// A hundred thousand observations and more, without a look at the answer, on a connection of its own.
+#[tokio::test]
+async fn who_sends_all_lines_before_reading_any_finds_the_connection_closed() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    let service = Service::start(&["--slow-reader-timeout", "200ms", "--max-streams", "1"]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let demonstration = example("figure-4/demonstration.json").as_array().unwrap().clone();
+    let mut client = narrow(&service).await;
+    let (mut answer, mut request) = client.split();
+    let head = format!(
+        "POST /v1/stream HTTP/1.1\r\nhost: {}\r\ncontent-type: {NDJSON}\r\ntransfer-encoding: chunked\r\n\r\n",
+        service.address
+    );
+    request.write_all(head.as_bytes()).await.unwrap();
+    let mut send = async |frame: Value| {
+        let line = frame.to_string() + "\n";
+        request.write_all(format!("{:x}\r\n{line}\r\n", line.len()).as_bytes()).await
+    };
+    send(json!({"type": "open", "model": "figure-4", "lookahead": 1})).await.unwrap();
+    let states: Vec<&Value> = demonstration.iter().cycle().take(100).collect();
+    let sending = async {
+        let mut seq = 0;
+        while send(json!({"type": "observe", "seq": seq, "states": states})).await.is_ok() {
+            seq += states.len();
+        }
+    };
+    tokio::time::timeout(PATIENCE, sending).await.unwrap();
+    let mut all = Vec::new();
+    // What has come is there; then nothing more comes.
+    let _ = tokio::time::timeout(PATIENCE, answer.read_to_end(&mut all)).await.unwrap();
+    assert!(String::from_utf8_lossy(&all).contains("\"received\""));
+    // Its place is free.
+    Client::connect(&service).await.open(json!({"type": "open", "model": "figure-4"})).await;
 }
 
 /// The goodbye waits behind what the client left unread, and comes once that is read.
@@ -675,9 +799,12 @@ async fn idle_sessions_expire() {
     let (service, _) = figure_4().await;
     let session = Client::connect(&service).await.open(json!({"type": "open", "model": "figure-4"})).await;
     let service = Service::start_in(service.stop().await, &["--session-idle-timeout", "100ms"]).await;
-    while service.get(&format!("/v1/sessions/{session}")).await.1["status"] != "expired" {
-        tokio::task::yield_now().await;
-    }
+    let expired = async {
+        while service.get(&format!("/v1/sessions/{session}")).await.1["status"] != "expired" {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(PATIENCE, expired).await.unwrap();
     let mut client = Client::connect(&service).await;
     assert_eq!(client.receive().await["problem"]["type"], "/problems/idle");
     assert_eq!(client.closed().await, 1008);
@@ -692,12 +819,14 @@ async fn idle_sessions_expire() {
 async fn the_limits_in_hello_are_those_that_are_kept() {
     let flags = ["--max-streams", "2", "--session-idle-timeout", "20s", "--slow-reader-timeout", "1500ms"];
     let service = Service::start(&flags).await;
-    let (socket, _) = tokio_tungstenite::connect_async(format!("ws://{}/v1/stream", service.address)).await.unwrap();
+    let stream = TcpStream::connect(service.address).await.unwrap();
+    let (socket, _) =
+        tokio_tungstenite::client_async(format!("ws://{}/v1/stream", service.address), stream).await.unwrap();
     let mut client = Client { socket };
     let limits = client.receive().await["limits"].take();
     let expected = json!({
         "frame_bytes": 262_144, "message_bytes": 262_144, "observations": 100_000,
-        "streams": 2, "idle_timeout_ms": 20_000, "slow_reader_timeout_ms": 1500,
+        "streams": 2, "idle_timeout_ms": 20_000, "slow_reader_timeout_ms": 1500, "ping_interval_ms": 30_000,
     });
     assert_eq!(limits, expected);
 
@@ -945,44 +1074,51 @@ async fn who_stays_slow_is_closed_as_overloaded() {
     let abort = CancellationToken::new();
     let (etude, _directory) = without_service(service, &abort).await;
     let limits = service::flags(&["--slow-reader-timeout", "100ms"]).stream_limits();
-    let (came, mut incoming) = mpsc::channel(1);
+    let (came, mut incoming) = queue(1000);
     // Room for `hello` alone.
-    let (outgoing, mut goes) = mpsc::channel(1);
-    let open = json!({"type": "open", "model": "figure-4"}).to_string();
-    came.send(Incoming::Frame(open.into_bytes())).await.unwrap();
-    let closed = etude::stream::run(&etude, CLIENT, limits, &mut incoming, &outgoing, &abort).await;
+    let (outgoing, mut goes) = queue(1);
+    came.send(frame(&json!({"type": "open", "model": "figure-4"}))).await.unwrap();
+    let there = std::future::pending();
+    let closed = etude::stream::run(&etude, CLIENT, limits, &mut incoming, &outgoing, &abort, there).await;
     assert_eq!((closed, closed.code().0), (Closed::Overloaded, 1013));
-    assert!(matches!(goes.try_recv(), Ok(Outgoing::Frame(hello)) if hello.contains("hello")));
+    let hello = goes.try_recv().unwrap().item;
+    assert!(matches!(&hello, Outgoing::Frame(hello) if hello.contains("hello")), "{hello:?}");
     etude.close().await;
 }
 
-/// A connection of the application alone, without a transport: as much fits into its queues as is told.
+/// A frame that came.
+fn frame(frame: &Value) -> Incoming {
+    Incoming::Frame { text: frame.to_string().into(), memory: None }
+}
+
+/// A connection of the application alone, without a transport: one frame fits into the queue to the client.
 struct Wire {
-    to_server: mpsc::Sender<Incoming>,
-    from_server: mpsc::Receiver<Outgoing>,
+    to_server: Sender<Incoming>,
+    from_server: Receiver<Outgoing>,
     running: JoinHandle<Closed>,
 }
 
 impl Wire {
     fn connect(etude: &Arc<Etude>, stopping: &CancellationToken) -> Self {
-        let (to_server, mut incoming) = mpsc::channel(8);
-        let (outgoing, from_server) = mpsc::channel(1);
+        let (to_server, mut incoming) = queue(65_536);
+        let (outgoing, from_server) = queue(1);
         let (etude, stopping) = (Arc::clone(etude), stopping.clone());
         let limits = service::flags(&["--slow-reader-timeout", "1h"]).stream_limits();
         let running = tokio::spawn(async move {
-            etude::stream::run(&etude, CLIENT, limits, &mut incoming, &outgoing, &stopping).await
+            let there = std::future::pending();
+            etude::stream::run(&etude, CLIENT, limits, &mut incoming, &outgoing, &stopping, there).await
         });
         Self { to_server, from_server, running }
     }
 
-    async fn send(&self, frame: Value) {
-        self.to_server.send(Incoming::Frame(frame.to_string().into_bytes())).await.unwrap();
+    async fn send(&self, sent: Value) {
+        self.to_server.send(frame(&sent)).await.unwrap();
     }
 
     async fn receive_until(&mut self, kind: &str) -> Value {
         loop {
             let came = tokio::time::timeout(PATIENCE, self.from_server.recv()).await.unwrap();
-            let Some(Outgoing::Frame(text)) = came else { panic!("{came:?} instead of {kind}") };
+            let Some(Outgoing::Frame(text)) = came.map(|queued| queued.item) else { panic!("an end before {kind}") };
             let frame: Value = serde_json::from_str(&text).unwrap();
             if frame["type"] == kind {
                 return frame;

@@ -112,7 +112,8 @@ impl Stream {
         }
         let Some((steps, mapping)) = online.end() else { return Err(nothing_observed()) };
         print(printer, &steps)?;
-        let done = ServerFrame::Done { policy_id: None, status: mapping.status, cost: mapping.cost, actions: &actions };
+        let done =
+            ServerFrame::Done { policy_id: None, status: mapping.status, cost: mapping.cost, actions: Some(&actions) };
         printer.frame(&text_of(&done)?).map(drop)
     }
 

@@ -43,7 +43,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::service::Etude;
-use crate::stream::Limits;
+use crate::stream::{Limits, Room};
 pub use access::Access;
 pub(crate) use access::{allowed_host, allowed_origin};
 pub use connections::{ConnectionLimits, serve};
@@ -79,14 +79,23 @@ pub struct Context {
 type SharedContext = Arc<Context>;
 
 impl Context {
-    /// A place for one more stream, until it is dropped.
-    fn admit_stream(&self) -> Result<OwnedSemaphorePermit, Problem> {
+    /// A place and memory for one more stream, until that is dropped.
+    fn admit_stream(&self) -> Result<StreamPlace, Problem> {
         if self.stopping.is_cancelled() {
             return Err(Problem::new(ProblemKind::Stopping, "the service is shutting down"));
         }
         let place = Arc::clone(&self.stream_places).try_acquire_owned();
-        place.map_err(|_| Problem::new(ProblemKind::Busy, "as many streams run as may"))
+        let place = place.map_err(|_| Problem::new(ProblemKind::Busy, "as many streams run as may"))?;
+        let room = Room::admit(self.etude.memory(), self.stream_limits);
+        let room = room.map_err(|_| Problem::new(ProblemKind::Busy, "there is no memory for one more stream now"))?;
+        Ok(StreamPlace { room, _place: place })
     }
+}
+
+/// What a stream takes of the service.
+struct StreamPlace {
+    room: Room,
+    _place: OwnedSemaphorePermit,
 }
 
 #[derive(OpenApi)]

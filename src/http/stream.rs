@@ -1,22 +1,21 @@
 //! `/v1/stream` and `/v1/sessions`: the stream protocol over websockets and NDJSON.
 
-use std::convert::Infallible;
-use std::pin::Pin;
+mod ndjson;
+mod websocket;
+
+use std::ops::ControlFlow;
 use std::time::Duration;
 
-use axum::body::{Body, BodyDataStream, Bytes};
-use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, rejection::WebSocketUpgradeRejection};
+use axum::body::{Body, Bytes};
+use axum::extract::ws::{WebSocketUpgrade, rejection::WebSocketUpgradeRejection};
 use axum::extract::{Request, State};
-use axum::http::header::{CONTENT_TYPE, EXPECT};
+use axum::http::header::CONTENT_TYPE;
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
-use futures_util::stream::{Peekable, SplitSink, SplitStream};
-use futures_util::{SinkExt, StreamExt};
 use jiff::Timestamp;
 use serde::Serialize;
-use tokio::sync::{OwnedSemaphorePermit, mpsc};
-use tokio_tungstenite::tungstenite;
-use tokio_util::sync::CancellationToken;
+use tokio::sync::mpsc;
+use tokio_stream::wrappers::ReceiverStream;
 use tracing::Instrument;
 use utoipa::ToSchema;
 
@@ -28,19 +27,9 @@ use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{Problem, ProblemKind};
 use crate::attribute::ByAttribute;
-use crate::service::{Caller, Client};
+use crate::service::Caller;
 use crate::store::{SessionRow, SessionWeights};
-use crate::stream::{self, Closed, Incoming, Outgoing, PROTOCOL};
-
-/// Frames that wait to be answered, and answers that wait to be read: enough to keep both ends busy.
-const MAX_WAITING: usize = 64;
-
-/// How much of a message over the limit is still taken in, as a multiple of the limit, so that it can be answered.
-const MAX_OVERSIZE: usize = 4;
-
-/// How much is read from a socket at once. Held by every stream, most of which wait for a small frame; a larger one is
-/// read in several goes.
-const READ_BUFFER_BYTES: usize = 8192;
+use crate::stream::{Gone, Incoming, Limits, PROTOCOL, READ_BUFFER_BYTES, Room, Sender, WRITE_BUFFER_BYTES};
 
 /// How long a closing handshake may take.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -63,124 +52,57 @@ pub(super) async fn websocket(
 ) -> Result<Response, Problem> {
     let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::UpgradeRequired, rejection.body_text()))?;
     let place = context.admit_stream()?;
-    let limit = context.stream_limits.frame_bytes;
+    let limits = context.stream_limits;
     let upgrade = upgrade
         .protocols([PROTOCOL])
-        .max_message_size(limit * MAX_OVERSIZE)
-        .max_frame_size(limit * MAX_OVERSIZE)
-        // A limit would be one on the size of `done`. There is no need for it: once more waits there than is written at once,
-        // the next frame is not taken from the queue until that has gone.
-        .max_write_buffer_size(usize::MAX)
-        .read_buffer_size(READ_BUFFER_BYTES);
+        // What is larger is answered without being read.
+        .max_message_size(limits.frame_bytes)
+        .max_frame_size(limits.frame_bytes)
+        .read_buffer_size(READ_BUFFER_BYTES)
+        .write_buffer_size(WRITE_BUFFER_BYTES)
+        .max_write_buffer_size(max_write_buffer_bytes(limits));
     let span = tracing::Span::current();
     Ok(upgrade.on_upgrade(move |socket| {
         let streams = context.streams.clone();
-        streams.track_future(serve_websocket(context, client, socket, place).instrument(span))
+        let serving = async move {
+            websocket::serve(&context.etude, client, limits, socket, &place.room, &context.stopping).await;
+            drop(place);
+        };
+        streams.track_future(serving.instrument(span))
     }))
 }
 
-async fn serve_websocket(context: SharedContext, client: Client, socket: WebSocket, place: OwnedSemaphorePermit) {
-    let (sink, source) = socket.split();
-    let (came, mut incoming) = mpsc::channel(MAX_WAITING);
-    let (outgoing, goes) = mpsc::channel(MAX_WAITING);
-    // Gone: nobody is there any more. Ended: nothing more will come.
-    let (gone, ended) = (CancellationToken::new(), CancellationToken::new());
-    let speaking = async {
-        let closed = tokio::select! {
-            closed = stream::run(&context.etude, client, context.stream_limits, &mut incoming, &outgoing, &context.stopping) => closed,
-            // A search that still runs ends with this.
-            () = gone.cancelled() => Closed::ByClient,
-        };
-        incoming.close();
-        // What is left to be written may take this long. Where the queue was full until now, this is the goodbye that a
-        // slow reader gets; if there was one already, nobody takes another.
-        let goodbye = tokio::time::timeout(CLOSE_TIMEOUT, outgoing.send(Outgoing::Close(closed)));
-        if let Ok(Ok(())) = goodbye.await {
-            drop(outgoing);
-            tokio::time::sleep(CLOSE_TIMEOUT).await;
-        }
-    };
-    let talking = async {
-        tokio::select! {
-            // In the order in which a frame passes, so that it passes in one go.
-            biased;
-            () = speaking => {}
-            () = write_websocket(sink, goes) => {}
-        }
-        // The client's half of the closing handshake, for which a shutdown does not wait.
-        tokio::select! {
-            () = ended.cancelled() => {}
-            () = context.stopping.cancelled() => {}
-            () = tokio::time::sleep(CLOSE_TIMEOUT) => {}
-        }
-    };
-    let listening = async {
-        read_websocket(source, came, &gone).await;
-        ended.cancel();
-        std::future::pending::<()>().await;
-    };
-    tokio::select! {
-        biased;
-        () = listening => {}
-        () = talking => {}
-    }
-    drop(place);
+/// How much may wait in a websocket to be written: what is gathered, a message, and the header of that. There is no more of ours, as
+/// the next message waits for the one before. The rest is for pongs: while the client reads nothing, those that find no room are left out,
+/// but for the last one.
+fn max_write_buffer_bytes(limits: Limits) -> usize {
+    /// Of the headers of a message and of a close frame, and for the pongs.
+    const OTHERS_BYTES: usize = 1024;
+    WRITE_BUFFER_BYTES + limits.message_bytes() + OTHERS_BYTES
 }
 
-/// Passes on what comes, until nobody wants it; then reads on for the client's goodbye. Pings are answered by reading.
-async fn read_websocket(mut source: SplitStream<WebSocket>, came: mpsc::Sender<Incoming>, gone: &CancellationToken) {
-    loop {
-        let incoming = match source.next().await {
-            Some(Ok(Message::Text(text))) => Incoming::Frame(text.as_bytes().to_vec()),
-            Some(Ok(Message::Binary(_))) => Incoming::Binary,
-            Some(Ok(Message::Ping(_) | Message::Pong(_))) => continue,
-            Some(Err(error)) => match error.into_inner().downcast_ref::<tungstenite::Error>() {
-                Some(tungstenite::Error::Capacity(_)) => Incoming::TooLarge,
-                Some(tungstenite::Error::Utf8(_)) => Incoming::NotText,
-                _ => return gone.cancel(),
-            },
-            Some(Ok(Message::Close(_))) | None => return gone.cancel(),
-        };
-        let is_last = matches!(incoming, Incoming::TooLarge | Incoming::NotText);
-        // Nobody wants it once the connection is closing.
-        let _ = came.send(incoming).await;
-        if is_last {
-            return;
-        }
-    }
+/// The way in for frames: a queue, and the memory that they take.
+struct Inlet<'s> {
+    came: Sender<Incoming>,
+    room: &'s Room,
 }
 
-async fn write_websocket(mut sink: SplitSink<WebSocket, Message>, mut goes: mpsc::Receiver<Outgoing>) {
-    let closed = write_frames(&mut sink, &mut goes).await;
-    if let Some(closed) = closed {
-        let (code, reason) = closed.code();
-        let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
-        // A client that does not read does not hear this either.
-        let _ = tokio::time::timeout(CLOSE_TIMEOUT, sink.send(close)).await;
-    }
-}
-
-/// Writes what goes to the client, until nothing more will. Gives how to close, if there is still something to be closed.
-async fn write_frames(sink: &mut SplitSink<WebSocket, Message>, goes: &mut mpsc::Receiver<Outgoing>) -> Option<Closed> {
-    while let Some(first) = goes.recv().await {
-        // What waits together is written together: a write, and a wakeup of the client, cost more than a frame.
-        let mut next = Some(first);
-        while let Some(outgoing) = next {
-            match outgoing {
-                Outgoing::Frame(text) => {
-                    if let Err(error) = sink.feed(Message::Text(text.into())).await {
-                        tracing::debug!(error = &error as &dyn std::error::Error, "a frame could not be written");
-                        // Where the client is gone, it does not hear this; a frame must not vanish without a word.
-                        return Some(Closed::Failed);
-                    }
-                }
-                Outgoing::Close(closed) => return Some(closed),
-            }
-            next = goes.try_recv().ok();
+impl Inlet<'_> {
+    /// Passes on a frame once there is room and memory for it. Breaks if nothing that comes after it will be wanted.
+    async fn pass_on(&self, text: Bytes) -> ControlFlow<()> {
+        match self.room.take_for_frame(text.len()).await {
+            Ok(memory) => self.tell(Incoming::Frame { text, memory }).await,
+            Err(_) => self.tell(Incoming::Crowded).await,
         }
-        sink.flush().await.ok()?;
     }
-    None
+
+    async fn tell(&self, incoming: Incoming) -> ControlFlow<()> {
+        let is_last = !matches!(incoming, Incoming::Frame { .. } | Incoming::Binary);
+        match self.came.send(incoming).await {
+            Ok(()) if !is_last => ControlFlow::Continue(()),
+            Ok(()) | Err(Gone) => ControlFlow::Break(()),
+        }
+    }
 }
 
 /// Stream a demonstration as NDJSON, both ways at the same time.
@@ -211,92 +133,20 @@ pub(super) async fn ndjson(
         return Err(refuse(request, &context, Problem::new(ProblemKind::UnsupportedMediaType, detail)));
     }
     let place = context.admit_stream()?;
-    let (came, mut incoming) = mpsc::channel(MAX_WAITING);
-    let (outgoing, goes) = mpsc::channel(MAX_WAITING);
-    let (lines, answer) = mpsc::channel::<Result<Bytes, Infallible>>(1);
-    let frame_bytes = context.stream_limits.frame_bytes;
-    let body = begin_reading(request).await;
-    let streams = context.streams.clone();
+    let body = ndjson::begin_reading(request).await;
+    let (lines, answer) = mpsc::channel(1);
+    let (streams, span) = (context.streams.clone(), tracing::Span::current());
     let serving = async move {
-        let speaking = async {
-            tokio::select! {
-                _ = stream::run(&context.etude, client, context.stream_limits, &mut incoming, &outgoing, &context.stopping) => {}
-                // The client does not read any more: it is gone.
-                () = lines.closed() => {}
-            }
-            drop(outgoing);
-            tokio::time::sleep(CLOSE_TIMEOUT).await;
-        };
-        let listening = async {
-            read_lines(body, frame_bytes, came).await;
-            std::future::pending::<()>().await;
-        };
-        tokio::select! {
-            () = write_lines(&lines, goes) => {}
-            () = speaking => {}
-            () = listening => {}
-        }
+        let limits = context.stream_limits;
+        ndjson::serve(&context.etude, client, limits, body, lines, &place.room, &context.stopping).await;
         drop(place);
     };
     // The answer is read while the request is still being sent, so this runs beside it.
-    streams.spawn(serving.instrument(tracing::Span::current()));
-    let mut response = Body::from_stream(tokio_stream::wrappers::ReceiverStream::new(answer)).into_response();
+    streams.spawn(serving.instrument(span));
+    let mut response = Body::from_stream(ReceiverStream::new(answer)).into_response();
     response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/x-ndjson"));
     response.extensions_mut().insert(IsStream);
     Ok(response)
-}
-
-/// The body of a request. A client that waits to be told to send it (`Expect: 100-continue`, as `curl` does for a second) is told
-/// so when the body is first asked for, which must be before the answer begins.
-async fn begin_reading(request: Request) -> Peekable<BodyDataStream> {
-    let waits = request.headers().contains_key(EXPECT);
-    let mut body = request.into_body().into_data_stream().peekable();
-    if waits {
-        let _asked = futures_util::poll!(Pin::new(&mut body).peek());
-        tokio::task::yield_now().await;
-    }
-    body
-}
-
-/// Passes on lines as frames. Ends with the body, or with a line over the limit.
-async fn read_lines(mut body: Peekable<BodyDataStream>, frame_bytes: usize, came: mpsc::Sender<Incoming>) {
-    let mut line = Vec::new();
-    while let Some(Ok(chunk)) = body.next().await {
-        for part in chunk.split_inclusive(|byte| *byte == b'\n') {
-            line.extend_from_slice(part);
-            if line.len() > frame_bytes + 1 {
-                let _ = came.send(Incoming::TooLarge).await;
-                return;
-            }
-            if line.ends_with(b"\n") && !pass_on(&mut line, &came).await {
-                return;
-            }
-        }
-    }
-    pass_on(&mut line, &came).await;
-}
-
-/// Passes on a line, unless it is blank. Says whether anybody listens.
-async fn pass_on(line: &mut Vec<u8>, came: &mpsc::Sender<Incoming>) -> bool {
-    let line = std::mem::take(line);
-    if line.trim_ascii().is_empty() {
-        return true;
-    }
-    came.send(Incoming::Frame(line)).await.is_ok()
-}
-
-async fn write_lines(lines: &mpsc::Sender<Result<Bytes, Infallible>>, mut goes: mpsc::Receiver<Outgoing>) {
-    while let Some(outgoing) = goes.recv().await {
-        match outgoing {
-            Outgoing::Frame(mut text) => {
-                text.push('\n');
-                if lines.send(Ok(text.into())).await.is_err() {
-                    return;
-                }
-            }
-            Outgoing::Close(_) => return,
-        }
-    }
 }
 
 /// A stream, running or done.
@@ -383,3 +233,6 @@ pub(super) async fn list_sessions(State(context): State<SharedContext>, paging: 
 pub(super) async fn get_session(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
     Ok(json(StatusCode::OK, &SessionBody::from(context.etude.session(&id).await?)))
 }
+
+#[cfg(test)]
+mod tests;

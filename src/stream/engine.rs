@@ -5,12 +5,16 @@ use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use serde_json::Value;
-use tokio::sync::{SetOnce, mpsc};
+use tokio::sync::SetOnce;
+use tokio_util::bytes::Bytes;
 use tokio_util::sync::CancellationToken;
 
-use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem};
+use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem, WriteError};
+use super::queue::{Gone, Receiver, Sender, Weighed};
+use super::room::Crowded;
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
+use crate::memory::Held;
 use crate::service::{
     Caller, Client, Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
@@ -30,33 +34,61 @@ pub struct Limits {
     pub slow_after: Duration,
     /// How long a connection may stay silent.
     pub idle_after: Duration,
+    /// How often a client of which nothing comes is asked for a sign of life, where the transport can. Above 0.
+    pub ping_every: Duration,
+}
+
+impl Limits {
+    /// Longest message that is sent, in bytes.
+    #[must_use]
+    pub fn message_bytes(&self) -> usize {
+        self.frame_bytes
+    }
 }
 
 impl From<Limits> for HelloLimits {
-    fn from(Limits { frame_bytes, streams, slow_after, idle_after }: Limits) -> Self {
+    fn from(limits: Limits) -> Self {
+        let message_bytes = limits.message_bytes();
+        let Limits { frame_bytes, streams, slow_after, idle_after, ping_every } = limits;
         let ms = |time: Duration| u64::try_from(time.as_millis()).unwrap_or(u64::MAX);
         Self {
             frame_bytes,
-            message_bytes: frame_bytes,
+            message_bytes,
             observations: Demonstration::MAX_OBSERVATIONS,
             streams,
             idle_timeout_ms: ms(idle_after),
             slow_reader_timeout_ms: ms(slow_after),
+            ping_interval_ms: ms(ping_every),
         }
     }
 }
 
 /// What came from the client.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Debug)]
 pub enum Incoming {
     /// A frame.
-    Frame(Vec<u8>),
+    Frame {
+        /// Its text.
+        text: Bytes,
+        /// What it takes of the memory of the service until it is handled, if it is not small.
+        memory: Option<Held>,
+    },
     /// Something that is no frame: a binary message.
     Binary,
     /// A frame over the limit.
     TooLarge,
     /// Text that is not UTF-8.
     NotText,
+    /// Something that the transport does not allow, and what.
+    Violation(String),
+    /// A frame that there is no memory for.
+    Crowded,
+}
+
+impl Weighed for Incoming {
+    fn n_bytes(&self) -> usize {
+        if let Self::Frame { text, .. } = self { text.len() } else { 0 }
+    }
 }
 
 /// What goes to the client.
@@ -68,6 +100,12 @@ pub enum Outgoing {
     Close(Closed),
 }
 
+impl Weighed for Outgoing {
+    fn n_bytes(&self) -> usize {
+        if let Self::Frame(text) = self { text.len() } else { 0 }
+    }
+}
+
 /// Why a connection ended: a websocket close code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Closed {
@@ -75,13 +113,17 @@ pub enum Closed {
     Done,
     /// The client said nothing more.
     ByClient,
+    /// The client gave no sign of life; the session is to be resumed.
+    Silent,
     /// The server shuts down; the session is to be resumed.
     GoingAway,
+    /// Something that a websocket does not allow.
+    Protocol,
     /// Not JSON, or not UTF-8.
     NotText,
     /// Not allowed now.
     NotAllowed,
-    /// A frame over the limit, or a policy.
+    /// A frame over the limit, whoever was to send it, or a policy.
     TooLarge,
     /// The server failed; the session is to be resumed.
     Failed,
@@ -100,8 +142,10 @@ impl Closed {
         match self {
             Self::Done | Self::ByClient => (1000, "done"),
             Self::GoingAway => (1001, "the server shuts down; resume"),
+            Self::Protocol => (1002, "against the protocol of websockets"),
             Self::NotText => (1007, "not JSON"),
             Self::NotAllowed => (1008, "not allowed"),
+            Self::Silent => (1008, "no sign of life; resume"),
             Self::TooLarge => (1009, "too large"),
             Self::Failed => (1011, "the server failed; resume"),
             Self::Overloaded => (1013, "overloaded or too slow a reader; resume"),
@@ -114,27 +158,30 @@ impl Closed {
 /// How long the last words may wait for a client that does not read.
 const GOODBYE_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Speaks the protocol until the connection is over, and says why it is: at once if the session is taken over or the server
-/// shuts down, whatever is under way. Dropping the future at any time leaves a session that can be resumed.
+/// Speaks the protocol until the connection is over, and says why it is: at once if the session is taken over, the server
+/// shuts down, or the transport has `lost` the client, whatever is under way. Dropping the future at any time leaves a session that can be
+/// resumed.
 pub async fn run(
     etude: &Etude,
     client: Client,
     limits: Limits,
-    incoming: &mut mpsc::Receiver<Incoming>,
-    outgoing: &mpsc::Sender<Outgoing>,
+    incoming: &mut Receiver<Incoming>,
+    outgoing: &Sender<Outgoing>,
     stopping: &CancellationToken,
+    lost: impl Future<Output = Closed>,
 ) -> Closed {
     let taken_over = SetOnce::new();
     let mut connection =
         Connection { etude, client, limits, outgoing, session: None, taken_over: &taken_over, is_reward_told: false };
-    let ended = tokio::select! {
+    let (ended, is_lost) = tokio::select! {
         biased;
         () = stopping.cancelled() => {
             let problem = StreamProblem::new("stopping", "the server shuts down; resume the session later");
-            Err(Over::because(Closed::GoingAway, problem))
+            (Err(Over::because(Closed::GoingAway, problem)), false)
         }
-        () = async { taken_over.wait().await.cancelled().await } => Err(ends(&SessionError::TakenOver)),
-        ended = connection.speak(incoming) => ended,
+        () = async { taken_over.wait().await.cancelled().await } => (Err(ends(&SessionError::TakenOver)), false),
+        closed = lost => (Ok(closed), true),
+        ended = connection.speak(incoming) => (ended, false),
     };
     // Given back now: whoever takes it over does not wait for the goodbye.
     let session = connection.session.take().map(|session| session.id().to_owned());
@@ -143,16 +190,18 @@ pub async fn run(
         Err(Over { closed, problem }) => (closed, problem),
     };
     let (code, _) = closed.code();
-    tracing::info!(code, session, "stream closed");
+    tracing::info!(code, session, is_lost, "stream closed");
     let goodbye = async {
         if let Some(problem) = problem {
             // Where this does not get through, the close code says it too.
             let _ = connection.send(&ServerFrame::Error { problem }).await;
         }
-        // A client that is gone or stuck does not hear this.
+        // A client that is stuck does not hear this.
         let _ = outgoing.send(Outgoing::Close(closed)).await;
     };
-    let _ = tokio::time::timeout(limits.slow_after.min(GOODBYE_TIMEOUT), goodbye).await;
+    if !is_lost {
+        let _ = tokio::time::timeout(limits.slow_after.min(GOODBYE_TIMEOUT), goodbye).await;
+    }
     closed
 }
 
@@ -172,7 +221,7 @@ struct Connection<'c> {
     etude: &'c Etude,
     client: Client,
     limits: Limits,
-    outgoing: &'c mpsc::Sender<Outgoing>,
+    outgoing: &'c Sender<Outgoing>,
     session: Option<Session>,
     /// Tells when another connection takes the session over, once there is one.
     taken_over: &'c SetOnce<CancellationToken>,
@@ -181,7 +230,7 @@ struct Connection<'c> {
 }
 
 impl Connection<'_> {
-    async fn speak(&mut self, incoming: &mut mpsc::Receiver<Incoming>) -> Result<Closed, Over> {
+    async fn speak(&mut self, incoming: &mut Receiver<Incoming>) -> Result<Closed, Over> {
         self.send(&ServerFrame::Hello {
             protocol: PROTOCOL,
             server: env!("CARGO_PKG_VERSION"),
@@ -193,15 +242,16 @@ impl Connection<'_> {
                 return Err(Over::because(Closed::NotAllowed, StreamProblem::new("idle", "nothing came for too long")));
             };
             let Some(came) = came else { return Ok(Closed::ByClient) };
-            let frame = read(came, self.limits)?;
-            if let Some(closed) = self.answer(frame).await? {
+            // Its room in the queue is given back once it is answered.
+            let (frame, memory) = read(came.item, self.limits)?;
+            if let Some(closed) = self.answer(frame, memory).await? {
                 return Ok(closed);
             }
         }
     }
 
-    /// Answers a frame. Gives how the connection ends, if it does.
-    async fn answer(&mut self, frame: ClientFrame) -> Result<Option<Closed>, Over> {
+    /// Answers a frame, whose memory is `memory`. Gives how the connection ends, if it does.
+    async fn answer(&mut self, frame: ClientFrame, memory: Option<Held>) -> Result<Option<Closed>, Over> {
         let now = Timestamp::now();
         let caller = Caller { client: self.client, arrived: Instant::now(), now };
         match (frame, &mut self.session) {
@@ -245,6 +295,8 @@ impl Connection<'_> {
                     Ok(received) => received,
                     Err(error) => return self.go_on_or_end(&error).await,
                 };
+                // Nobody waits for a search with what it does not need.
+                drop((frame, memory));
                 let frame = ServerFrame::Received { seq: session.n_received() };
                 send(self.outgoing, self.limits, &frame).await?;
                 let steps = match received {
@@ -341,25 +393,35 @@ impl Connection<'_> {
 }
 
 /// Puts a frame into the queue, which a client that does not read keeps full.
-async fn send(outgoing: &mpsc::Sender<Outgoing>, limits: Limits, frame: &ServerFrame<'_>) -> Result<(), Over> {
-    let failed = |error: serde_json::Error| ends(&SessionError::Service(ServiceError::Write(error)));
-    let text = serde_json::to_string(frame).map_err(failed)?;
-    outgoing.send_timeout(Outgoing::Frame(text), limits.slow_after).await.map_err(|error| match error {
-        mpsc::error::SendTimeoutError::Timeout(_) => Over { closed: Closed::Overloaded, problem: None },
-        mpsc::error::SendTimeoutError::Closed(_) => Over { closed: Closed::ByClient, problem: None },
-    })
+async fn send(outgoing: &Sender<Outgoing>, limits: Limits, frame: &ServerFrame<'_>) -> Result<(), Over> {
+    let text = frame.text_within(limits.message_bytes()).map_err(|error| match error {
+        WriteError::TooLong => {
+            let detail = format!(
+                "the server's next frame takes more than the {} bytes that a message may have, as the states of this model do: ask for a \
+                 policy instead",
+                limits.message_bytes()
+            );
+            Over::because(Closed::TooLarge, StreamProblem::new("too-large", detail))
+        }
+        WriteError::Json(error) => ends(&SessionError::Service(ServiceError::Write(error))),
+    })?;
+    match tokio::time::timeout(limits.slow_after, outgoing.send(Outgoing::Frame(text))).await {
+        Ok(Ok(())) => Ok(()),
+        Ok(Err(Gone)) => Err(Over { closed: Closed::ByClient, problem: None }),
+        Err(_) => Err(Over { closed: Closed::Overloaded, problem: None }),
+    }
 }
 
 fn not_allowed(detail: &str) -> Over {
     Over::because(Closed::NotAllowed, StreamProblem::new("not-allowed", detail))
 }
 
-/// Reads what came.
-fn read(came: Incoming, limits: Limits) -> Result<ClientFrame, Over> {
+/// Reads what came. Gives the frame's memory along.
+fn read(came: Incoming, limits: Limits) -> Result<(ClientFrame, Option<Held>), Over> {
     let bad = |problem| Over::because(Closed::BadFrame, problem);
-    let text = match came {
-        Incoming::Frame(text) if text.len() <= limits.frame_bytes => text,
-        Incoming::Frame(_) | Incoming::TooLarge => {
+    let (text, memory) = match came {
+        Incoming::Frame { text, memory } if text.len() <= limits.frame_bytes => (text, memory),
+        Incoming::Frame { .. } | Incoming::TooLarge => {
             let detail = format!("a frame has at most {} bytes", limits.frame_bytes);
             return Err(Over::because(Closed::TooLarge, StreamProblem::new("too-large", detail)));
         }
@@ -368,6 +430,14 @@ fn read(came: Incoming, limits: Limits) -> Result<ClientFrame, Over> {
             let problem = StreamProblem::new("malformed-json", "the frame is not UTF-8");
             return Err(Over::because(Closed::NotText, problem));
         }
+        Incoming::Violation(what) => {
+            let detail = format!("against the protocol of websockets: {what}");
+            return Err(Over::because(Closed::Protocol, StreamProblem::new("bad-frame", detail)));
+        }
+        Incoming::Crowded => {
+            let problem = StreamProblem::new("overloaded", Crowded.to_string());
+            return Err(Over::because(Closed::Overloaded, problem));
+        }
     };
     let frame: Value = document::parse(&text).map_err(|error| match error {
         ParseError::Syntax { .. } => {
@@ -375,7 +445,8 @@ fn read(came: Incoming, limits: Limits) -> Result<ClientFrame, Over> {
         }
         ParseError::Faults(faults) => bad(StreamProblem::of("bad-frame", &faults)),
     })?;
-    ClientFrame::read(frame).map_err(|faults| bad(StreamProblem::of("bad-frame", &faults)))
+    let frame = ClientFrame::read(frame).map_err(|faults| bad(StreamProblem::of("bad-frame", &faults)))?;
+    Ok((frame, memory))
 }
 
 /// How an error ends the connection.

@@ -1,5 +1,7 @@
 //! The frames of the protocol.
 
+use std::io;
+
 use serde::Serialize;
 use serde_json::Value;
 
@@ -136,8 +138,9 @@ pub enum ServerFrame<'f> {
         status: Status,
         /// What it costs.
         cost: Cost,
-        /// Its actions, in order.
-        actions: &'f [std::sync::Arc<str>],
+        /// Its actions, in order; `None` where they are left out, as the frame would be too long.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        actions: Option<&'f [std::sync::Arc<str>]>,
     },
     /// The reward of the explored trial is durable.
     Rewarded {
@@ -155,6 +158,74 @@ pub enum ServerFrame<'f> {
     },
 }
 
+/// Why a frame could not be written.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    /// It takes more bytes than it may.
+    #[error("the frame is too long")]
+    TooLong,
+    /// It is no JSON: a defect.
+    #[error(transparent)]
+    Json(serde_json::Error),
+}
+
+impl ServerFrame<'_> {
+    /// Its JSON, of at most `max_bytes`. Where it would take more, a policy's actions, or faults beyond the first ones, are left out.
+    ///
+    /// # Errors
+    ///
+    /// [`WriteError::TooLong`] if it takes more without these too.
+    pub fn text_within(&self, max_bytes: usize) -> Result<String, WriteError> {
+        let written = write_within(self, max_bytes);
+        match (self, written) {
+            (Self::Done { actions: Some(_), policy_id, status, cost }, Err(WriteError::TooLong)) => {
+                let shorter = Self::Done { actions: None, policy_id: *policy_id, status: *status, cost: *cost };
+                write_within(&shorter, max_bytes)
+            }
+            (Self::Error { problem }, Err(WriteError::TooLong)) if !problem.errors.is_empty() => {
+                let errors = problem.errors[..problem.errors.len() / 2].to_vec();
+                let problem = StreamProblem { errors, kind: problem.kind.clone(), detail: problem.detail.clone() };
+                Self::Error { problem }.text_within(max_bytes)
+            }
+            (_, written) => written,
+        }
+    }
+}
+
+/// Text that may not grow beyond `max_bytes`.
+struct Bounded {
+    text: Vec<u8>,
+    max_bytes: usize,
+}
+
+impl io::Write for Bounded {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.write_all(bytes).map(|()| bytes.len())
+    }
+
+    fn write_all(&mut self, bytes: &[u8]) -> io::Result<()> {
+        if self.text.len() + bytes.len() > self.max_bytes {
+            return Err(io::ErrorKind::FileTooLarge.into());
+        }
+        self.text.extend_from_slice(bytes);
+        Ok(())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+fn write_within(frame: &ServerFrame<'_>, max_bytes: usize) -> Result<String, WriteError> {
+    /// Of most frames.
+    const USUAL_BYTES: usize = 256;
+    let mut bounded = Bounded { text: Vec::with_capacity(USUAL_BYTES), max_bytes };
+    serde_json::to_writer(&mut bounded, frame)
+        .map_err(|error| if error.is_io() { WriteError::TooLong } else { WriteError::Json(error) })?;
+    // What serde_json writes is UTF-8.
+    String::from_utf8(bounded.text).map_err(|error| WriteError::Json(serde::ser::Error::custom(error)))
+}
+
 /// What a server takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct HelloLimits {
@@ -170,6 +241,8 @@ pub struct HelloLimits {
     pub idle_timeout_ms: u64,
     /// How long a client may leave unread what waits for it, in milliseconds.
     pub slow_reader_timeout_ms: u64,
+    /// How often a client of which nothing comes is asked for a sign of life over a websocket, in milliseconds.
+    pub ping_interval_ms: u64,
 }
 
 /// A committed step.
@@ -212,7 +285,7 @@ impl<'f> From<&'f Policy> for ServerFrame<'f> {
             policy_id: policy.id.as_deref(),
             status: policy.status,
             cost: policy.cost,
-            actions: &policy.actions,
+            actions: Some(&policy.actions),
         }
     }
 }
@@ -245,5 +318,36 @@ impl StreamProblem {
             _ => format!("{} faults", faults.count()),
         };
         Self { errors: faults.listed().to_vec(), ..Self::new(slug, detail) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+
+    #[test]
+    fn a_frame_that_would_be_too_long_leaves_out_what_can_be_had_otherwise() {
+        let actions: Vec<Arc<str>> = vec!["forward".into(); 100];
+        let cost = Cost { total: 0.0, actions: 0.0, distance: 0.0 };
+        let done = |actions| ServerFrame::Done { policy_id: Some("7"), status: Status::Local, cost, actions };
+        let (done, without) = (done(Some(&actions[..])), done(None));
+        let whole = serde_json::to_string(&done).unwrap();
+        assert_eq!(done.text_within(whole.len()).unwrap(), whole);
+        let shorter = done.text_within(whole.len() - 1).unwrap();
+        assert_eq!(shorter, serde_json::to_string(&without).unwrap());
+        assert!(matches!(done.text_within(shorter.len() - 1), Err(WriteError::TooLong)));
+
+        let faults = (0..1000).map(|n| Fault { line: None, pointer: format!("/states/{n}"), detail: "far".to_owned() });
+        let problem = StreamProblem { errors: faults.collect(), ..StreamProblem::new("invalid", "1000 faults") };
+        let text = ServerFrame::Error { problem: problem.clone() }.text_within(10_000).unwrap();
+        let told: Value = serde_json::from_str(&text).unwrap();
+        let n_told = told["problem"]["errors"].as_array().unwrap().len();
+        assert!((100..250).contains(&n_told) && text.len() <= 10_000, "{n_told} of 1000 in {} bytes", text.len());
+        // A single one that is too long.
+        let problem = StreamProblem::of("invalid", &Faults::one("x".repeat(10_000), "unknown attribute"));
+        let text = ServerFrame::Error { problem }.text_within(10_000).unwrap();
+        assert_eq!(text, r#"{"type":"error","problem":{"type":"/problems/invalid","detail":"unknown attribute"}}"#);
     }
 }

@@ -4,14 +4,18 @@
 //! protocol itself, whatever the transport: [`run`] takes what came from a queue and puts answers into another.
 //!
 //! ```text
-//! socket -> reader -> queue (bounded) -> run -> queue (bounded) -> writer -> socket
-//!                                         |
-//!                                    Session (durable), pool
+//! socket -> reader -> queue (bounded in bytes) -> run -> queue (bounded in bytes) -> writer -> socket
+//!             |                                    |                                   |
+//!            Room (memory)                    Session (durable), pool                 Room
 //! ```
 //!
 #![doc = include_str!("protocol.md")]
 
 mod engine;
 pub mod frames;
+mod queue;
+mod room;
 
 pub use engine::{Closed, Incoming, Limits, Outgoing, PROTOCOL, run};
+pub use queue::{Gone, QUEUE_BYTES, Queued, Receiver, Sender, Weighed, queue};
+pub use room::{Crowded, READ_BUFFER_BYTES, Room, SMALL_FRAME_BYTES, WRITE_BUFFER_BYTES};

@@ -1,0 +1,111 @@
+//! The stream protocol over NDJSON: a line is a frame, in the body of the request and in that of the answer.
+
+use std::convert::Infallible;
+use std::ops::ControlFlow;
+use std::pin::Pin;
+
+use axum::body::{BodyDataStream, Bytes};
+use axum::extract::Request;
+use axum::http::header::EXPECT;
+use futures_util::StreamExt;
+use futures_util::stream::Peekable;
+use tokio::sync::mpsc;
+use tokio_util::sync::CancellationToken;
+
+use super::{CLOSE_TIMEOUT, Inlet};
+use crate::service::{Client, Etude};
+use crate::stream::{self, Closed, Incoming, Limits, Outgoing, QUEUE_BYTES, Receiver, Room, queue};
+
+/// Lines of an answer, on their way into its body.
+pub(super) type Lines = mpsc::Sender<Result<Bytes, Infallible>>;
+
+/// The body of a request. A client that waits to be told to send it (`Expect: 100-continue`, as `curl` does for a second) is told
+/// so when the body is first asked for, which must be before the answer begins.
+pub(super) async fn begin_reading(request: Request) -> Peekable<BodyDataStream> {
+    let waits = request.headers().contains_key(EXPECT);
+    let mut body = request.into_body().into_data_stream().peekable();
+    if waits {
+        let _asked = futures_util::poll!(Pin::new(&mut body).peek());
+        tokio::task::yield_now().await;
+    }
+    body
+}
+
+/// Streams from `body` into `lines` until either ends. The answer ends with the lines; where the request goes on, it is not read any
+/// more, and its connection is closed after the answer.
+pub(super) async fn serve(
+    etude: &Etude,
+    client: Client,
+    limits: Limits,
+    body: Peekable<BodyDataStream>,
+    lines: Lines,
+    room: &Room,
+    stopping: &CancellationToken,
+) {
+    let (came, mut incoming) = queue(QUEUE_BYTES);
+    let (outgoing, goes) = queue(QUEUE_BYTES);
+    let speaking = async {
+        let is_lost = async {
+            // The client does not read any more: it is gone.
+            lines.closed().await;
+            Closed::ByClient
+        };
+        stream::run(etude, client, limits, &mut incoming, &outgoing, stopping, is_lost).await;
+        drop(outgoing);
+        // What is left to be written may take this long.
+        tokio::time::sleep(CLOSE_TIMEOUT).await;
+    };
+    let listening = async {
+        read(body, limits.frame_bytes, Inlet { came, room }).await;
+        std::future::pending::<()>().await;
+    };
+    tokio::select! {
+        () = write(&lines, goes, room) => {}
+        () = speaking => {}
+        () = listening => {}
+    }
+}
+
+/// Passes on lines as frames. Ends with the body, or with a line that ends the stream.
+pub(super) async fn read(mut body: Peekable<BodyDataStream>, frame_bytes: usize, inlet: Inlet<'_>) {
+    let mut line = Vec::new();
+    while let Some(Ok(chunk)) = body.next().await {
+        for part in chunk.split_inclusive(|byte| *byte == b'\n') {
+            // A line of which no end comes takes no more than one that is complete.
+            let n_bytes = line.len() + part.len();
+            if n_bytes > frame_bytes + 1 {
+                let _ = inlet.tell(Incoming::TooLarge).await;
+                return;
+            }
+            if inlet.room.take_for_buffers(n_bytes).await.is_err() {
+                let _ = inlet.tell(Incoming::Crowded).await;
+                return;
+            }
+            line.extend_from_slice(part);
+            if line.ends_with(b"\n") && pass_on(&mut line, &inlet).await.is_break() {
+                return;
+            }
+        }
+    }
+    let _ = pass_on(&mut line, &inlet).await;
+}
+
+/// Passes on a line, unless it is blank.
+async fn pass_on(line: &mut Vec<u8>, inlet: &Inlet<'_>) -> ControlFlow<()> {
+    let line = std::mem::take(line);
+    if line.trim_ascii().is_empty() { ControlFlow::Continue(()) } else { inlet.pass_on(line.into()).await }
+}
+
+async fn write(lines: &Lines, mut goes: Receiver<Outgoing>, room: &Room) {
+    while let Some(outgoing) = goes.recv().await {
+        match outgoing.item {
+            Outgoing::Frame(mut text) => {
+                text.push('\n');
+                if room.take_for_buffers(text.len()).await.is_err() || lines.send(Ok(text.into())).await.is_err() {
+                    return;
+                }
+            }
+            Outgoing::Close(_) => return,
+        }
+    }
+}

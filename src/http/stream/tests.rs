@@ -1,0 +1,278 @@
+//! Streams over transports without a network.
+
+use std::future::ready;
+use std::time::Duration;
+
+use axum::extract::ws;
+use clap::Parser;
+use futures_util::{Sink, SinkExt, Stream, StreamExt, stream};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream};
+use tokio::time::Instant;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
+use tokio_tungstenite::tungstenite::protocol::{self, Role, WebSocketConfig};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use super::*;
+use crate::config::ServeConfig;
+use crate::model::Format;
+use crate::service::{Client, Etude, ModelText, Name};
+
+/// Longer than anything here takes; a test that waits for this fails.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+#[derive(Parser)]
+struct Flags {
+    #[command(flatten)]
+    config: ServeConfig,
+}
+
+/// The application, without a service, and the limits of its streams.
+async fn application(flags: &[&str]) -> (Etude, Limits, TempDir) {
+    let directory = tempfile::tempdir().unwrap();
+    let database = directory.path().join("etude.db");
+    let own = ["etude", "--database", database.to_str().unwrap()];
+    let config = Flags::parse_from(own.iter().chain(flags)).config;
+    let etude = Etude::open(&config.settings(), &TaskTracker::new(), CancellationToken::new()).await.unwrap();
+    (etude, config.stream_limits(), directory)
+}
+
+/// The server's end of a websocket, as axum gives it.
+async fn server_end(
+    io: DuplexStream,
+    limits: Limits,
+) -> impl Stream<Item = Result<ws::Message, axum::Error>> + Sink<ws::Message, Error = axum::Error> {
+    let config = WebSocketConfig::default()
+        .max_message_size(Some(limits.frame_bytes))
+        .max_frame_size(Some(limits.frame_bytes))
+        .read_buffer_size(READ_BUFFER_BYTES)
+        .write_buffer_size(WRITE_BUFFER_BYTES)
+        .max_write_buffer_size(max_write_buffer_bytes(limits));
+    let socket = WebSocketStream::from_raw_socket(io, Role::Server, Some(config)).await;
+    let socket = socket.map(|came| match came {
+        Ok(Message::Text(text)) => Ok(ws::Message::Text(text.as_str().into())),
+        Ok(Message::Binary(bytes)) => Ok(ws::Message::Binary(bytes)),
+        Ok(Message::Ping(bytes)) => Ok(ws::Message::Ping(bytes)),
+        Ok(Message::Pong(bytes)) => Ok(ws::Message::Pong(bytes)),
+        Ok(Message::Close(_) | Message::Frame(_)) => Ok(ws::Message::Close(None)),
+        Err(error) => Err(axum::Error::new(error)),
+    });
+    socket.sink_map_err(axum::Error::new).with(|goes: ws::Message| {
+        ready(Ok::<_, axum::Error>(match goes {
+            ws::Message::Text(text) => Message::text(text.as_str()),
+            ws::Message::Binary(bytes) => Message::Binary(bytes),
+            ws::Message::Ping(bytes) => Message::Ping(bytes),
+            ws::Message::Pong(bytes) => Message::Pong(bytes),
+            ws::Message::Close(close) => Message::Close(close.map(|close| protocol::CloseFrame {
+                code: CloseCode::from(close.code),
+                reason: close.reason.as_str().into(),
+            })),
+        }))
+    })
+}
+
+/// Speaks with a server over a websocket whose two ends hold so many bytes in between. The server is there for as long as `client` is, or
+/// less.
+async fn speak<T>(
+    (etude, limits): (&Etude, Limits),
+    max_bytes: usize,
+    client: impl AsyncFnOnce(DuplexStream) -> T,
+) -> T {
+    let (ours, theirs) = tokio::io::duplex(max_bytes);
+    let room = Room::admit(etude.memory(), limits).unwrap();
+    let stopping = CancellationToken::new();
+    let socket = server_end(theirs, limits).await;
+    let serving = websocket::serve(etude, Client::LOCAL, limits, socket, &room, &stopping);
+    tokio::join!(serving, client(ours)).1
+}
+
+async fn client_end(io: DuplexStream) -> WebSocketStream<DuplexStream> {
+    WebSocketStream::from_raw_socket(io, Role::Client, None).await
+}
+
+/// A frame of a client, masked with zeros.
+fn frame(first_byte: u8, payload: &[u8]) -> Vec<u8> {
+    let n_bytes = u8::try_from(payload.len()).unwrap();
+    let length = if n_bytes < 126 { vec![0x80 | n_bytes] } else { vec![0x80 | 126, 0, n_bytes] };
+    [&[first_byte], &length[..], &[0; 4], payload].concat()
+}
+
+#[tokio::test]
+async fn pongs_that_are_not_read_do_not_pile_up() {
+    const N_PINGS: usize = 40_000;
+    let (etude, limits, _directory) = application(&[]).await;
+    let n_read = speak((&etude, limits), 1024, async |mut io| {
+        let ping = frame(0x89, &[b'x'; 125]);
+        for _ in 0..N_PINGS {
+            io.write_all(&ping).await.unwrap();
+        }
+        // Something that has an answer, which finds room although pongs fill what there is.
+        io.write_all(&frame(0x81, b"{")).await.unwrap();
+        let mut all = Vec::new();
+        io.read_to_end(&mut all).await.unwrap();
+        assert!(String::from_utf8_lossy(&all).contains("malformed-json"));
+        all.len()
+    });
+    let n_read = tokio::time::timeout(PATIENCE, n_read).await.unwrap();
+    let most = max_write_buffer_bytes(limits) + 4096;
+    assert!(n_read <= most, "{n_read} of the {} bytes of all pongs were kept", 127 * N_PINGS);
+    etude.close().await;
+}
+
+#[tokio::test]
+async fn a_client_that_gives_no_sign_of_life_is_asked_for_one_and_let_go() {
+    let (etude, limits, _directory) = application(&[]).await;
+    tokio::time::pause();
+    let started = Instant::now();
+    speak((&etude, limits), 4096, async |mut io| {
+        let mut all = Vec::new();
+        io.read_to_end(&mut all).await.unwrap();
+        let silent = started.elapsed();
+        assert!((3 * limits.ping_every..=5 * limits.ping_every).contains(&silent), "{silent:?}");
+        // Two pings of no bytes, and a close frame.
+        assert!(all.windows(4).any(|bytes| bytes == [0x89, 0, 0x89, 0]), "{}", String::from_utf8_lossy(&all));
+        let close: Vec<u8> = [&[0x88, 25][..], &1008_u16.to_be_bytes(), b"no sign of life; resume"].concat();
+        assert!(all.ends_with(&close), "{}", String::from_utf8_lossy(&all));
+    })
+    .await;
+    etude.close().await;
+}
+
+#[tokio::test]
+async fn a_client_that_answers_pings_stays_for_as_long_as_it_likes() {
+    let (etude, limits, _directory) = application(&[]).await;
+    tokio::time::pause();
+    speak((&etude, limits), 4096, async |io| {
+        let mut client = client_end(io).await;
+        let mut n_pings = 0;
+        let reading = async {
+            while let Some(Ok(message)) = client.next().await {
+                n_pings += u32::from(message.is_ping());
+            }
+        };
+        // Less than after which a session is idle.
+        let ended = tokio::time::timeout(limits.ping_every * 100, reading).await;
+        assert!(ended.is_err(), "it was let go after {n_pings} pings");
+        assert!(n_pings > 40, "{n_pings}");
+    })
+    .await;
+    etude.close().await;
+}
+
+#[tokio::test]
+async fn what_websockets_do_not_allow_closes_them_with_1002_and_text_that_is_none_with_1007() {
+    let (etude, limits, _directory) = application(&[]).await;
+    let text_begins = frame(0x01, b"{");
+    let cases = [
+        ("a reserved data opcode", frame(0x83, b"x"), 1002),
+        ("a reserved control opcode", frame(0x8b, b"x"), 1002),
+        ("an unmasked frame", vec![0x81, 2, b'{', b'}'], 1002),
+        ("a reserved bit", frame(0xc1, b"{}"), 1002),
+        ("a continuation of nothing", frame(0x80, b"{}"), 1002),
+        ("a message within another", [text_begins.clone(), frame(0x81, b"{}")].concat(), 1002),
+        ("a fragmented ping", frame(0x09, b"x"), 1002),
+        ("a ping that is too long", frame(0x89, &[b'x'; 126]), 1002),
+        ("a close frame of one byte", frame(0x88, b"x"), 1002),
+        ("text that is not UTF-8", frame(0x81, b"\xff\xfe"), 1007),
+        ("text that is not UTF-8 as a whole", [text_begins, frame(0x80, b"\xff")].concat(), 1007),
+    ];
+    for (what, bytes, expected) in cases {
+        let told = speak((&etude, limits), 4096, async |io| {
+            let mut client = client_end(io).await;
+            client.get_mut().write_all(&bytes).await.unwrap();
+            let mut told = Vec::new();
+            loop {
+                match client.next().await {
+                    Some(Ok(Message::Text(text))) => told.push(serde_json::from_str::<Value>(&text).unwrap()),
+                    Some(Ok(Message::Close(close))) => return (told, u16::from(close.unwrap().code)),
+                    other => panic!("{what}: {other:?}"),
+                }
+            }
+        });
+        let (frames, code) = tokio::time::timeout(PATIENCE, told).await.unwrap();
+        assert_eq!(code, expected, "{what}: {frames:?}");
+        let kind = if code == 1002 { "/problems/bad-frame" } else { "/problems/malformed-json" };
+        assert_eq!(frames.last().unwrap()["problem"]["type"], kind, "{what}");
+    }
+    // Who closes in good order with a code that must not be used is told so, and nothing else.
+    let code = speak((&etude, limits), 4096, async |io| {
+        let mut client = client_end(io).await;
+        client.get_mut().write_all(&frame(0x88, &1005_u16.to_be_bytes())).await.unwrap();
+        loop {
+            match client.next().await {
+                Some(Ok(Message::Close(close))) => return u16::from(close.unwrap().code),
+                Some(Ok(Message::Text(text))) => assert!(text.contains("hello"), "{text}"),
+                other => panic!("{other:?}"),
+            }
+        }
+    });
+    assert_eq!(tokio::time::timeout(PATIENCE, code).await.unwrap(), 1002);
+    etude.close().await;
+}
+
+#[tokio::test]
+async fn a_client_that_vanishes_is_not_told_of_a_violation() {
+    let (etude, limits, _directory) = application(&[]).await;
+    let vanished = speak((&etude, limits), 4096, async |mut io| {
+        io.shutdown().await.unwrap();
+        let mut all = Vec::new();
+        io.read_to_end(&mut all).await.unwrap();
+        assert!(!String::from_utf8_lossy(&all).contains("error"), "{}", String::from_utf8_lossy(&all));
+    });
+    tokio::time::timeout(PATIENCE, vanished).await.unwrap();
+    etude.close().await;
+}
+
+/// As long as the client sends, and reads nothing.
+#[tokio::test]
+async fn who_sends_lines_without_end_and_reads_none_is_let_go_and_gives_its_memory_back() {
+    let (etude, limits, _directory) = application(&["--slow-reader-timeout", "100ms"]).await;
+    let model = json!({
+        "attributes": [{"name": "x", "kind": "number"}], "actions": [{"name": "on", "cost": 1}],
+        "dynamics": {"kind": "table", "states": [[0], [1]], "transitions": [[0, "on", 1], [1, "on", 0]], "start": 0},
+    });
+    let (text, format) = (ModelText::Whole(model.to_string().into_bytes()), Format::Json);
+    let caller = Caller { client: Client::LOCAL, arrived: std::time::Instant::now(), now: Timestamp::now() };
+    etude.put_model(&Name::new("m").unwrap(), text, format, caller).await.unwrap();
+    let free = etude.memory().free();
+    let room = Room::admit(etude.memory(), limits).unwrap();
+    let open = json!({"type": "open", "model": "m", "lookahead": 1}).to_string();
+    let observe = |seq: u32| json!({"type": "observe", "seq": seq, "states": [{"x": seq % 2}]}).to_string();
+    let lines = std::iter::once(open).chain((0..).map(observe)).map(|line| Ok::<_, axum::Error>(line + "\n"));
+    let body = ndjson::begin_reading(Request::new(Body::from_stream(stream::iter(lines)))).await;
+    let (lines, mut answer) = mpsc::channel(1);
+    let stopping = CancellationToken::new();
+    let serving = ndjson::serve(&etude, Client::LOCAL, limits, body, lines, &room, &stopping);
+    tokio::time::timeout(PATIENCE, serving).await.unwrap();
+    drop(room);
+    assert_eq!(etude.memory().free(), free);
+    assert!(answer.recv().await.is_some_and(|line| line.unwrap().starts_with(b"{\"type\":\"hello\"")));
+    assert!(answer.recv().await.is_none(), "the answer has ended");
+    etude.close().await;
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_line_without_an_end_takes_its_memory_before_it_is_complete_and_no_more_than_a_frame() {
+    let memory = crate::memory::Memory::with_room(8 << 20);
+    let limits = Flags::parse_from(["etude"]).config.stream_limits();
+    let room = Room::admit(&memory, limits).unwrap();
+    let before = memory.free();
+    let (came, mut incoming) = crate::stream::queue(crate::stream::QUEUE_BYTES);
+    let (begins, body) = mpsc::channel::<Result<Vec<u8>, axum::Error>>(1);
+    let body = ndjson::begin_reading(Request::new(Body::from_stream(ReceiverStream::new(body)))).await;
+    let reading = ndjson::read(body, limits.frame_bytes, Inlet { came, room: &room });
+    let sending = async {
+        begins.send(Ok(vec![b'x'; 100_000])).await.unwrap();
+        // Taken before more is read.
+        begins.send(Ok(Vec::new())).await.unwrap();
+        begins.reserve().await.unwrap();
+        assert_eq!(before - memory.free(), 3 * limits.frame_bytes as u64);
+        begins.send(Ok(vec![b'x'; 200_000])).await.unwrap();
+        assert!(matches!(incoming.recv().await.unwrap().item, Incoming::TooLarge));
+    };
+    tokio::join!(reading, sending);
+}

@@ -1,0 +1,213 @@
+//! The stream protocol over a websocket: a message is a frame.
+
+use axum::body::Bytes;
+use axum::extract::ws::{CloseFrame, Message};
+use futures_util::stream::{SplitSink, SplitStream};
+use futures_util::{Sink, SinkExt, Stream, StreamExt};
+use tokio::sync::{SetOnce, mpsc};
+use tokio::time::{Instant, MissedTickBehavior};
+use tokio_tungstenite::tungstenite;
+use tokio_tungstenite::tungstenite::error::ProtocolError;
+use tokio_util::sync::CancellationToken;
+
+use super::{CLOSE_TIMEOUT, Inlet};
+use crate::service::{Client, Etude};
+use crate::stream::{self, Closed, Incoming, Limits, Outgoing, QUEUE_BYTES, Receiver, Room, SMALL_FRAME_BYTES, queue};
+
+/// A client is gone of which nothing came for so many intervals, after all but the first of which it was asked for a sign of life.
+const MAX_SILENT_INTERVALS: u32 = 3;
+
+/// Asks for a sign of life.
+struct Ping;
+
+/// Streams over `socket` until either end closes it.
+pub(super) async fn serve<S>(
+    etude: &Etude,
+    client: Client,
+    limits: Limits,
+    socket: S,
+    room: &Room,
+    stopping: &CancellationToken,
+) where
+    S: Stream<Item = Result<Message, axum::Error>> + Sink<Message, Error = axum::Error>,
+{
+    let (sink, source) = socket.split();
+    let (came, mut incoming) = queue(QUEUE_BYTES);
+    let (outgoing, goes) = queue(QUEUE_BYTES);
+    let (pinger, pings) = mpsc::channel(1);
+    // Lost: the client is not there any more, or cannot be spoken to. Ended: nothing more will come.
+    let (lost, ended) = (SetOnce::new(), CancellationToken::new());
+    let speaking = async {
+        // A search that still runs ends with the client.
+        let is_lost = async { *lost.wait().await };
+        let closed = stream::run(etude, client, limits, &mut incoming, &outgoing, stopping, is_lost).await;
+        incoming.close();
+        // What is left to be written may take this long. Where the queue was full until now, this is the goodbye that a
+        // slow reader gets; if there was one already, nobody takes another.
+        let goodbye = tokio::time::timeout(CLOSE_TIMEOUT, outgoing.send(Outgoing::Close(closed)));
+        if let Ok(Ok(())) = goodbye.await {
+            drop(outgoing);
+            tokio::time::sleep(CLOSE_TIMEOUT).await;
+        }
+    };
+    let talking = async {
+        let is_written = tokio::select! {
+            // In the order in which a frame passes, so that it passes in one go.
+            biased;
+            () = speaking => false,
+            () = write(sink, goes, pings, room) => true,
+        };
+        // The client's half of the closing handshake, for which a shutdown does not wait.
+        if is_written {
+            tokio::select! {
+                () = ended.cancelled() => {}
+                () = stopping.cancelled() => {}
+                () = tokio::time::sleep(CLOSE_TIMEOUT) => {}
+            }
+        }
+    };
+    let listening = async {
+        let read = read(source, Inlet { came, room }, pinger, limits).await;
+        if let Some(closed) = read {
+            // It is set here only.
+            let _ = lost.set(closed);
+        }
+        ended.cancel();
+        std::future::pending::<()>().await;
+    };
+    tokio::select! {
+        biased;
+        () = listening => {}
+        () = talking => {}
+    }
+}
+
+/// Passes on what comes, until nobody wants it; then reads on for the client's goodbye. Pings are answered by reading. Gives why the
+/// client is lost, if it is.
+async fn read<S>(
+    mut source: SplitStream<S>,
+    inlet: Inlet<'_>,
+    pinger: mpsc::Sender<Ping>,
+    limits: Limits,
+) -> Option<Closed>
+where
+    S: Stream<Item = Result<Message, axum::Error>>,
+{
+    let mut ticks = tokio::time::interval_at(Instant::now() + limits.ping_every, limits.ping_every);
+    // While the client's frames wait for us, its silence is not counted.
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let (mut has_come, mut n_silent) = (false, 0);
+    loop {
+        let message = tokio::select! {
+            biased;
+            message = source.next() => message,
+            _ = ticks.tick() => {
+                n_silent = if std::mem::take(&mut has_come) { 0 } else { n_silent + 1 };
+                if n_silent == MAX_SILENT_INTERVALS {
+                    return Some(Closed::Silent);
+                }
+                if n_silent > 0 {
+                    // Where one is on its way already, or nothing is written any more, there is no need for another.
+                    let _ = pinger.try_send(Ping);
+                }
+                continue;
+            }
+        };
+        has_come = true;
+        // Nobody wants it once the connection is closing.
+        let _ = match message {
+            // A small one is copied, so that it does not keep what was read with it.
+            Some(Ok(Message::Text(text))) if text.len() <= SMALL_FRAME_BYTES => {
+                inlet.pass_on(Bytes::copy_from_slice(text.as_bytes())).await
+            }
+            Some(Ok(Message::Text(text))) => inlet.pass_on(text.into()).await,
+            Some(Ok(Message::Binary(_))) => inlet.tell(Incoming::Binary).await,
+            Some(Ok(Message::Ping(_) | Message::Pong(_))) => continue,
+            Some(Ok(Message::Close(_))) | None => return Some(Closed::ByClient),
+            Some(Err(error)) => match what_is_wrong(error) {
+                Ok(incoming) => {
+                    let _ = inlet.tell(incoming).await;
+                    return None;
+                }
+                Err(closed) => return Some(closed),
+            },
+        };
+    }
+}
+
+/// What an error of reading tells of the client, or why that is lost.
+fn what_is_wrong(error: axum::Error) -> Result<Incoming, Closed> {
+    let error = error.into_inner().downcast::<tungstenite::Error>().map_err(|_| Closed::ByClient)?;
+    match *error {
+        tungstenite::Error::Capacity(_) => Ok(Incoming::TooLarge),
+        tungstenite::Error::Utf8(_) => Ok(Incoming::NotText),
+        tungstenite::Error::Protocol(ProtocolError::ResetWithoutClosingHandshake) => Err(Closed::ByClient),
+        tungstenite::Error::Protocol(error) => Ok(Incoming::Violation(error.to_string())),
+        tungstenite::Error::Io(error) if error.kind() == std::io::ErrorKind::TimedOut => Err(Closed::Overloaded),
+        _ => Err(Closed::ByClient),
+    }
+}
+
+async fn write<S>(
+    mut sink: SplitSink<S, Message>,
+    mut goes: Receiver<Outgoing>,
+    mut pings: mpsc::Receiver<Ping>,
+    room: &Room,
+) where
+    S: Sink<Message, Error = axum::Error>,
+{
+    let closed = write_frames(&mut sink, &mut goes, &mut pings, room).await;
+    if let Some(closed) = closed {
+        let (code, reason) = closed.code();
+        let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
+        // A client that does not read does not hear this either.
+        let _ = tokio::time::timeout(CLOSE_TIMEOUT, sink.send(close)).await;
+    }
+}
+
+/// Writes what goes to the client, until nothing more will. Gives how to close, if there is still something to be closed.
+async fn write_frames<S>(
+    sink: &mut SplitSink<S, Message>,
+    goes: &mut Receiver<Outgoing>,
+    pings: &mut mpsc::Receiver<Ping>,
+    room: &Room,
+) -> Option<Closed>
+where
+    S: Sink<Message, Error = axum::Error>,
+{
+    loop {
+        let first = tokio::select! {
+            biased;
+            first = goes.recv() => first?,
+            Some(Ping) = pings.recv() => {
+                sink.flush().await.ok()?;
+                sink.send(Message::Ping(Bytes::new())).await.ok()?;
+                continue;
+            }
+        };
+        // Pongs may have filled what waits to be written. They must not keep a frame of ours out, now or below.
+        sink.flush().await.ok()?;
+        // What waits together is written together: a write, and a wakeup of the client, cost more than a frame.
+        let mut next = Some(first);
+        while let Some(outgoing) = next {
+            match outgoing.item {
+                Outgoing::Frame(text) => {
+                    if text.len() > SMALL_FRAME_BYTES {
+                        if room.take_for_buffers(text.len()).await.is_err() {
+                            return Some(Closed::Overloaded);
+                        }
+                        sink.flush().await.ok()?;
+                    }
+                    if let Err(error) = sink.feed(Message::Text(text.into())).await {
+                        tracing::debug!(error = &error as &dyn std::error::Error, "a frame could not be written");
+                        // Where the client is gone, it does not hear this; a frame must not vanish without a word.
+                        return Some(Closed::Failed);
+                    }
+                }
+                Outgoing::Close(closed) => return Some(closed),
+            }
+            next = goes.try_recv();
+        }
+        sink.flush().await.ok()?;
+    }
+}
