@@ -307,16 +307,14 @@ impl Mapper {
                 let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, space.row(problem.start));
-                match self.solve(problem, settings.grouping, TableRoom::within(budget.max_bytes), interrupt)? {
-                    Some(projected) => {
-                        let least_f = first + projected.cost_to_go(0, space.row(problem.start));
-                        conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
-                    }
-                    None => {
-                        let stopped_by = found.stopped_by.or(Some(StoppedBy::Deadline));
-                        let found = Found { least_f: first, stopped_by, ..found };
-                        conclude(problem, space, &Blind, found, interrupt)
-                    }
+                let room = TableRoom::within(budget.max_bytes);
+                if let Some(projected) = self.solve(problem, settings.grouping, room, interrupt)? {
+                    let least_f = first + projected.cost_to_go(0, space.row(problem.start));
+                    conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
+                } else {
+                    let stopped_by = found.stopped_by.or(Some(StoppedBy::Deadline));
+                    let found = Found { least_f: first, stopped_by, ..found };
+                    conclude(problem, space, &Blind, found, interrupt)
                 }
             }
         }

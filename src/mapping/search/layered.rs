@@ -106,7 +106,7 @@ impl Buffers {
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
         let Self { body, parts, nodes } = self;
-        let joined: usize = parts.joined.iter().map(|classes| classes.len() * size_of::<u32>()).sum();
+        let joined = parts.joined.len() * parts.columns.len() * size_of::<u32>();
         body.ways.capacity() * size_of::<Way>()
             + body.ends.capacity() * STATE_BYTES
             + joined
