@@ -9,6 +9,7 @@ use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
 use super::pool::Admission;
 use super::{Etude, ServiceError};
 use crate::mapping::Mapper;
+use crate::memory::SMALL_BYTES;
 use crate::store::ModelKey;
 
 /// Compiled models by the hash of their content, the least useful evicted. Concurrent requests for a model that is not
@@ -58,9 +59,10 @@ impl MapperCache {
         Self { cache, oversized: Mutex::default() }
     }
 
-    /// Lets all models go; those that are searched stay as long as they are.
-    pub(super) fn clear(&self) {
-        self.cache.clear();
+    /// Lets large models go; those that are searched stay as long as they are. Small ones stay: whoever asks for much memory does not
+    /// keep others waiting for theirs.
+    pub(super) fn let_large_ones_go(&self) {
+        self.cache.retain(|_, kept| kept.size_bytes <= SMALL_BYTES);
         let _oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).take();
     }
 
