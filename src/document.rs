@@ -171,6 +171,21 @@ pub fn parse(text: &[u8]) -> Result<Value, ParseError> {
     serde_json::from_slice(text).map_err(|error| explain_parse_error(text, &error))
 }
 
+/// About how much memory the values in `text` take once they are parsed, in bytes: up to eighty times as much as the text. Looks at
+/// nothing but punctuation, and takes that in strings for more of it.
+#[must_use]
+pub fn parsed_bytes(text: &[u8]) -> usize {
+    /// A value in a list that has grown, or a name; a map, which has room for eleven members.
+    const VALUE_BYTES: usize = 2 * size_of::<Value>();
+    const MAP_BYTES: usize = 11 * (size_of::<Value>() + size_of::<String>()) + 32;
+    let bytes_of = |byte: &u8| match byte {
+        b',' | b':' => VALUE_BYTES,
+        b'{' => MAP_BYTES,
+        _ => 0,
+    };
+    text.len() + text.iter().map(bytes_of).sum::<usize>()
+}
+
 /// Parses once more, slowly, to say where the fault is.
 fn explain_parse_error(text: &[u8], error: &serde_json::Error) -> ParseError {
     let place = || {

@@ -87,7 +87,8 @@ impl Etude {
             sent
         } else {
             // Another model was given this name meanwhile.
-            SentBatch { document: parse(body, &place).await?, read: None }
+            let (document, held) = parse(body, &place, &self.memory).await?;
+            SentBatch { document, read: None, _held: held }
         };
         let memory = self.memory.clone();
         let read = move |_: &mut dyn Interrupt| Ok(Batch::read(sent, envelope, named, memory));
@@ -139,7 +140,7 @@ impl Etude {
         let n_bytes = body.as_ref().len();
         let read = move || {
             let at_hand = |model: &str| etude.mapper_at_hand(model).map(|(_, mapper)| mapper);
-            SentBatch::read(body.as_ref(), &at_hand)
+            SentBatch::read(body.as_ref(), &at_hand, &etude.memory)
         };
         if n_bytes <= MAX_INLINE_BYTES { read() } else { place.run_reading(n_bytes, read).await? }
     }
@@ -151,20 +152,23 @@ struct SentBatch {
     document: Value,
     /// The items that were read for a model.
     read: Option<(Arc<Mapper>, Vec<Item>)>,
+    /// For the document, unless the items were read already.
+    _held: Option<Held>,
 }
 
 impl SentBatch {
     /// Reads a batch in one pass if that can be, else as a document. Items with a lookahead need documents: their requests are stored, to
     /// be refined.
-    fn read(body: &[u8], at_hand: AtHand<'_>) -> Result<Self, ServiceError> {
+    fn read(body: &[u8], at_hand: AtHand<'_>, memory: &Memory) -> Result<Self, ServiceError> {
         let outline = BatchOutline::read(body, at_hand).filter(|BatchOutline { document, items, .. }| {
             document["lookahead"].is_null() && items.iter().all(|(item, _)| item["lookahead"].is_null())
         });
         let Some(BatchOutline { document, items, mapper }) = outline else {
-            return Ok(Self { document: document::parse(body)?, read: None });
+            let held = memory.try_take(document::parsed_bytes(body) as u64)?;
+            return Ok(Self { document: document::parse(body)?, read: None, _held: Some(held) });
         };
         let as_item = |(document, demonstration)| Item { document, demonstration: Some(demonstration) };
-        Ok(Self { document, read: Some((mapper, items.into_iter().map(as_item).collect())) })
+        Ok(Self { document, read: Some((mapper, items.into_iter().map(as_item).collect())), _held: None })
     }
 
     /// Whether it can be followed by this model.
@@ -198,6 +202,7 @@ struct Batch {
     /// What an item has unless it has its own.
     options: Map<String, Value>,
     memory: Memory,
+    _document_held: Option<Held>,
     /// What the answer takes.
     answer: Mutex<Answer>,
     /// The items that wait, with their places in the batch.
@@ -211,7 +216,7 @@ impl Batch {
     /// Reads all but the items against the model.
     fn read(sent: SentBatch, envelope: Envelope, named: Named, memory: Memory) -> Result<Self, ServiceError> {
         let Envelope { model, over_limits: mut faults, .. } = envelope;
-        let SentBatch { mut document, read } = sent;
+        let SentBatch { mut document, read, _held: document_held } = sent;
         let Named { learner, model_hash, mapper } = named;
         let root = Place::root(&document);
         let object = root.object(&BATCH_FIELDS, &mut faults);
@@ -249,7 +254,7 @@ impl Batch {
         };
         let answer = Mutex::new(Answer { held: memory.try_take(0)?, n_bytes: 0, is_full: false });
         let waiting = Mutex::new(items.into_iter().enumerate());
-        Ok(Self { mapper, stamp, weights, options, memory, answer, waiting })
+        Ok(Self { _document_held: document_held, mapper, stamp, weights, options, memory, answer, waiting })
     }
 
     /// Follows items that wait, one after the other, until a slice is over. Nothing if none waits any more.
@@ -466,7 +471,7 @@ mod tests {
     /// What comes of the items, but for ids and times, and whether they were read in one pass if the model is at hand.
     fn follow(text: &str, mapper: &Arc<Mapper>, is_at_hand: bool) -> (Vec<Result<Value, String>>, bool) {
         let at_hand = |model: &str| (is_at_hand && model == "figure-4").then(|| Arc::clone(mapper));
-        let sent = SentBatch::read(text.as_bytes(), &at_hand).unwrap();
+        let sent = SentBatch::read(text.as_bytes(), &at_hand, &Memory::with_room(1 << 30)).unwrap();
         let is_read = sent.read.is_some();
         let (envelope, _) = Envelope::read(&sent.document, &BATCH_FIELDS, "items");
         let Some(envelope) = envelope else { return (Vec::new(), is_read) };

@@ -59,11 +59,30 @@ impl MapperCache {
         Self { cache, oversized: Mutex::default() }
     }
 
-    /// Lets large models go; those that are searched stay as long as they are. Small ones stay: whoever asks for much memory does not
-    /// keep others waiting for theirs.
-    pub(super) fn let_large_ones_go(&self) {
-        self.cache.retain(|_, kept| kept.size_bytes <= SMALL_BYTES);
-        let _oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).take();
+    /// Lets as many large models go that nobody searches now as give back `n_bytes`, or none if all of them would not. Small ones stay:
+    /// whoever asks for much memory does not keep others waiting for theirs.
+    pub(super) fn make_room(&self, n_bytes: u64) {
+        let mut oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner);
+        let idle_oversized = oversized.as_ref().filter(|(_, mapper)| Arc::strong_count(mapper) == 1);
+        let oversized_bytes = idle_oversized.map_or(0, |(_, mapper)| mapper.size_bytes() as u64);
+        // One is the cache's, one that of whoever looks.
+        let idle =
+            self.cache.iter().filter(|(_, kept)| kept.size_bytes > SMALL_BYTES && Arc::strong_count(&kept.mapper) == 2);
+        let idle: Vec<(ModelKey, u64)> = idle.map(|(key, kept)| (key, kept.size_bytes)).collect();
+        if oversized_bytes + idle.iter().map(|(_, size)| size).sum::<u64>() < n_bytes {
+            return;
+        }
+        if oversized_bytes > 0 {
+            *oversized = None;
+        }
+        let mut n_left = n_bytes.saturating_sub(oversized_bytes);
+        for (key, size_bytes) in idle.into_iter() {
+            if n_left == 0 {
+                break;
+            }
+            self.cache.remove(&key);
+            n_left = n_left.saturating_sub(size_bytes);
+        }
     }
 
     /// Puts in a model that has just been compiled.

@@ -44,14 +44,14 @@ impl Compiler {
         }
     }
 
-    /// Takes so much memory, in place of large models that are kept if need be.
+    /// Takes so much memory, in place of large models that nobody searches now if need be.
     ///
     /// # Errors
     ///
     /// [`NoRoom`] if there is not so much.
     pub(super) fn take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
         self.memory.try_take(n_bytes).or_else(|_| {
-            self.cache.let_large_ones_go();
+            self.cache.make_room(n_bytes.saturating_sub(self.memory.free_for_large()));
             self.memory.try_take(n_bytes)
         })
     }

@@ -118,7 +118,7 @@ impl Etude {
     ) -> Result<Searched, ServiceError> {
         let place = self.pool.admit_when_needed(caller.client);
         let is_small = body.as_ref().len() <= MAX_INLINE_BYTES;
-        let document = parse(body, &place).await?;
+        let (document, held) = parse(body, &place, &self.memory).await?;
         let (envelope, faults) = self.read_envelope(&document, &Request::FIELDS, "demonstration");
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(envelope) = envelope else { return Err(faults.into()) };
@@ -131,6 +131,7 @@ impl Etude {
         let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
         let is_quick = is_small && is_quick(mapper.model(), &document, n_observations);
         let job = move |interrupt: &mut dyn Interrupt| {
+            let _held = held;
             let base = |faults: &mut Faults| base_weights(mapper.model(), learner.as_ref(), faults);
             search(&mapper, (&document, &Request::FIELDS, envelope.over_limits), base, stamp, &memory, interrupt)
         };
@@ -208,14 +209,19 @@ impl Etude {
     }
 }
 
-/// Parses a body, by its `place` in the pool if it is large: without waiting for searches, as how long it may wait is written in it.
-pub(super) async fn parse(body: impl AsRef<[u8]> + Send + 'static, place: &Admission) -> Result<Value, ServiceError> {
-    let document = if body.as_ref().len() <= MAX_INLINE_BYTES {
-        document::parse(body.as_ref())
-    } else {
-        place.run_reading(body.as_ref().len(), move || document::parse(body.as_ref())).await?
-    };
-    Ok(document?)
+/// Parses a body, by its `place` in the pool if it is large: without waiting for searches, as how long it may wait is written in it. What
+/// a large one takes is held as well.
+pub(super) async fn parse(
+    body: impl AsRef<[u8]> + Send + 'static,
+    place: &Admission,
+    memory: &Memory,
+) -> Result<(Value, Option<Held>), ServiceError> {
+    if body.as_ref().len() <= MAX_INLINE_BYTES {
+        return Ok((document::parse(body.as_ref())?, None));
+    }
+    let held = memory.try_take(document::parsed_bytes(body.as_ref()) as u64)?;
+    let document = place.run_reading(body.as_ref().len(), move || document::parse(body.as_ref())).await??;
+    Ok((document, Some(held)))
 }
 
 /// What must be known of a request before its model is at hand.

@@ -49,7 +49,7 @@ impl Etude {
         let Ready { sequence, name, learner, weights } = self.ready(name.as_str(), None).await?;
         let place = self.pool.admit_when_needed(caller.client);
         let is_small = body.as_ref().len() <= policies::MAX_INLINE_BYTES;
-        let document = policies::parse(body, &place).await?;
+        let (document, held) = policies::parse(body, &place, &self.memory).await?;
         let (envelope, faults) = self.read_envelope(&document, &TRIAL_FIELDS, "demonstration");
         let Some(envelope) = envelope else { return Err(faults.into()) };
         let deadline = self.deadline(&envelope, caller.arrived);
@@ -72,6 +72,7 @@ impl Etude {
         let is_quick = is_small && policies::is_quick(mapper.model(), &document, n_observations);
         let memory = self.memory.clone();
         let job = move |interrupt: &mut dyn Interrupt| {
+            let _held = held;
             let mut drawn = None;
             let base = |faults: &mut Faults| {
                 let schema = mapper.model().schema();

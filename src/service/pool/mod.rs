@@ -7,7 +7,7 @@
 //! ```
 //!
 //! A job is admitted while there is a place for its client, waits for its turn, and runs on a thread. What has run for longer than a
-//! [`MOMENT`] may hold all threads but one, and makes way for the long jobs of other clients: it keeps what it has done and waits for its
+//! [`MOMENT`] may hold all threads but some, and makes way for the long jobs of other clients: it keeps what it has done and waits for its
 //! next turn, so that small requests are answered while any number of large ones run. Whoever waits for a job may go away at
 //! any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`].
 //!
@@ -18,6 +18,7 @@
 
 mod turns;
 
+use std::cell::Cell;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
@@ -54,7 +55,7 @@ const LONG_READ_BYTES: usize = 1 << 20;
 /// Size of the pool.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct PoolSettings {
-    /// Jobs that run at the same time. With one, another one is added for what takes less than a moment.
+    /// Jobs that run at the same time. A few more run while they take less than a moment.
     pub n_threads: usize,
     /// Jobs that wait; further ones are refused.
     pub max_waiting: usize,
@@ -349,6 +350,7 @@ impl SearchPool {
         let runtime = Handle::current();
         let running = self.0.tasks.spawn_blocking(move || {
             let _held = held;
+            give_way();
             let mut watch = Watch::new(job, cancel, runtime);
             let done = span.in_scope(|| run(&mut watch));
             (done, watch.is_refused)
@@ -482,6 +484,20 @@ impl Admission {
             Some(patience) => tokio::time::timeout_at(patience.into(), waiting).await.ok().transpose()?,
         };
         self.pool.run_holding((), Job { client, turn, place: Some(place), deadline }, job).await
+    }
+}
+
+/// Lets the threads that talk to clients and to the disk come before this one, from now on: they need little, and soon.
+fn give_way() {
+    /// As niceness; a third of the time, where all processors are wanted.
+    const NICENESS: i32 = 5;
+    thread_local! {
+        static HAS_GIVEN_WAY: Cell<bool> = const { Cell::new(false) };
+    }
+    #[cfg(target_os = "linux")]
+    if !HAS_GIVEN_WAY.replace(true) {
+        // Threads have priorities of their own here. Where this one keeps its, things are as they were.
+        let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
     }
 }
 

@@ -2,7 +2,8 @@
 //!
 //! A job is *short* until it has run for a moment, and *long* from then on.
 //!
-//! - Short jobs come before long ones. Long ones have all threads but one; the last one is lent to them while nothing short comes.
+//! - Short jobs come before long ones. Long ones have all threads but one and those that only short ones use; one more is lent to
+//!   them while nothing short comes.
 //! - Of jobs of a kind, clients take turns: each is served once before one of them is served again. Of a client's jobs, the one that
 //!   has run least is served first (a level is twice as long as the one before it), and of those the first to come.
 //! - A long job makes way for one that has run less, and, once it had its share, for another client's.
@@ -16,7 +17,10 @@ use rustc_hash::FxHashMap;
 
 use crate::service::Client;
 
-/// How long nothing short must have come before long jobs may use all threads.
+/// Threads that only short jobs use: one of these may be in the middle of something that takes it longer than it should.
+const N_SHORT_THREADS: usize = 2;
+
+/// How long nothing short must have come before another thread is lent to long jobs.
 pub(super) const LENT_AFTER: Duration = Duration::from_millis(10);
 
 /// How long a job has run.
@@ -37,7 +41,10 @@ pub(super) type Ticket = u64;
 /// Threads and places, who has them, and who waits for a thread.
 #[derive(Debug)]
 pub(super) struct Turns {
+    /// All threads.
     n_threads: usize,
+    /// Those that long jobs may have; one less while short ones come.
+    n_long_threads: usize,
     n_running: usize,
     n_running_long: usize,
     short: Places,
@@ -50,10 +57,11 @@ pub(super) struct Turns {
 }
 
 impl Turns {
-    /// Turns for `n_threads`, at least two of them, and for so many short and so many long jobs, waiting or running.
+    /// Turns for `n_threads` and a few more for what is short, and for so many short and so many long jobs, waiting or running.
     pub(super) fn new(n_threads: usize, n_short: usize, n_long: usize) -> Self {
         Self {
-            n_threads: n_threads.max(2),
+            n_threads: n_threads + N_SHORT_THREADS,
+            n_long_threads: n_threads,
             n_running: 0,
             n_running_long: 0,
             short: Places::new(n_short),
@@ -112,7 +120,7 @@ impl Turns {
 
     /// Takes a thread for a job that nobody waits for, if another one stays free and nobody waits.
     pub(super) fn try_start_spare(&mut self) -> bool {
-        let starts = self.n_running + 1 < self.n_threads && !self.is_waited_for();
+        let starts = self.n_running + 1 < self.n_long_threads.max(2) && !self.is_waited_for();
         if starts {
             self.start(Class::Long);
         }
@@ -169,25 +177,26 @@ impl Turns {
         !(self.waiting_short.is_empty() && self.waiting_long.is_empty())
     }
 
-    /// Whether all threads are taken.
+    /// Whether as many threads are taken as there are processors for.
     pub(super) fn are_all_taken(&self) -> bool {
-        self.n_running >= self.n_threads
+        self.n_running >= self.n_long_threads.max(2)
     }
 
     /// Whether more long jobs run than may.
     fn is_one_too_many(&self, now: Instant) -> bool {
-        self.n_running_long >= self.n_threads && !self.is_lent(now)
+        self.n_running_long > self.n_for_long(now)
     }
 
-    /// Whether long jobs may use the last thread.
-    fn is_lent(&self, now: Instant) -> bool {
+    /// How many threads long jobs may have.
+    fn n_for_long(&self, now: Instant) -> usize {
         let is_quiet = self.last_short.is_none_or(|last| now.saturating_duration_since(last) >= LENT_AFTER);
-        is_quiet && self.waiting_short.is_empty()
+        let is_lent = is_quiet && self.waiting_short.is_empty();
+        if is_lent { self.n_long_threads } else { self.n_long_threads - 1 }.max(1)
     }
 
     fn has_thread_for(&self, class: Class, now: Instant) -> bool {
         let is_free = self.n_running < self.n_threads;
-        is_free && (class == Class::Short || self.n_running_long + 1 < self.n_threads || self.is_lent(now))
+        is_free && (class == Class::Short || self.n_running_long < self.n_for_long(now))
     }
 
     fn start(&mut self, class: Class) {
@@ -333,7 +342,7 @@ mod tests {
     fn clients_take_turns_and_a_clients_jobs_keep_their_order() {
         let now = Instant::now();
         let mut turns = Turns::new(2, 10, 10);
-        assert!(turns.try_start(Class::Short, now) && turns.try_start(Class::Short, now));
+        while turns.try_start(Class::Short, now) {}
         let tickets = [0, 0, 0, 1, 1, 2].map(|n| turns.wait(client(n), Class::Short, 0));
         let [a1, a2, a3, b1, b2, c1] = tickets;
         assert_eq!(order(&mut turns, Class::Short, now), [a1, b1, c1, a2, b2, a3]);
@@ -345,9 +354,10 @@ mod tests {
         let mut turns = Turns::new(3, 10, 10);
         assert!(turns.try_start(Class::Short, now));
         assert!(turns.become_long(now) && turns.try_start(Class::Long, now));
-        assert!(!turns.try_start(Class::Long, now), "the last thread is for short jobs");
+        assert!(!turns.try_start(Class::Long, now), "the other threads are for short jobs");
         let long = turns.wait(client(0), Class::Long, 1);
-        assert!(turns.try_start(Class::Short, now));
+        while turns.try_start(Class::Short, now) {}
+        assert_eq!(turns.n_running(), 3 + N_SHORT_THREADS);
         let short = turns.wait(client(0), Class::Short, 0);
         turns.stop(Class::Long);
         assert_eq!((turns.next(now), turns.next(now)), (Some(short), None));
@@ -459,11 +469,12 @@ mod tests {
                     prop_assert!(at.is_some(), "nobody waits with this ticket");
                     running.push(waiting.remove(at.unwrap()).2);
                 }
-                prop_assert!(running.len() <= n_threads);
+                prop_assert!(running.len() <= n_threads + N_SHORT_THREADS);
                 let waits = |wanted| waiting.iter().any(|(.., class)| *class == wanted);
-                prop_assert!(running.len() == n_threads || !waits(Class::Short));
+                prop_assert!(running.len() == n_threads + N_SHORT_THREADS || !waits(Class::Short));
                 let n_long = running.iter().filter(|class| **class == Class::Long).count();
-                prop_assert!(running.len() == n_threads || n_long + 1 >= n_threads || !waits(Class::Long));
+                prop_assert!(n_long <= n_threads);
+                prop_assert!(running.len() == n_threads + N_SHORT_THREADS || n_long + 1 >= n_threads || !waits(Class::Long));
             }
             // Whoever still waits is served in the end.
             now += LENT_AFTER;
