@@ -11,7 +11,7 @@ use std::time::Duration;
 use tempfile::TempDir;
 
 /// Longer than anything here takes; what is not done by then is killed, and its test fails.
-const PATIENCE: Duration = Duration::from_secs(60);
+const PATIENCE: Duration = Duration::from_mins(1);
 
 /// A service in a process of its own, whose log is read only when a test reads it.
 struct Process {
@@ -62,7 +62,8 @@ impl Process {
         let watched = watch(child.id());
         let mut process = Self { child, address: String::new(), log, _watched: watched, _directory: directory };
         let listening = process.until_logged("listening on http://");
-        process.address = listening.split("http://").nth(1).unwrap().split(' ').next().unwrap().trim().to_owned();
+        let address = listening.split("http://").nth(1).unwrap().split(' ').next().unwrap().trim();
+        address.clone_into(&mut process.address);
         process
     }
 
@@ -95,9 +96,8 @@ fn ask(connection: &mut BufReader<TcpStream>, request: &str) -> String {
         assert_ne!(connection.read_line(&mut head).unwrap(), 0, "{head}");
         match head[start..].trim().split_once(": ") {
             Some(("content-length", value)) => n_bytes = value.parse().unwrap(),
-            Some(_) => {}
             None if head[start..].trim().is_empty() => break,
-            None => {}
+            _ => {}
         }
     }
     let mut body = vec![0; n_bytes];

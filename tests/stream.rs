@@ -668,7 +668,7 @@ async fn a_client_that_sends_pings_and_never_reads_is_closed() {
     use tokio::io::AsyncWriteExt;
     let service = Service::start(&["--slow-reader-timeout", "200ms"]).await;
     let mut client = Client::connect_narrowly(&service).await;
-    let ping = [&[0x89, 0x80 | 125, 0, 0, 0, 0][..], &[b'x'; 125]].concat().repeat(100);
+    let ping = [&[0x89, 0xfd, 0, 0, 0, 0][..], &[b'x'; 125]].concat().repeat(100);
     let sending = async {
         let stream = client.socket.get_mut();
         while stream.write_all(&ping).await.is_ok() {}

@@ -65,7 +65,7 @@ pub(super) async fn websocket(
     Ok(upgrade.on_upgrade(move |socket| {
         let streams = context.streams.clone();
         let serving = async move {
-            websocket::serve(&context.etude, client, limits, socket, &place.room, &context.stopping).await;
+            Box::pin(websocket::serve(&context.etude, client, limits, socket, &place.room, &context.stopping)).await;
             drop(place);
         };
         streams.track_future(serving.instrument(span))

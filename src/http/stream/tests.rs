@@ -86,7 +86,7 @@ async fn speak<T>(
     let room = Room::admit(etude.memory(), limits).unwrap();
     let stopping = CancellationToken::new();
     let socket = server_end(theirs, limits).await;
-    let serving = websocket::serve(etude, Client::LOCAL, limits, socket, &room, &stopping);
+    let serving = Box::pin(websocket::serve(etude, Client::LOCAL, limits, socket, &room, &stopping));
     tokio::join!(serving, client(ours)).1
 }
 
@@ -97,7 +97,7 @@ async fn client_end(io: DuplexStream) -> WebSocketStream<DuplexStream> {
 /// A frame of a client, masked with zeros.
 fn frame(first_byte: u8, payload: &[u8]) -> Vec<u8> {
     let n_bytes = u8::try_from(payload.len()).unwrap();
-    let length = if n_bytes < 126 { vec![0x80 | n_bytes] } else { vec![0x80 | 126, 0, n_bytes] };
+    let length = if n_bytes < 126 { vec![0x80 | n_bytes] } else { vec![0xfe, 0, n_bytes] };
     [&[first_byte], &length[..], &[0; 4], payload].concat()
 }
 
@@ -246,7 +246,7 @@ async fn who_sends_lines_without_end_and_reads_none_is_let_go_and_gives_its_memo
     let body = ndjson::begin_reading(Request::new(Body::from_stream(stream::iter(lines)))).await;
     let (lines, mut answer) = mpsc::channel(1);
     let stopping = CancellationToken::new();
-    let serving = ndjson::serve(&etude, Client::LOCAL, limits, body, lines, &room, &stopping);
+    let serving = Box::pin(ndjson::serve(&etude, Client::LOCAL, limits, body, lines, &room, &stopping));
     tokio::time::timeout(PATIENCE, serving).await.unwrap();
     drop(room);
     assert_eq!(etude.memory().free(), free);
