@@ -188,9 +188,9 @@ const MIN_MEMORY_BYTES: u64 = 128 << 20;
 /// Most threads: half of those that the runtime has for what blocks.
 const MAX_THREADS: usize = 256;
 
-/// Most searches that have run for longer than a moment, each of which may keep a thread of the operating system. One client may
-/// have half of these.
-const MAX_LONG_SEARCHES: usize = 256;
+/// Most searches that have run for longer than a moment, each of which keeps its memory until it is done. One client may have half of
+/// these.
+const MAX_LONG_SEARCHES: usize = 32;
 
 /// Fewest connections, whatever the limits are.
 pub(crate) const MIN_CONNECTIONS: usize = 16;
@@ -252,7 +252,7 @@ mod tests {
         let config = |n: &'static str| <Flags as clap::Parser>::parse_from(flags.into_iter().chain([n])).config;
         let allowed = |n: &'static str, max_files: u64| config(n).within(max_files).max_connections;
         assert_eq!((allowed("1000", 1_000_000), allowed("1000", 1024), allowed("1000", 64)), (1000, 960, 16));
-        assert_eq!(allowed("10000", 1_000_000), 4096, "a quarter of the memory is theirs");
+        assert_eq!(allowed("10000", 1_000_000), 5461, "a third of the memory is theirs");
         let few = config("16").within(1024);
         assert_eq!((few.stream_limits().streams, few.connection_limits().max_connections), (12, 16));
         assert!(parse_connections("15").is_err() && parse_connections("1000001").is_err());

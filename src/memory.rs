@@ -42,10 +42,10 @@ impl Memory {
     /// Least that is kept for what takes nothing from the budget.
     const MIN_BASE_BYTES: u64 = 64 << 20;
 
-    /// A budget of `max_bytes`, a quarter of which is kept for what is too small or too scattered to be counted.
+    /// A budget of `max_bytes`, a third of which is kept for what is too small or too scattered to be counted.
     #[must_use]
     pub fn new(max_bytes: u64) -> Self {
-        let base = (max_bytes / 4).max(Self::MIN_BASE_BYTES);
+        let base = (max_bytes / 3).max(Self::MIN_BASE_BYTES);
         Self::with_room(max_bytes.saturating_sub(base))
     }
 

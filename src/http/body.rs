@@ -24,7 +24,7 @@ use super::problem::{Problem, ProblemKind};
 use crate::document::Quoted;
 use crate::memory::{Held, Memory, NoRoom};
 use crate::model::Format;
-use crate::service::{ModelText, OpenText, PipeWriter, ServiceError, pipe};
+use crate::service::{Client, ModelText, OpenText, PipeWriter, ServiceError, pipe};
 
 /// How long a client may take to send its body, however slowly it comes.
 const BODY_TIMEOUT: Duration = Duration::from_mins(1);
@@ -69,6 +69,7 @@ async fn read_json_within(limit: SentLimit, request: Request, context: &Context)
         Err(problem) if is_json => return Err(refuse(request, context, problem)),
         _ => return Err(refuse(request, context, Problem::new(ProblemKind::UnsupportedMediaType, detail))),
     };
+    let client = request.extensions().get::<Client>().copied().unwrap_or(Client::LOCAL);
     let (collected, _) = collect(open(request, limit, context)?, usize::MAX, context).await?;
     let bytes = collected.into_bytes();
     if encoding == Encoding::Identity {
@@ -93,8 +94,8 @@ async fn read_json_within(limit: SentLimit, request: Request, context: &Context)
             decoded.hold(decoded.bytes.capacity() + n_seen).map_err(BodyError::NoRoom)?;
         }
     };
-    let decoded = context.tasks.spawn_blocking(decode).await.map_err(io::Error::other).flatten();
-    decoded.map_err(|error| unreadable(&error))
+    let decoded = context.etude.pool().read_patiently(client, limit.n_bytes, decode).await;
+    decoded.map_err(ServiceError::from)?.map_err(|error| unreadable(&error))
 }
 
 /// Most bytes of a body as it is sent, and what the setting is called.

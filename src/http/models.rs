@@ -23,7 +23,7 @@ use super::path::PathName;
 use super::problem::Problem;
 use crate::attribute::AttributeDocument;
 use crate::model::{ActionDocument, DefinitionDocument};
-use crate::service::{Caller, DefinitionReader, Etude, ModelAnswer, ModelDefinition, Registered, ServiceError};
+use crate::service::{Caller, DefinitionReader, Etude, ModelDefinition, Registered, ServiceError};
 use crate::store::{ModelSummary, PIECE_BYTES};
 
 /// A registered model.
@@ -160,9 +160,10 @@ pub(super) async fn get_model(
     State(context): State<SharedContext>,
     PathName(name): PathName,
 ) -> Result<Response, Problem> {
-    let ModelAnswer { summary, definition } = context.etude.model(&name).await?;
-    let summary = summary.into();
-    match definition {
+    // What it takes is held until the answer is written.
+    let answer = context.etude.model(&name).await?;
+    let summary = answer.summary.into();
+    match answer.definition {
         ModelDefinition::Text(definition) => Ok(json(StatusCode::OK, &WholeModelBody { summary, definition })),
         ModelDefinition::Pieces(pieces) => Ok(json_stream(whole_model(Arc::clone(&context.etude), &summary, pieces)?)),
     }
@@ -200,7 +201,7 @@ fn whole_model(
     ),
 )]
 pub(super) async fn list_models(State(context): State<SharedContext>, paging: Paging) -> Result<Response, Problem> {
-    let page = context.etude.models(paging.after.as_deref(), paging.limit).await?;
+    let (page, _held) = context.etude.models(paging.after.as_deref(), paging.limit).await?;
     Ok(json(StatusCode::OK, &List::of(page, ModelBody::from)))
 }
 

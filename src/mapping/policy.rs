@@ -227,9 +227,14 @@ impl Policy {
     ///
     /// [`TooManySteps`] if it would be too large to be written and stored.
     pub fn check_steps(model: &Model, mapping: &Mapping) -> Result<(), TooManySteps> {
-        let n_steps = mapping.moves.len();
-        let n_bytes = n_steps.saturating_mul(STEP_BYTES.saturating_add(model.state_bytes()));
+        let (n_steps, n_bytes) = (mapping.moves.len(), Self::steps_bytes(model, mapping));
         if n_bytes > MAX_STEPS_BYTES { Err(TooManySteps { n_steps, n_bytes }) } else { Ok(()) }
+    }
+
+    /// About how many bytes of JSON the steps of the policy of `mapping` are, which must be of `model`.
+    #[must_use]
+    pub fn steps_bytes(model: &Model, mapping: &Mapping) -> usize {
+        mapping.moves.len().saturating_mul(STEP_BYTES.saturating_add(model.state_bytes()))
     }
 
     /// Notes at `place` that a policy of `n_observations`, each of which has a step at least, would be too large; says

@@ -112,7 +112,7 @@ impl Etude {
         let (mut rows, mut refinements) = (Vec::new(), Vec::new());
         let mut items = Vec::with_capacity(made.len());
         for (_, searched) in made {
-            items.push(searched.map(|Searched { policy, row, refinement }| {
+            items.push(searched.map(|Searched { policy, row, refinement, .. }| {
                 let row = row.at(caller.now);
                 let id = row.id.clone();
                 rows.push(row);

@@ -76,7 +76,7 @@ impl MapperCache {
             *oversized = None;
         }
         let mut n_left = n_bytes.saturating_sub(oversized_bytes);
-        for (key, size_bytes) in idle.into_iter() {
+        for (key, size_bytes) in idle {
             if n_left == 0 {
                 break;
             }

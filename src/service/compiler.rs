@@ -44,12 +44,16 @@ impl Compiler {
         }
     }
 
-    /// Takes so much memory, in place of large models that nobody searches now if need be.
+    /// Takes the memory for compiling what needs about `n_bytes`, in place of large models that nobody searches now if need be.
     ///
     /// # Errors
     ///
     /// [`NoRoom`] if there is not so much.
     pub(super) fn take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
+        /// Where values differ from state to state, it takes up to three times what counts tell. If there is so much, it is taken, and
+        /// given back once it is known what was needed.
+        const MOST_OF_COUNTED: u64 = 3;
+        let n_bytes = (MOST_OF_COUNTED * n_bytes).min(n_bytes.max(self.memory.free_for_large()));
         self.memory.try_take(n_bytes).or_else(|_| {
             self.cache.make_room(n_bytes.saturating_sub(self.memory.free_for_large()));
             self.memory.try_take(n_bytes)
@@ -70,7 +74,7 @@ impl Compiler {
     ) -> Result<Mapper, ServiceError> {
         /// What was taken is a good guess, not more.
         const SLACK_BYTES: u64 = 16 << 20;
-        let max_bytes = usize::try_from(2 * held.n_bytes() + SLACK_BYTES).unwrap_or(usize::MAX);
+        let max_bytes = usize::try_from(held.n_bytes() + SLACK_BYTES).unwrap_or(usize::MAX);
         let mut limited = LimitedTime::new(interrupt, self.max_time);
         let model = Model::compile(&definition, limits, &mut limited)?;
         drop(definition);

@@ -27,6 +27,8 @@ pub struct ModelAnswer {
     pub summary: ModelSummary,
     /// The definition.
     pub definition: ModelDefinition,
+    /// For what is kept, if that is much.
+    _held: Option<Held>,
 }
 
 /// A definition in canonical form.
@@ -302,6 +304,7 @@ impl Etude {
     ///
     /// If there is none.
     pub async fn model(&self, name: &Name) -> Result<ModelAnswer, ServiceError> {
+        let held = self.take_for_summary(self.store.summary_bytes(name.as_str()).await?)?;
         let row = self.store.model(name.as_str()).await?.ok_or_else(|| unknown(name.as_str(), None))?;
         let definition = match row.definition {
             StoredDefinition::Text(text) => {
@@ -311,16 +314,27 @@ impl Etude {
             }
             StoredDefinition::Pieces(id) => ModelDefinition::Pieces(DefinitionReader::new(&row.summary, id)),
         };
-        Ok(ModelAnswer { summary: row.summary, definition })
+        Ok(ModelAnswer { summary: row.summary, definition, _held: held })
     }
 
-    /// At most `limit` models in the order of their names, from the first after `after`.
+    /// At most `limit` models in the order of their names, from the first after `after`, and the memory that they take, if that is much.
     ///
     /// # Errors
     ///
     /// If the store failed.
-    pub async fn models(&self, after: Option<&str>, limit: u32) -> Result<Page<ModelSummary>, ServiceError> {
-        Ok(self.store.models(after, limit).await?)
+    pub async fn models(
+        &self,
+        after: Option<&str>,
+        limit: u32,
+    ) -> Result<(Page<ModelSummary>, Option<Held>), ServiceError> {
+        let held = self.take_for_summary(self.store.first_summary_bytes(after).await?)?;
+        Ok((self.store.models(after, limit).await?, held))
+    }
+
+    /// Takes what reading and writing so many bytes of attributes and actions needs, if that is much: labels may take any number of bytes.
+    fn take_for_summary(&self, n_bytes: u64) -> Result<Option<Held>, NoRoom> {
+        const COPIES: u64 = 8;
+        (n_bytes > SMALL_BYTES / COPIES).then(|| self.memory.try_take(COPIES * n_bytes)).transpose()
     }
 
     /// Deletes the model called `name`. Policies made with it stay.

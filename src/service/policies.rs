@@ -59,7 +59,7 @@ impl Etude {
             }
             None => self.search_at_length(body, &id, caller).await?,
         };
-        let Searched { policy, row, refinement } = searched;
+        let Searched { policy, row, refinement, held: _held } = searched;
         let is_refined = refinement.is_some();
         self.store.add_policies(vec![row.at(caller.now)], refinement.into_iter().collect()).await?;
         if is_refined {
@@ -306,6 +306,8 @@ pub(super) struct Searched {
     pub(super) row: PolicyText,
     /// What is to be done about the policy, if it is local.
     pub(super) refinement: Option<NewRefinement>,
+    /// For all of this, if it is much.
+    pub(super) held: Option<Held>,
 }
 
 /// A policy as it will be stored.
@@ -359,17 +361,28 @@ pub(super) fn follow(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
     let started = Instant::now();
-    let _held = match memory.map(|memory| take_for_search(mapper, &mut request, memory)).transpose() {
+    let searching = match memory.map(|memory| take_for_search(mapper, &mut request, memory)).transpose() {
         Ok(held) => held,
         Err(no_room) => return Ok(Err(no_room.into())),
     };
     let mapping = request.solve(mapper, interrupt)?;
+    drop(searching);
     let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
     if let Err(error) = Policy::check_steps(mapper.model(), &mapping) {
         let mut faults = Faults::default();
         faults.note_at(place, error.to_string());
         return Ok(Err(faults.into()));
+    }
+    // As it will be answered, and as it will be stored.
+    let n_bytes = 2 * Policy::steps_bytes(mapper.model(), &mapping);
+    let held =
+        match memory.filter(|_| n_bytes > MAX_INLINE_BYTES).map(|memory| memory.try_take(n_bytes as u64)).transpose() {
+            Ok(held) => held,
+            Err(no_room) => return Ok(Err(no_room.into())),
+        };
+    if memory.is_some_and(|memory| memory.free_for_large() < memory.room() / 4) {
+        mapper.release();
     }
     let refinement = (mapping.status == Status::Local).then(|| {
         let mut request_for_refined = document.clone();
@@ -386,19 +399,26 @@ pub(super) fn follow(
         }
     });
     let written = write_policy(stamp, &request.problem, &mapping);
-    Ok(written.map(|(policy, row)| Searched { policy, row, refinement }))
+    Ok(written.map(|(policy, row)| Searched { policy, row, refinement, held }))
 }
 
-/// Takes the memory that a search may need, and lets the search use no more than that. Where there is not so much, it gets half of what
-/// is left, so that others find something too.
+/// Takes the memory that a search may need, and lets the search use no more than that: a quarter of what is left at most, so that others
+/// find something too. What is kept for small requests is not for searches that may need more.
 ///
 /// # Errors
 ///
 /// [`NoRoom`] if hardly anything is left.
 pub(super) fn take_for_search(mapper: &Mapper, request: &mut Request<'_>, memory: &Memory) -> Result<Held, NoRoom> {
     let wanted = request.search_bytes(mapper) as u64;
-    // With less than what is small, a search would hardly begin.
-    let held = memory.try_take(wanted.min((memory.free_for_large() / 2).max(SMALL_BYTES)))?;
+    let held = if wanted <= SMALL_BYTES {
+        memory.try_take(wanted)?
+    } else {
+        // With less, a search would hardly begin.
+        let least = SMALL_BYTES / 4;
+        let free = memory.free_for_large();
+        let taken = if free < least { Err(NoRoom { wanted, room: memory.room() }) } else { Ok(free / 4) };
+        memory.try_take(wanted.min(taken?.max(least)))?
+    };
     request.settings.budget.max_bytes = usize::try_from(held.n_bytes()).unwrap_or(usize::MAX);
     Ok(held)
 }

@@ -100,7 +100,7 @@ impl Etude {
             Ok(searched.map(|searched| (searched, drawn)))
         };
         let made = if is_quick { self.pool.run_here(deadline, job)? } else { place.run(deadline, job).await? };
-        let (Searched { policy, row, refinement }, drawn) = made?;
+        let (Searched { policy, row, refinement, held: _held }, drawn) = made?;
         drop(place);
         let (number, weights) = drawn.ok_or(StoreError::Closed)?;
         let weights = weights?;

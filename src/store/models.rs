@@ -171,6 +171,30 @@ impl Store {
         row.map(read).transpose()
     }
 
+    /// How many bytes of text the attributes and actions of the model called `name` are; 0 if there is none.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn summary_bytes(&self, name: &str) -> Result<u64, StoreError> {
+        let sizes = "SELECT octet_length(attributes) + octet_length(actions) FROM models WHERE name = $1";
+        let size: Option<i64> = sqlx::query_scalar(sizes).bind(name).fetch_optional(&self.readers().await).await?;
+        Ok(size.unwrap_or_default().unsigned_abs())
+    }
+
+    /// The same of the first model after `after` in the order of their names. A page of models has no more, unless that is little.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn first_summary_bytes(&self, after: Option<&str>) -> Result<u64, StoreError> {
+        let sizes =
+            "SELECT octet_length(attributes) + octet_length(actions) FROM models WHERE name > $1 ORDER BY name LIMIT 1";
+        let sizes = sqlx::query_scalar(sizes).bind(after.unwrap_or_default());
+        let size: Option<i64> = sizes.fetch_optional(&self.readers().await).await?;
+        Ok(size.unwrap_or_default().unsigned_abs())
+    }
+
     /// At most `limit` models in the order of their names, from the first after `after`.
     ///
     /// # Errors

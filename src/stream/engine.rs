@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem, WriteError};
 use super::queue::{Gone, Receiver, Sender, Weighed};
-use super::room::Crowded;
+use super::room::{Crowded, SMALL_FRAME_BYTES};
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
 use crate::memory::Held;
@@ -243,11 +243,21 @@ impl Connection<'_> {
             };
             let Some(came) = came else { return Ok(Closed::ByClient) };
             // Its room in the queue is given back once it is answered.
-            let (frame, memory) = read(came.item, self.limits)?;
+            let (frame, memory) = self.read(came.item).await?;
             if let Some(closed) = self.answer(frame, memory).await? {
                 return Ok(closed);
             }
         }
+    }
+
+    /// Reads what came: a large frame off the threads that serve others. Gives its memory along.
+    async fn read(&self, came: Incoming) -> Result<(ClientFrame, Option<Held>), Over> {
+        let (text, memory) = text_of(came, self.limits)?;
+        if text.len() <= SMALL_FRAME_BYTES {
+            return Ok((read_frame(&text)?, memory));
+        }
+        let reading = self.etude.pool().read_patiently(self.client, text.len(), move || read_frame(&text));
+        Ok((reading.await.map_err(|error| ends(&error.into()))??, memory))
     }
 
     /// Answers a frame, whose memory is `memory`. Gives how the connection ends, if it does.
@@ -416,37 +426,41 @@ fn not_allowed(detail: &str) -> Over {
     Over::because(Closed::NotAllowed, StreamProblem::new("not-allowed", detail))
 }
 
-/// Reads what came. Gives the frame's memory along.
-fn read(came: Incoming, limits: Limits) -> Result<(ClientFrame, Option<Held>), Over> {
+/// The text of what came, and its memory.
+fn text_of(came: Incoming, limits: Limits) -> Result<(Bytes, Option<Held>), Over> {
     let bad = |problem| Over::because(Closed::BadFrame, problem);
-    let (text, memory) = match came {
-        Incoming::Frame { text, memory } if text.len() <= limits.frame_bytes => (text, memory),
+    match came {
+        Incoming::Frame { text, memory } if text.len() <= limits.frame_bytes => Ok((text, memory)),
         Incoming::Frame { .. } | Incoming::TooLarge => {
             let detail = format!("a frame has at most {} bytes", limits.frame_bytes);
-            return Err(Over::because(Closed::TooLarge, StreamProblem::new("too-large", detail)));
+            Err(Over::because(Closed::TooLarge, StreamProblem::new("too-large", detail)))
         }
-        Incoming::Binary => return Err(bad(StreamProblem::new("bad-frame", "expected text, found a binary message"))),
+        Incoming::Binary => Err(bad(StreamProblem::new("bad-frame", "expected text, found a binary message"))),
         Incoming::NotText => {
             let problem = StreamProblem::new("malformed-json", "the frame is not UTF-8");
-            return Err(Over::because(Closed::NotText, problem));
+            Err(Over::because(Closed::NotText, problem))
         }
         Incoming::Violation(what) => {
             let detail = format!("against the protocol of websockets: {what}");
-            return Err(Over::because(Closed::Protocol, StreamProblem::new("bad-frame", detail)));
+            Err(Over::because(Closed::Protocol, StreamProblem::new("bad-frame", detail)))
         }
         Incoming::Crowded => {
             let problem = StreamProblem::new("overloaded", Crowded.to_string());
-            return Err(Over::because(Closed::Overloaded, problem));
+            Err(Over::because(Closed::Overloaded, problem))
         }
-    };
-    let frame: Value = document::parse(&text).map_err(|error| match error {
+    }
+}
+
+/// Reads the text of a frame.
+fn read_frame(text: &[u8]) -> Result<ClientFrame, Over> {
+    let bad = |problem| Over::because(Closed::BadFrame, problem);
+    let frame: Value = document::parse(text).map_err(|error| match error {
         ParseError::Syntax { .. } => {
             Over::because(Closed::NotText, StreamProblem::new("malformed-json", error.to_string()))
         }
         ParseError::Faults(faults) => bad(StreamProblem::of("bad-frame", &faults)),
     })?;
-    let frame = ClientFrame::read(frame).map_err(|faults| bad(StreamProblem::of("bad-frame", &faults)))?;
-    Ok((frame, memory))
+    ClientFrame::read(frame).map_err(|faults| bad(StreamProblem::of("bad-frame", &faults)))
 }
 
 /// How an error ends the connection.

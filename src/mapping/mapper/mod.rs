@@ -170,6 +170,9 @@ struct Buffers {
 }
 
 impl Buffers {
+    /// Searches of which they are kept: as many as there are processors for, mostly.
+    const MAX_KEPT: usize = 4;
+
     /// Most that are kept of a search.
     const MAX_KEPT_BYTES: usize = 16 << 20;
 
@@ -371,7 +374,10 @@ impl Mapper {
         let done = work(&mut buffers)?;
         // What is kept is there beside what a search goes on to do.
         if buffers.size_bytes() <= Buffers::MAX_KEPT_BYTES.min(max_bytes / Buffers::PART_KEPT) {
-            self.buffers().push((thread, buffers));
+            let mut kept = self.buffers();
+            if kept.len() < Buffers::MAX_KEPT {
+                kept.push((thread, buffers));
+            }
         }
         Ok(done)
     }

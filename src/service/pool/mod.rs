@@ -244,6 +244,38 @@ impl SearchPool {
         self.run_holding((), Job { client, turn: Some(turn), place: None, deadline: None }, job).await
     }
 
+    /// Runs `job`, which reads so many bytes for `client`, when it is its turn among what is read. For callers that are bounded in number
+    /// themselves.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Stopped`] if the service ends before it has begun.
+    pub async fn read_patiently<T, F>(&self, client: Client, n_bytes: usize, job: F) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce() -> T + Send + 'static,
+    {
+        self.read_holding((), client, n_bytes, job).await
+    }
+
+    /// Runs `job`, which reads so many bytes for `client`, and keeps `held` until it has ended.
+    async fn read_holding<T, F>(
+        &self,
+        held: impl Send + 'static,
+        client: Client,
+        n_bytes: usize,
+        job: F,
+    ) -> Result<T, PoolError>
+    where
+        T: Send + 'static,
+        F: FnOnce() -> T + Send + 'static,
+    {
+        let class = if n_bytes > LONG_READ_BYTES { Class::Long } else { Class::Short };
+        let turn = self.turn(&self.0.reading, client, class, 0).await?;
+        let reading = Job { client, turn: None, place: None, deadline: None };
+        self.run_holding((held, turn), reading, |_| Ok(job())).await
+    }
+
     /// Runs `job`, which nobody waits for, if there is a thread to spare: of several, another one stays free when it begins.
     ///
     /// # Errors
@@ -456,12 +488,8 @@ impl Admission {
         T: Send + 'static,
         F: FnOnce() -> T + Send + 'static,
     {
-        let class = if n_bytes > LONG_READ_BYTES { Class::Long } else { Class::Short };
-        let (place, client) = (self.place()?, self.client);
-        let turn = self.pool.turn(&self.pool.0.reading, client, class, 0).await?;
-        let held = (place, turn);
-        let reading = Job { client, turn: None, place: None, deadline: None };
-        self.pool.run_holding(held, reading, |_| Ok(job())).await
+        let place = self.place()?;
+        self.pool.read_holding(place, self.client, n_bytes, job).await
     }
 
     /// Runs `job` on a thread of the pool. It is told to finish when `deadline` has passed, and to stop when the returned
