@@ -381,10 +381,8 @@ async fn asking(address: SocketAddr, path: &str) -> TcpStream {
 
 #[tokio::test]
 async fn who_does_not_read_an_answer_is_closed_and_gives_its_memory_back() {
-    let directory = tempfile::tempdir().unwrap();
-    let flags = ["--slow-reader-timeout", "300ms"];
-    let service =
-        Service::start_set_up(directory, &flags, |config| config.max_memory = Some(BASE_BYTES + (24 << 20))).await;
+    // To make it takes more memory than to read it.
+    let service = Service::start(&[]).await;
     assert_eq!(service.put("/v1/models/way", &long_way()).await.0, 201);
     let request = json!({"model": "way", "demonstration": to_and_fro(32)});
     let (status, policy) = service.post("/v1/policies", &request).await;
@@ -393,6 +391,10 @@ async fn who_does_not_read_an_answer_is_closed_and_gives_its_memory_back() {
     assert!((13 << 20..24 << 20).contains(&n_bytes), "one answer fits and two do not: {n_bytes}");
     let path = format!("/v1/policies/{}", policy["id"].as_str().unwrap());
     drop(policy);
+    let directory = service.stop().await;
+    let flags = ["--slow-reader-timeout", "300ms"];
+    let service =
+        Service::start_set_up(directory, &flags, |config| config.max_memory = Some(BASE_BYTES + (24 << 20))).await;
 
     let mut unread = asking(service.address, &path).await;
     assert_eq!(status_of(&read_until(&mut unread, "\r\n\r\n").await), 200);

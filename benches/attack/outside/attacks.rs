@@ -297,7 +297,8 @@ impl Target {
             Attack::Announced => {
                 let paths = [("POST", "/v1/policies"), ("PUT", "/v1/models/announced"), ("POST", "/v1/policies:batch")];
                 let announced = paths.map(|(method, path)| self.announce(method, path, JSON, 8 << 20));
-                (900, Unread, announced.map(|head| Message { n_times: 2, pause: MOMENT, ..slowly(&head, b"{") }).into())
+                // Fewer than one client may have connections where there is little memory.
+                (700, Unread, announced.map(|head| Message { n_times: 2, pause: MOMENT, ..slowly(&head, b"{") }).into())
             }
             Attack::Idle => (500, Unread, vec![Message::default(), at_once(b"GET /readyz HTT".to_vec())]),
             Attack::HalfOpen => {
