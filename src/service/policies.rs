@@ -403,22 +403,15 @@ pub(super) fn follow(
 }
 
 /// Takes the memory that a search may need, and lets the search use no more than that: a quarter of what is left at most, so that others
-/// find something too. What is kept for small requests is not for searches that may need more.
+/// find something too.
 ///
 /// # Errors
 ///
 /// [`NoRoom`] if hardly anything is left.
 pub(super) fn take_for_search(mapper: &Mapper, request: &mut Request<'_>, memory: &Memory) -> Result<Held, NoRoom> {
     let wanted = request.search_bytes(mapper) as u64;
-    let held = if wanted <= SMALL_BYTES {
-        memory.try_take(wanted)?
-    } else {
-        // With less, a search would hardly begin.
-        let least = SMALL_BYTES / 4;
-        let free = memory.free_for_large();
-        let taken = if free < least { Err(NoRoom { wanted, room: memory.room() }) } else { Ok(free / 4) };
-        memory.try_take(wanted.min(taken?.max(least)))?
-    };
+    // With less than what is small, a search would hardly begin. No more of them run than that leaves room for other small requests.
+    let held = memory.try_take(wanted.min((memory.free_for_large() / 4).max(SMALL_BYTES)))?;
     request.settings.budget.max_bytes = usize::try_from(held.n_bytes()).unwrap_or(usize::MAX);
     Ok(held)
 }
