@@ -266,7 +266,13 @@ impl Batch {
             let Some((n, item)) = next else { break };
             let searched =
                 if self.answer().is_full { Err(ServiceError::BatchFull) } else { self.follow(n, item, interrupt)? };
-            slice.push((n, searched.and_then(|searched| self.answer().take_in(searched))));
+            let taken_in = searched.and_then(|searched| self.answer().take_in(searched));
+            // With less in it, the next batch may have room for it.
+            let taken_in = taken_in.map_err(|error| match error {
+                ServiceError::NoRoom(_) => ServiceError::BatchFull,
+                error => error,
+            });
+            slice.push((n, taken_in));
         }
         Ok(slice)
     }
