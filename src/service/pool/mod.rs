@@ -43,7 +43,7 @@ const SHARE: Duration = Duration::from_millis(100);
 /// How often a long job looks whether it should make way.
 const LOOK_EVERY: Duration = Duration::from_millis(1);
 
-/// Most jobs that have made way, each of which keeps a thread of the operating system; more go on.
+/// Most jobs that have made way, each of which keeps a thread of the operating system; more are refused.
 const MAX_PARKED: usize = 256;
 
 /// How long a job that nobody waits for may go on when it has taken the last thread: longer than most jobs keep theirs.
@@ -580,8 +580,12 @@ impl Watch {
         } else {
             lines.turns.makes_way(self.job.client, level, ran >= SHARE, now)
         };
-        if !makes_way || lines.n_parked >= MAX_PARKED {
+        if !makes_way {
             return Signal::Continue;
+        }
+        if lines.n_parked >= MAX_PARKED {
+            self.is_refused = true;
+            return Signal::Cancel;
         }
         lines.n_parked += 1;
         let waiting = threads.line_up(&mut lines, self.job.client, Class::Long, level);

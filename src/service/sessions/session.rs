@@ -235,11 +235,12 @@ impl Session {
         observations: Vec<Observation>,
     ) -> Result<Vec<CommittedStep>, SessionError> {
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
-        // Others find something too. What it really takes is counted afterwards.
-        let free = (etude.memory.free_for_large() / 4).max(SMALL_BYTES);
-        let most_bytes = usize::try_from(self.held.n_bytes() + free).unwrap_or(usize::MAX);
-        let mut online = online.within(most_bytes);
         let is_inline = self.is_inline(observations.len());
+        // Others find something too. What it really took is kept afterwards.
+        let free = if is_inline { 0 } else { etude.memory.free_for_large() / 4 };
+        let spare = etude.memory.try_take(free.max(SMALL_BYTES)).map_err(ServiceError::from)?;
+        let most_bytes = usize::try_from(self.held.n_bytes() + spare.n_bytes()).unwrap_or(usize::MAX);
+        let mut online = online.within(most_bytes);
         let job = move |interrupt: &mut dyn Interrupt| {
             let mut steps = Vec::new();
             for observation in &observations {
@@ -258,6 +259,7 @@ impl Session {
         };
         let no_room = || NoRoom { wanted: most_bytes as u64, room: etude.memory.room() };
         let (online, steps) = advanced.ok_or_else(no_room).map_err(ServiceError::from)?;
+        drop(spare);
         self.hold(online.size_bytes() as u64)?;
         self.online = Some(online);
         self.n_steps += steps.len();
