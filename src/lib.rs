@@ -44,6 +44,9 @@
 //! arrays, with all faults), [`model::Model::compile`], and `store::definitions` (its canonical text, in pieces if it is long) before
 //! `store::writer` makes it visible.
 //!
+//! What is large takes its memory from [`memory`] before it begins, and whose turn it is to use a thread is told by `service::pool`. A model
+//! that is not at hand is made ready by `service::compiler`, once, however many ask for it.
+//!
 //! A trial goes the same way through `service::trials`, with weights that a [`learning::Learner`] draws. Its reward is accepted by
 //! `store::writer`, which numbers rewards in one log per learner; `service::learner_task` folds what is new in the log into
 //! the next version of the weights.
