@@ -2,7 +2,8 @@
 //!
 //! The service is the program itself, in a process of its own that has [`MEMORY_BYTES`], of which it is told to use [`BUDGET`].
 //! Honest clients ask at a fixed rate, whatever is answered; what they wait is counted from when they meant to ask. Attackers share
-//! one thread of low priority, and the machine, with them. The argument is for how many seconds the attack goes on, 300 if there is none.
+//! one thread of low priority, and the machine, with them. An argument that is a number says for how many seconds the attack goes on, 300
+//! if there is none; others are the attacks that there are to be, by their names, all if there are none.
 
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
 
@@ -82,14 +83,20 @@ fn main() -> Result<ExitCode, Failure> {
     };
     let service = Service::start(&flags, &first)?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    runtime.block_on(run(Arc::new(service), Duration::from_secs(seconds)))
+    let named: Vec<String> = std::env::args().skip(1).collect();
+    let of_name = |attack: &Attack| named.contains(&format!("{attack:?}"));
+    let mut attacks: Vec<Attack> = Attack::ALL.iter().copied().filter(of_name).collect();
+    if attacks.is_empty() {
+        attacks = Attack::ALL.to_vec();
+    }
+    runtime.block_on(run(Arc::new(service), &attacks, Duration::from_secs(seconds)))
 }
 
-async fn run(service: Arc<Service>, length: Duration) -> Result<ExitCode, Failure> {
+async fn run(service: Arc<Service>, attacks: &[Attack], length: Duration) -> Result<ExitCode, Failure> {
     let cave = worlds::cave(20, 3, 50, 1);
     let honest = Arc::new(Honest::prepare(service.address, Ipv4Addr::LOCALHOST, &cave).await?);
     let mut attackers = Vec::new();
-    for attack in Attack::ALL.iter().copied() {
+    for attack in attacks.iter().copied() {
         // One that has nothing to attack is left out, and told.
         match timeout(PREPARATION, Attacker::prepare(attack, service.address, SIZE))
             .await

@@ -17,7 +17,7 @@ use std::fmt::Write;
 
 use serde::Deserialize;
 use serde_json::value::RawValue;
-use sqlx::{SqliteConnection, SqlitePool};
+use sqlx::SqliteConnection;
 
 use super::sessions::{self, NewObservations};
 use super::{StoreError, corrupt};
@@ -178,9 +178,9 @@ impl Arrivals {
 }
 
 /// What has arrived and is not settled, by session.
-pub(super) async fn read(readers: &SqlitePool) -> Result<BTreeMap<String, NewObservations>, StoreError> {
+pub(super) async fn read(reader: &mut SqliteConnection) -> Result<BTreeMap<String, NewObservations>, StoreError> {
     let query = sqlx::query_scalar("SELECT observations FROM arrivals ORDER BY sequence");
-    together(&query.fetch_all(readers).await?)
+    together(&query.fetch_all(reader).await?)
 }
 
 /// Changes when another connection has written.

@@ -18,8 +18,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use sqlx::migrate::{Migration, MigrationType, Migrator};
+use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{SqliteConnectOptions, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{ConnectOptions, Connection, SqlSafeStr, SqliteConnection};
+use sqlx::{ConnectOptions, Connection, SqlSafeStr, Sqlite, SqliteConnection};
 use tokio::sync::RwLock;
 
 use super::{Depth, StoreError, Unavailable};
@@ -92,13 +93,17 @@ pub(super) struct Readers {
 }
 
 impl Readers {
-    /// The pool to read by.
-    pub(super) async fn pool(&self) -> SqlitePool {
-        self.pool.read().await.clone()
+    /// One of them, until it is dropped. While others take their place, these are waited for.
+    ///
+    /// # Errors
+    ///
+    /// If none comes free in time, or there are no more.
+    pub(super) async fn one(&self) -> Result<PoolConnection<Sqlite>, StoreError> {
+        Ok(self.pool.read().await.acquire().await?)
     }
 
     pub(super) async fn close(&self) {
-        self.pool().await.close().await;
+        self.pool.read().await.close().await;
     }
 }
 
@@ -151,8 +156,15 @@ impl Database {
         };
         // The ways to read that there are without a writer keep its own from being opened as they should, and take locks away when they
         // are closed. So that is done first, once it looks as if it were worth it, and undone if it was not.
-        probe_aside(&self.path).await?;
+        let probed = probe_aside(&self.path).await;
         let mut place = readers.pool.write().await;
+        if let Err(unavailable) = probed {
+            // Where that was tried before, and then there were not even ways to read.
+            if place.is_closed() {
+                *place = self.look_at(Depth::Schema).await?;
+            }
+            return Err(unavailable.into());
+        }
         place.close().await;
         let opened = self.open().await;
         let (connection, pool) = match opened {
@@ -517,8 +529,28 @@ mod tests {
         assert_eq!(store.learners_behind().await.unwrap(), ["behind"]);
         assert_eq!(store.policy("p").await.unwrap().unwrap(), refined);
         assert_eq!(store.policies(0, 10).await.unwrap().items[0].summary, refined);
-        let id = sqlx::query("PRAGMA application_id").fetch_one(&store.readers().await).await.unwrap();
+        let id = sqlx::query("PRAGMA application_id").fetch_one(&mut *store.reader().await.unwrap()).await.unwrap();
         assert_eq!(id.get::<i64, _>(0), APPLICATION_ID);
+    }
+
+    #[tokio::test]
+    async fn who_waits_for_a_way_to_read_gets_it_before_others_take_their_place() {
+        let directory = tempfile::tempdir().unwrap();
+        let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+        let mut taken = Vec::new();
+        for _ in 0..N_READERS {
+            taken.push(store.reader().await.unwrap());
+        }
+        let mut waiting = Box::pin(store.reader());
+        assert!(futures_util::poll!(&mut waiting).is_pending());
+        let replaced = async { store.readers.pool.write().await.close().await };
+        let reads = async move {
+            taken.clear();
+            sqlx::query("SELECT * FROM models").fetch_all(&mut *waiting.await?).await?;
+            Ok::<_, StoreError>(())
+        };
+        let ((), read) = tokio::join!(biased; replaced, reads);
+        read.unwrap();
     }
 
     #[tokio::test]

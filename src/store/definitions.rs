@@ -106,7 +106,7 @@ impl Store {
             "SELECT id FROM (SELECT id FROM definitions UNION SELECT definition_id FROM definition_pieces)
              WHERE NOT EXISTS (SELECT 1 FROM models WHERE definition_id = id)",
         );
-        for id in left.fetch_all(&self.readers().await).await? {
+        for id in left.fetch_all(&mut *self.reader().await?).await? {
             self.sweeper.sweep(id);
         }
         Ok(())
@@ -147,9 +147,9 @@ impl Store {
     pub async fn piece(&self, definition_id: i64, seq: i64) -> Result<Option<Vec<u8>>, StoreError> {
         let query = sqlx::query_scalar("SELECT piece FROM definition_pieces WHERE definition_id = $1 AND seq = $2");
         let query = query.bind(definition_id).bind(seq);
-        let Some(piece): Option<Vec<u8>> = query.fetch_optional(&self.readers().await).await? else {
+        let Some(piece): Option<Vec<u8>> = query.fetch_optional(&mut *self.reader().await?).await? else {
             // Pieces are only ever removed once the model is.
-            return match is_a_models(definition_id).fetch_one(&self.readers().await).await? {
+            return match is_a_models(definition_id).fetch_one(&mut *self.reader().await?).await? {
                 false => Err(StoreError::Removed),
                 true if seq == 0 => Err(corrupt("definition_pieces", "seq")("the first piece is missing")),
                 true => Ok(None),
@@ -247,10 +247,8 @@ mod tests {
 
     /// How many definitions and pieces there are, whoever they belong to.
     async fn counts(store: &Store) -> (i64, i64) {
-        let readers = store.readers().await;
-        let count = |table| sqlx::query_scalar(table).fetch_one(&readers);
-        let definitions = count("SELECT count(*) FROM definitions").await.unwrap();
-        (definitions, count("SELECT count(*) FROM definition_pieces").await.unwrap())
+        let counts = "SELECT (SELECT count(*) FROM definitions), (SELECT count(*) FROM definition_pieces)";
+        sqlx::query_as(counts).fetch_one(&mut *store.reader().await.unwrap()).await.unwrap()
     }
 
     async fn until_counts_are(store: &Store, expected: (i64, i64)) {

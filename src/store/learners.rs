@@ -125,7 +125,7 @@ impl Store {
     /// If the database failed.
     pub async fn learner(&self, name: &str) -> Result<Option<LearnerRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM learners WHERE name = $1").bind(name);
-        query.fetch_optional(&self.readers().await).await?.map(|row| read_learner(&row)).transpose()
+        query.fetch_optional(&mut *self.reader().await?).await?.map(|row| read_learner(&row)).transpose()
     }
 
     /// The learner called `name`, and the last version of its weights.
@@ -139,7 +139,7 @@ impl Store {
              FROM learners l JOIN weights w ON w.learner = l.sequence
              WHERE l.name = $1 ORDER BY w.version DESC LIMIT 1",
         );
-        let row = query.bind(name).fetch_optional(&self.readers().await).await?;
+        let row = query.bind(name).fetch_optional(&mut *self.reader().await?).await?;
         row.map(|row| Ok((read_learner(&row)?, read_weights(&row)?))).transpose()
     }
 
@@ -152,10 +152,11 @@ impl Store {
         // Definitions may be so long that even a few of them are not read ahead.
         let sizes = "SELECT octet_length(definition) FROM learners WHERE name > $1 ORDER BY name LIMIT $2";
         let sizes = sqlx::query_scalar(sizes).bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
-        let (n_rows, rest) = page::fitting(&sizes.fetch_all(&self.readers().await).await?, limit);
+        let mut reader = self.reader().await?;
+        let sizes: Vec<i64> = sizes.fetch_all(&mut *reader).await?;
+        let (n_rows, rest) = page::fitting(&sizes, limit);
         let query = sqlx::query("SELECT * FROM learners WHERE name > $1 ORDER BY name LIMIT $2");
-        let readers = self.readers().await;
-        let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(&readers);
+        let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(&mut *reader);
         Rows { table: "learners", key: "name", name: "name", long: &["definition"], read: read_learner }
             .page(rows, n_rows, rest)
             .await
@@ -167,7 +168,7 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn learners_behind(&self) -> Result<Vec<String>, StoreError> {
-        Ok(sqlx::query_scalar(BEHIND).fetch_all(&self.readers().await).await?)
+        Ok(sqlx::query_scalar(BEHIND).fetch_all(&mut *self.reader().await?).await?)
     }
 
     /// A version of the weights of a learner.
@@ -178,7 +179,7 @@ impl Store {
     pub async fn weights(&self, learner: i64, version: u64) -> Result<Option<WeightsRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version = $2");
         let query = query.bind(learner).bind(as_integer(version));
-        query.fetch_optional(&self.readers().await).await?.map(|row| read_weights(&row)).transpose()
+        query.fetch_optional(&mut *self.reader().await?).await?.map(|row| read_weights(&row)).transpose()
     }
 
     /// At most `limit` versions of the weights of a learner, from the first after `after` on; `None`: from version 0.
@@ -194,8 +195,8 @@ impl Store {
     ) -> Result<Page<WeightsRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version > $2 ORDER BY version LIMIT $3");
         let query = query.bind(learner).bind(after.map_or(-1, as_integer)).bind(i64::from(limit) + 1);
-        let readers = self.readers().await;
-        let rows = query.fetch(&readers);
+        let mut reader = self.reader().await?;
+        let rows = query.fetch(&mut *reader);
         Rows { table: "weights", key: "version", name: "version", long: &["mean", "sd"], read: read_weights }
             .page(rows, limit, Rest::IsNone)
             .await
@@ -216,8 +217,8 @@ impl Store {
             "SELECT r.reward_order, r.reward, t.weights FROM rewards r JOIN trials t ON t.sequence = r.trial
              WHERE r.learner = $1 AND r.reward_order > $2 ORDER BY r.reward_order",
         );
-        let readers = self.readers().await;
-        let mut rows = query.bind(learner).bind(as_integer(after)).fetch(&readers);
+        let mut reader = self.reader().await?;
+        let mut rows = query.bind(learner).bind(as_integer(after)).fetch(&mut *reader);
         while let Some(row) = rows.try_next().await? {
             each(RewardRow {
                 reward_order: count(&row, "rewards", "reward_order")?,
@@ -447,11 +448,11 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
         let plan = sqlx::query(AssertSqlSafe(format!("EXPLAIN QUERY PLAN {BEHIND}")));
-        let plan = plan.fetch_all(&store.readers().await).await.unwrap();
+        let plan = plan.fetch_all(&mut *store.reader().await.unwrap()).await.unwrap();
         let plan: Vec<String> = plan.iter().map(|row| row.get("detail")).collect();
         assert_eq!(plan, ["SCAN learners USING INDEX learners_with_pending"]);
         let index: String = sqlx::query_scalar("SELECT sql FROM sqlite_schema WHERE name = 'learners_with_pending'")
-            .fetch_one(&store.readers().await)
+            .fetch_one(&mut *store.reader().await.unwrap())
             .await
             .unwrap();
         assert!(index.ends_with("WHERE has_pending = 1"), "{index}");

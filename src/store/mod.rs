@@ -45,7 +45,9 @@ pub use sessions::{
     ExpiredSession, MAX_EXPIRED_AT_ONCE, NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus,
     SessionWeights,
 };
-use sqlx::SqlitePool;
+
+use sqlx::Sqlite;
+use sqlx::pool::PoolConnection;
 use tokio_util::task::TaskTracker;
 pub use trials::{AcceptedReward, FailTrial, Failure, NewReward, NewTrial, PutReward, TrialRow, TrialStatus};
 use writer::{Write, Writer};
@@ -129,8 +131,9 @@ impl Store {
         self.writer.close();
     }
 
-    async fn readers(&self) -> SqlitePool {
-        self.readers.pool().await
+    /// A way to read, for one statement after another.
+    async fn reader(&self) -> Result<PoolConnection<Sqlite>, StoreError> {
+        self.readers.one().await
     }
 
     /// Counts up whenever a model was registered or deleted, before whoever did so is told.

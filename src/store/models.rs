@@ -146,7 +146,7 @@ impl Store {
     /// If the database failed.
     pub async fn model(&self, name: &str) -> Result<Option<ModelRow>, StoreError> {
         let query = sqlx::query("SELECT * FROM models WHERE name = $1").bind(name);
-        let row = query.fetch_optional(&self.readers().await).await?;
+        let row = query.fetch_optional(&mut *self.reader().await?).await?;
         let read = |row: SqliteRow| {
             let definition = match row.try_get("definition_id")? {
                 Some(id) => StoredDefinition::Pieces(id),
@@ -164,7 +164,7 @@ impl Store {
     /// If the database failed.
     pub async fn model_key(&self, name: &str) -> Result<Option<ModelKey>, StoreError> {
         let query = sqlx::query("SELECT hash, n_states FROM models WHERE name = $1").bind(name);
-        let row = query.fetch_optional(&self.readers().await).await?;
+        let row = query.fetch_optional(&mut *self.reader().await?).await?;
         let read = |row: SqliteRow| {
             Ok(ModelKey { hash: row.try_get("hash")?, is_lazy: row.try_get::<i64, _>("n_states")? == UNKNOWN })
         };
@@ -178,7 +178,7 @@ impl Store {
     /// If the database failed.
     pub async fn summary_bytes(&self, name: &str) -> Result<u64, StoreError> {
         let sizes = "SELECT octet_length(attributes) + octet_length(actions) FROM models WHERE name = $1";
-        let size: Option<i64> = sqlx::query_scalar(sizes).bind(name).fetch_optional(&self.readers().await).await?;
+        let size: Option<i64> = sqlx::query_scalar(sizes).bind(name).fetch_optional(&mut *self.reader().await?).await?;
         Ok(size.unwrap_or_default().unsigned_abs())
     }
 
@@ -191,7 +191,7 @@ impl Store {
         let sizes =
             "SELECT octet_length(attributes) + octet_length(actions) FROM models WHERE name > $1 ORDER BY name LIMIT 1";
         let sizes = sqlx::query_scalar(sizes).bind(after.unwrap_or_default());
-        let size: Option<i64> = sizes.fetch_optional(&self.readers().await).await?;
+        let size: Option<i64> = sizes.fetch_optional(&mut *self.reader().await?).await?;
         Ok(size.unwrap_or_default().unsigned_abs())
     }
 
@@ -204,13 +204,14 @@ impl Store {
         // Labels may be so long that even a few models are not read ahead.
         let sizes = "SELECT octet_length(attributes) + octet_length(actions) FROM models WHERE name > $1 ORDER BY name LIMIT $2";
         let sizes = sqlx::query_scalar(sizes).bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
-        let (n_rows, rest) = page::fitting(&sizes.fetch_all(&self.readers().await).await?, limit);
+        let mut reader = self.reader().await?;
+        let sizes: Vec<i64> = sizes.fetch_all(&mut *reader).await?;
+        let (n_rows, rest) = page::fitting(&sizes, limit);
         let query = sqlx::query(
             "SELECT name, hash, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms
              FROM models WHERE name > $1 ORDER BY name LIMIT $2",
         );
-        let readers = self.readers().await;
-        let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(&readers);
+        let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(&mut *reader);
         Rows { table: "models", key: "name", name: "name", long: &["attributes", "actions"], read: read_summary }
             .page(rows, n_rows, rest)
             .await

@@ -61,7 +61,7 @@ impl Store {
     pub async fn policy(&self, id: &str) -> Result<Option<String>, StoreError> {
         let query =
             sqlx::query("SELECT summary, policy, steps, checksum, refined_by FROM policies WHERE id = $1").bind(id);
-        let Some(row) = query.fetch_optional(&self.readers().await).await? else { return Ok(None) };
+        let Some(row) = query.fetch_optional(&mut *self.reader().await?).await? else { return Ok(None) };
         match self.read_policy(&row).await {
             Ok(policy) => Ok(Some(policy)),
             Err(error) => Err(error.of_row("policies", id)),
@@ -98,8 +98,8 @@ impl Store {
         let query = sqlx::query(
             "SELECT sequence, id, summary, checksum, refined_by FROM policies WHERE sequence > $1 ORDER BY sequence LIMIT $2",
         );
-        let readers = self.readers().await;
-        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch(&readers);
+        let mut reader = self.reader().await?;
+        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch(&mut *reader);
         Rows { table: TABLE, key: "sequence", name: "id", long: &["summary"], read: read_summary }
             .page(rows, limit, Rest::IsNone)
             .await

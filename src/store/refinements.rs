@@ -40,7 +40,7 @@ impl Store {
             "SELECT rowid AS sequence, policy_id, model_hash, request FROM refinements WHERE rowid > $1
              ORDER BY rowid LIMIT 1",
         );
-        let Some(row) = query.bind(after).fetch_optional(&self.readers().await).await? else { return Ok(None) };
+        let Some(row) = query.bind(after).fetch_optional(&mut *self.reader().await?).await? else { return Ok(None) };
         let refinement = NewRefinement {
             policy_id: row.try_get("policy_id")?,
             model_hash: row.try_get("model_hash")?,
@@ -75,7 +75,7 @@ impl Store {
     #[cfg(test)]
     pub(crate) async fn n_attempts(&self, policy_id: &str) -> Option<u32> {
         let query = sqlx::query_scalar("SELECT attempts FROM refinements WHERE policy_id = $1").bind(policy_id);
-        query.fetch_optional(&self.readers().await).await.unwrap()
+        query.fetch_optional(&mut *self.reader().await.unwrap()).await.unwrap()
     }
 
     /// Stores a refined policy and links the two.

@@ -222,11 +222,11 @@ impl Store {
     /// Brings observations that have arrived to their table, whoever's they are. Where nothing can be written, gives them, by session.
     async fn settle(&self) -> Result<BTreeMap<String, NewObservations>, StoreError> {
         let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM arrivals)");
-        if !query.fetch_one(&self.readers().await).await? {
+        if !query.fetch_one(&mut *self.reader().await?).await? {
             return Ok(BTreeMap::new());
         }
         match self.writer.write(Write::Settle).await {
-            Err(StoreError::Unavailable(_)) => arrivals::read(&self.readers().await).await,
+            Err(StoreError::Unavailable(_)) => arrivals::read(&mut *self.reader().await?).await,
             settled => settled.map(|_| BTreeMap::new()),
         }
     }
@@ -239,7 +239,7 @@ impl Store {
     pub async fn session(&self, id: &str) -> Result<Option<SessionRow>, StoreError> {
         let arrived = self.settle().await?;
         let query = sqlx::query("SELECT * FROM sessions WHERE id = $1").bind(id);
-        let row = query.fetch_optional(&self.readers().await).await?;
+        let row = query.fetch_optional(&mut *self.reader().await?).await?;
         let session = row.as_ref().map(read_session).transpose().map_err(|error| error.of_row("sessions", id))?;
         Ok(session.map(|session| session.with(&arrived)))
     }
@@ -252,8 +252,8 @@ impl Store {
     pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRow>, StoreError> {
         let arrived = self.settle().await?;
         let query = sqlx::query("SELECT * FROM sessions WHERE sequence > $1 ORDER BY sequence LIMIT $2");
-        let readers = self.readers().await;
-        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch(&readers);
+        let mut reader = self.reader().await?;
+        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch(&mut *reader);
         let rows_of = Rows { table: "sessions", key: "sequence", name: "id", long: &["weights"], read: read_session };
         let mut page = rows_of.page(rows, limit, Rest::IsNone).await?;
         page.items = page.items.into_iter().map(|session| session.with(&arrived)).collect();
@@ -269,7 +269,7 @@ impl Store {
         let mut arrived = self.settle().await?;
         let query =
             sqlx::query_as("SELECT seq + n_states, states FROM observations WHERE session_id = $1 ORDER BY seq");
-        let stored: Vec<(i64, String)> = query.bind(session_id).fetch_all(&self.readers().await).await?;
+        let stored: Vec<(i64, String)> = query.bind(session_id).fetch_all(&mut *self.reader().await?).await?;
         let n_stored = stored.last().map_or(0, |(end, _)| *end);
         // What was settled since it was read is stored already.
         let new = arrived.remove(session_id).filter(|new| i64::from(new.seq) == n_stored);

@@ -234,7 +234,7 @@ impl Store {
     /// If the database failed.
     pub async fn trial(&self, id: &str) -> Result<Option<TrialRow>, StoreError> {
         let query = sqlx::query(AssertSqlSafe(format!("{SELECT} {FROM} WHERE t.id = $1"))).bind(id);
-        query.fetch_optional(&self.readers().await).await?.map(|row| read_trial(&row)).transpose()
+        query.fetch_optional(&mut *self.reader().await?).await?.map(|row| read_trial(&row)).transpose()
     }
 
     /// At most `limit` trials of a learner with the given status by `now`, in the order of their numbers, from the first
@@ -256,8 +256,8 @@ impl Store {
             "{SELECT} {FROM} WHERE t.learner = $1 AND t.number > $2 AND {condition} ORDER BY t.number LIMIT $3"
         )));
         let query = query.bind(learner).bind(as_integer(after)).bind(i64::from(limit) + 1).bind(now.as_millisecond());
-        let readers = self.readers().await;
-        let rows = query.fetch(&readers);
+        let mut reader = self.reader().await?;
+        let rows = query.fetch(&mut *reader);
         Rows { table: "trials", key: "number", name: "id", long: &["weights", "fail_reason"], read: read_trial }
             .page(rows, limit, Rest::IsNone)
             .await
@@ -270,7 +270,7 @@ impl Store {
     /// If the database failed.
     pub async fn last_trial_number(&self, learner: i64) -> Result<u64, StoreError> {
         let query = sqlx::query("SELECT COALESCE(MAX(number), 0) AS number FROM trials WHERE learner = $1");
-        count(&query.bind(learner).fetch_one(&self.readers().await).await?, "trials", "number")
+        count(&query.bind(learner).fetch_one(&mut *self.reader().await?).await?, "trials", "number")
     }
 }
 

@@ -42,9 +42,10 @@ pub(super) async fn serve<S>(
         let is_lost = async { *lost.wait().await };
         let closed = stream::run(etude, client, limits, &mut incoming, &outgoing, stopping, is_lost).await;
         incoming.close();
-        // What is left to be written may take this long. Where the queue was full until now, this is the goodbye that a
-        // slow reader gets; if there was one already, nobody takes another.
-        let goodbye = tokio::time::timeout(CLOSE_TIMEOUT, outgoing.send(Outgoing::Close(closed)));
+        // Where the queue was full until now, this is the goodbye that a slow reader gets, who is not waited for longer than before; if
+        // there was one already, nobody takes another. What is left to be written may take its time.
+        let patience = limits.slow_after.min(CLOSE_TIMEOUT);
+        let goodbye = tokio::time::timeout(patience, outgoing.send(Outgoing::Close(closed)));
         if let Ok(Ok(())) = goodbye.await {
             drop(outgoing);
             tokio::time::sleep(CLOSE_TIMEOUT).await;
