@@ -8,10 +8,15 @@
 //!
 //! Whoever is about to use much memory takes so many bytes first, and gives them back by dropping what it holds. What does not fit
 //! waits ([`Memory::take`]) or is refused ([`Memory::try_take`]). An eighth of the room is left to what takes up to [`SMALL_BYTES`], so that
-//! large requests cannot keep small ones from being answered. The budget counts what it is told; it measures nothing.
+//! large requests cannot keep small ones from being answered.
+//!
+//! The budget counts what it is told. What it is not told shows in what is resident, which [`Memory::watch`] measures: while most of
+//! `--max-memory` is, nothing large is begun, whatever was counted.
 
 use std::fs;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 
@@ -36,7 +41,20 @@ pub struct NoRoom {
 pub struct Memory {
     room: u64,
     free: Arc<Semaphore>,
+    resident: Arc<Resident>,
 }
+
+/// What the process has of the machine's memory.
+#[derive(Debug)]
+struct Resident {
+    /// As much as may be, in bytes.
+    most: u64,
+    /// When that was last measured, in bytes.
+    measured: AtomicU64,
+}
+
+/// How often what is resident is measured: more often than much can be allocated and written to.
+const MEASURE_EVERY: Duration = Duration::from_millis(20);
 
 impl Memory {
     /// Least that is kept for what takes nothing from the budget.
@@ -46,7 +64,10 @@ impl Memory {
     #[must_use]
     pub fn new(max_bytes: u64) -> Self {
         let base = (max_bytes / 3).max(Self::MIN_BASE_BYTES);
-        Self::with_room(max_bytes.saturating_sub(base))
+        // What has begun may go on to use what is left beyond this.
+        let most = max_bytes - max_bytes / 8;
+        let resident = Arc::new(Resident { most, measured: AtomicU64::new(0) });
+        Self { resident, ..Self::with_room(max_bytes.saturating_sub(base)) }
     }
 
     /// A budget that has all of `n_bytes` for whoever asks.
@@ -54,7 +75,24 @@ impl Memory {
     pub fn with_room(n_bytes: u64) -> Self {
         let n_units = (n_bytes / UNIT_BYTES).min(u64::from(u32::MAX));
         let n_permits = usize::try_from(n_units).unwrap_or(usize::MAX).min(Semaphore::MAX_PERMITS);
-        Self { room: n_bytes, free: Arc::new(Semaphore::new(n_permits)) }
+        let resident = Resident { most: u64::MAX, measured: AtomicU64::new(0) };
+        Self { room: n_bytes, free: Arc::new(Semaphore::new(n_permits)), resident: Arc::new(resident) }
+    }
+
+    /// Measures what is resident, again and again. Where that cannot be found out, the budget is what is counted.
+    pub async fn watch(self) {
+        let mut ticks = tokio::time::interval(MEASURE_EVERY);
+        ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        while let Some(n_bytes) = resident_bytes() {
+            self.note_resident(n_bytes);
+            ticks.tick().await;
+        }
+        self.note_resident(0);
+    }
+
+    /// Notes that the process has so much of the machine's memory now.
+    fn note_resident(&self, n_bytes: u64) {
+        self.resident.measured.store(n_bytes, Ordering::Relaxed);
     }
 
     /// How much there is when nobody uses any, in bytes.
@@ -72,7 +110,8 @@ impl Memory {
     /// How much of that something large may take now, in bytes.
     #[must_use]
     pub fn free_for_large(&self) -> u64 {
-        self.free().saturating_sub(self.room / 8)
+        let not_resident = self.resident.most.saturating_sub(self.resident.measured.load(Ordering::Relaxed));
+        self.free().saturating_sub(self.room / 8).min(not_resident)
     }
 
     /// Takes `n_bytes` if they are free.
@@ -161,6 +200,13 @@ pub fn default_max_bytes() -> u64 {
     [by_resident, by_addresses].into_iter().flatten().min().unwrap_or(UNKNOWN)
 }
 
+/// What this process has of the machine's memory.
+fn resident_bytes() -> Option<u64> {
+    let text = fs::read_to_string("/proc/self/statm").ok()?;
+    let n_pages: u64 = text.split_whitespace().nth(1)?.parse().ok()?;
+    Some(n_pages * rustix::param::page_size() as u64)
+}
+
 /// The memory of the machine.
 fn machine_bytes() -> Option<u64> {
     let text = fs::read_to_string("/proc/meminfo").ok()?;
@@ -243,6 +289,21 @@ mod tests {
         assert_eq!(memory.free(), 0);
         drop((large, small));
         assert_eq!((memory.free(), memory.free_for_large()), (16 * MIB, 14 * MIB));
+    }
+
+    #[test]
+    fn nothing_large_is_begun_while_most_of_the_memory_is_resident() {
+        let memory = Memory::new(320 * MIB);
+        assert!(memory.try_take(100 * MIB).is_ok());
+        memory.note_resident(270 * MIB);
+        assert!(memory.try_take(11 * MIB).is_err(), "seven eighths are 280");
+        let mut large = memory.try_take(10 * MIB).unwrap();
+        memory.note_resident(300 * MIB);
+        assert!(memory.try_take(SMALL_BYTES).is_ok(), "what is small is answered");
+        assert!(large.grow_to(11 * MIB).is_err());
+        memory.note_resident(20 * MIB);
+        assert!(large.grow_to(11 * MIB).is_ok());
+        assert!((MIB..1 << 40).contains(&resident_bytes().unwrap()));
     }
 
     #[tokio::test]

@@ -87,6 +87,7 @@ impl Server {
         let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
         tasks.spawn(upkeep(metrics.clone(), stopping.clone()));
+        tasks.spawn(stopping.clone().run_until_cancelled_owned(etude.memory().clone().watch()));
         let etude = Arc::new(etude);
         tasks.spawn(Arc::clone(&etude).refine_until(stopping.clone()));
         tasks.spawn(Arc::clone(&etude).expire_until(stopping.clone()));

@@ -29,7 +29,7 @@ const MEMORY_BYTES: u64 = 1 << 30;
 /// What the service is told to use: three quarters of it.
 const BUDGET: (&str, u64) = ("768M", 768 << 20);
 
-/// How long honest clients are alone, before and after.
+/// How long honest clients are alone, before and after, or as long as the attack goes on if that is shorter.
 const ALONE: Duration = Duration::from_secs(30);
 
 /// Between honest requests.
@@ -109,7 +109,8 @@ async fn run(service: Arc<Service>, attacks: &[Attack], length: Duration) -> Res
     }
     println!("prepared; resident {}", resident(&service));
 
-    let before = Phase::watch(&service, &honest, ALONE).await;
+    let alone = ALONE.min(length);
+    let before = Phase::watch(&service, &honest, alone).await;
     before.print("before");
     let over = CancellationToken::new();
     let attacking = std::thread::spawn({
@@ -124,7 +125,7 @@ async fn run(service: Arc<Service>, attacks: &[Attack], length: Duration) -> Res
     over.cancel();
     let attackers = attacking.join().map_err(|_| "the attackers panicked")??;
     under.print("under attack");
-    let after = Phase::watch(&service, &honest, ALONE).await;
+    let after = Phase::watch(&service, &honest, alone).await;
     after.print("after");
 
     println!("\nattacks: connections by how they ended");
