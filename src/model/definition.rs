@@ -1,5 +1,6 @@
 //! What a client registers as a model.
 
+use std::cell::RefCell;
 use std::io::{self, BufRead};
 
 use serde::{Deserialize, Serialize};
@@ -7,7 +8,7 @@ use sha2::{Digest, Sha256};
 use utoipa::ToSchema;
 
 use super::action::ReadActions;
-use super::reading::{Outline, RawStates, RawTransitions, Reader};
+use super::reading::{Interruptible, Outline, RawStates, RawTransitions, Reader};
 use super::{ActionDocument, Cave, CompileError, Format, Limits, ReadError, TableDocument, WumpusDocument, table};
 use crate::attribute::{AttributeDocument, Schema};
 use crate::document::{Faults, ParseError, Path, Place};
@@ -74,7 +75,11 @@ impl Definition {
         limits: Limits,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Self, ReadError> {
-        let mut meter = Meter::new(interrupt, POLL_EVERY);
+        // Asked for by what is read and by what is made of it.
+        let interrupt = RefCell::new(interrupt);
+        let (mut by_reader, mut by_maker) = (|| interrupt.borrow_mut().poll(), || interrupt.borrow_mut().poll());
+        let mut meter = Meter::new(&mut by_maker, POLL_EVERY);
+        let reader = Interruptible::new(reader, &mut by_reader);
         let outline = Reader::new(limits, &mut meter).read_from(reader, format)?;
         of_outline(outline, limits, &mut meter)
     }

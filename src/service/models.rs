@@ -106,9 +106,7 @@ impl ModelText {
     ) -> Result<Definition, ReadError> {
         match self {
             Self::Whole(text) => Definition::parse(&text, format, limits, interrupt),
-            Self::Packed(open) | Self::Arriving(open) => {
-                Definition::parse_from(open().map_err(ReadError::Read)?, format, limits, interrupt)
-            }
+            Self::Packed(open) | Self::Arriving(open) => Definition::parse_from(open()?, format, limits, interrupt),
         }
     }
 

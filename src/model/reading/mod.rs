@@ -9,12 +9,14 @@
 //! JSON, NDJSON, Value --> Reader --> Outline { root, states, transitions } --> definition::of_outline, table::read
 //! ```
 
+mod interruptible;
 mod lists;
 mod raw;
 mod seeds;
 
 use std::io::{self, BufRead};
 
+pub(super) use interruptible::Interruptible;
 pub(super) use lists::{NoTransition, RawIndex, RawStates, RawTransitions};
 pub(super) use raw::{Distinct, Raw};
 use seeds::{Position, Seed};
@@ -55,6 +57,15 @@ pub enum ReadError {
     /// The text could not be read to its end.
     #[error("the text could not be read")]
     Read(#[source] io::Error),
+}
+
+impl From<io::Error> for ReadError {
+    fn from(error: io::Error) -> Self {
+        match error.get_ref().and_then(|inner| inner.downcast_ref::<Interrupted>()) {
+            Some(interrupted) => (*interrupted).into(),
+            None => Self::Read(error),
+        }
+    }
 }
 
 impl From<Interrupted> for ReadError {
@@ -226,7 +237,7 @@ impl<'m, 'i> Reader<'m, 'i> {
             None => {}
         }
         if error.is_io() {
-            return ReadError::Read(error.into());
+            return io::Error::from(error).into();
         }
         let beyond_floats = || {
             let mut faults = Faults::default();
@@ -269,7 +280,7 @@ fn read_line(reader: &mut impl BufRead, line: &mut Vec<u8>, number: u64) -> Resu
     loop {
         let available = match reader.fill_buf() {
             Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
-            available => available.map_err(ReadError::Read)?,
+            available => available?,
         };
         let end = available.iter().position(|byte| *byte == b'\n');
         let n_taken = end.map_or(available.len(), |end| end + 1);

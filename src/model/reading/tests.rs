@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::{Format, MAX_LINE_BYTES, ReadError, Reader};
 use crate::document::{Fault, ParseError};
-use crate::interrupt::{Meter, Uninterrupted};
+use crate::interrupt::{Meter, Signal, Uninterrupted};
 use crate::model::{Definition, Limits};
 
 fn parse(text: &str, format: Format) -> Result<Definition, ReadError> {
@@ -322,5 +322,29 @@ fn a_text_that_ends_early_is_no_model() {
         let reader = io::BufReader::new(text.as_bytes()[..9].chain(Broken));
         let read = Definition::parse_from(reader, format, Limits::DEFAULT, &mut Uninterrupted);
         assert!(matches!(&read, Err(ReadError::Read(error)) if error.to_string() == "gone"), "{read:?}");
+    }
+}
+
+#[test]
+fn a_text_of_blanks_or_of_one_string_is_interrupted_while_it_is_read() {
+    let n_bytes = 16 << 20;
+    for (head, byte) in [("", b' '), ("{\"", b'a'), ("{\"attributes\": ", b' ')] {
+        for format in [Format::Json, Format::Ndjson] {
+            for signal in [Signal::Cancel, Signal::Finish] {
+                let text = io::Read::chain(head.as_bytes(), io::Read::take(io::repeat(byte), n_bytes));
+                let mut n_left = 10;
+                let mut interrupt = || {
+                    n_left -= 1;
+                    if n_left == 0 { signal } else { Signal::Continue }
+                };
+                let text = io::BufReader::new(text);
+                let read = Definition::parse_from(text, format, Limits::DEFAULT, &mut interrupt);
+                let is_told = match signal {
+                    Signal::Cancel => matches!(read, Err(ReadError::Cancelled(_))),
+                    _ => matches!(read, Err(ReadError::OutOfTime)),
+                };
+                assert!(is_told, "{read:?}");
+            }
+        }
     }
 }
