@@ -31,8 +31,12 @@ const LEAST_SQLITE_VERSION: (u32, u32, u32) = (3, 51, 3);
 /// How long a connection waits for another process's lock.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Readers at the same time. Reads are short, and there are few cores.
-const N_READERS: u32 = 4;
+/// Readers at the same time. Reads are short, and there are few cores. One of them copies the log now and then.
+pub(super) const N_READERS: u32 = 5;
+
+/// Pages of the log, of 4 KiB, over which a commit copies it itself. That is rare: readers do it beside the writer before, but cannot
+/// come to its end as long as others write, and only then it begins anew.
+const MAX_LOG_PAGES: &str = "16384";
 
 /// Statements that a connection keeps prepared: all that there are, those with a number of rows as often as there are numbers.
 const N_STATEMENTS: usize = 256;
@@ -100,6 +104,16 @@ impl Readers {
     /// If none comes free in time, or there are no more.
     pub(super) async fn one(&self) -> Result<PoolConnection<Sqlite>, StoreError> {
         Ok(self.pool.read().await.acquire().await?)
+    }
+
+    /// Copies what is in the log to the file of the database, as far as others let it: nobody waits for that.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub(super) async fn checkpoint(&self) -> Result<(), StoreError> {
+        sqlx::query("PRAGMA wal_checkpoint(PASSIVE)").execute(&mut *self.one().await?).await?;
+        Ok(())
     }
 
     pub(super) async fn close(&self) {
@@ -178,7 +192,8 @@ impl Database {
 
     /// Opens a way to write, and for the first of them, ways to read that go with it.
     async fn open(&mut self) -> Result<(SqliteConnection, Option<SqlitePool>), StoreError> {
-        let mut connection = options(&self.path).synchronous(SqliteSynchronous::Full).connect().await?;
+        let writing = options(&self.path).synchronous(SqliteSynchronous::Full);
+        let mut connection = writing.pragma("wal_autocheckpoint", MAX_LOG_PAGES).connect().await?;
         match self.prepare(&mut connection).await {
             Ok(pool) => Ok((connection, pool)),
             Err(error) => {

@@ -331,6 +331,27 @@ mod tests {
     }
 
     #[tokio::test]
+    async fn a_piece_that_is_still_to_be_written_is_removed_with_the_others() {
+        let directory = tempfile::tempdir().unwrap();
+        let (store, tasks) = open(directory.path()).await;
+        let kept = stored(&store, &[]).await;
+        let dropped = stored(&store, &["one, "]).await;
+        let write = |definition_id, seq| {
+            let write = Write::AddPiece { definition_id, seq, piece: vec![0; 1 << 20] };
+            Box::pin(store.writer.write(write))
+        };
+        let mut others = [write(kept.id, 0), write(kept.id, 1)];
+        for other in &mut others {
+            assert!(futures_util::poll!(other).is_pending());
+        }
+        assert!(futures_util::poll!(write(dropped.id, 1)).is_pending());
+        drop(dropped);
+        until_counts_are(&store, (1, 2)).await;
+        drop(others);
+        close(store, tasks).await;
+    }
+
+    #[tokio::test]
     async fn what_a_foreign_hand_has_removed_becomes_no_model() {
         let directory = tempfile::tempdir().unwrap();
         let (store, tasks) = open(directory.path()).await;

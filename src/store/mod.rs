@@ -1,10 +1,10 @@
 //! All SQL: what is durable, in SQLite.
 //!
 //! ```text
-//! service --Write--> queue --> writer (one task, one connection): groups what is waiting into one transaction
-//!    |                            BEGIN IMMEDIATE .. COMMIT (WAL, synchronous = FULL), then answers every waiter
-//!    |                            observations: one row a group in `arrivals`, settled in their table later
-//!    +------ reads ------------> pool of readers (query_only)
+//! service --Write--> two lines --> writer (one task, one connection): groups what is small and waits, and some of what is large
+//!    |                                BEGIN IMMEDIATE .. COMMIT (WAL, synchronous = FULL), then answers every waiter
+//!    |                                observations: one row a group in `arrivals`, settled in their table later
+//!    +------ reads ----------------> pool of readers (query_only), one of which copies the log to the database now and then
 //! ```
 //!
 //! A write that was answered is on disk, in the file that has the database's name. Where nothing can be written, reading goes on. Rows become domain types here and nowhere else; times are milliseconds since 1970,
@@ -104,7 +104,7 @@ impl Store {
             Err(error) => return Err(error),
         };
         let readers = database.readers()?;
-        let writer = Writer::start(database, connection, tasks);
+        let writer = Writer::start(database, connection, Arc::clone(&readers), tasks);
         Ok(Self::of(readers, writer, tasks))
     }
 

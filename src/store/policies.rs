@@ -28,6 +28,13 @@ pub struct NewPolicy {
     pub created_at: Timestamp,
 }
 
+impl NewPolicy {
+    /// How much there is to be written.
+    pub(super) fn n_bytes(&self) -> usize {
+        self.summary.len() + self.steps.len()
+    }
+}
+
 /// A policy without its steps, as it is stored.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct PolicySummaryRow {
@@ -159,21 +166,37 @@ const MAX_INLINE_BYTES: usize = 32 * 1024;
 /// Most policies that a statement inserts. Each number of them is a statement of its own, which is prepared once and kept.
 const MAX_ROWS: usize = 64;
 
+/// Most bytes of them, which the driver has a copy of meanwhile, unless one alone has more.
+const MAX_ROWS_BYTES: usize = 1 << 20;
+
 /// Adds policies in this order, within a transaction.
 pub(super) async fn add_all(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
-    for rows in policies.chunks(MAX_ROWS) {
+    let mut rest = policies;
+    while !rest.is_empty() {
+        let (rows, after) = rest.split_at(n_fitting(rest));
         insert(connection, rows).await?;
+        rest = after;
     }
     Ok(())
 }
 
+/// How many of these, of which there are some, a statement inserts.
+fn n_fitting(policies: &[&NewPolicy]) -> usize {
+    let mut n_bytes = 0;
+    let fits = |policy: &&&NewPolicy| {
+        n_bytes += policy.n_bytes();
+        n_bytes <= MAX_ROWS_BYTES
+    };
+    policies.iter().take(MAX_ROWS).take_while(fits).count().max(1)
+}
+
 /// Adds policies in this order, all of them or none, outside of a transaction: one statement, which is durable when this returns.
-/// Says whether they were added; they are not if they are none, or too many.
+/// Says whether they were added; they are not if they are none, or too much.
 pub(super) async fn add_at_once(
     connection: &mut SqliteConnection,
     policies: &[&NewPolicy],
 ) -> Result<bool, StoreError> {
-    let fits = (1..=MAX_ROWS).contains(&policies.len());
+    let fits = !policies.is_empty() && n_fitting(policies) == policies.len();
     if fits {
         insert(connection, policies).await?;
     }

@@ -20,6 +20,13 @@ pub struct NewRefinement {
     pub request: String,
 }
 
+impl NewRefinement {
+    /// How much there is to be written.
+    pub(super) fn n_bytes(&self) -> usize {
+        self.request.len()
+    }
+}
+
 /// The end of a refinement.
 #[derive(Clone, Debug)]
 pub struct RefinementEnd {

@@ -14,7 +14,7 @@ use super::page::{Rest, Rows};
 use super::policies::NewPolicy;
 use super::refinements::NewRefinement;
 use super::trials::{self, NewTrial};
-use super::writer::{Write, Written};
+use super::writer::{Line, Write, Written};
 use super::{Page, Store, StoreError, arrivals, as_integer, corrupt, count, policies, refinements, timestamp};
 use crate::attribute::ByAttribute;
 
@@ -174,13 +174,24 @@ impl Store {
         self.done(Write::AddObservations(observations)).await
     }
 
-    /// Notes that something came for a session at `at`, once all that was written before is done. Says whether it is open.
+    /// Notes that something came for a session at `at`. Says whether it is open.
     ///
     /// # Errors
     ///
     /// If the database failed.
     pub async fn touch_session(&self, id: &str, at: Timestamp) -> Result<bool, StoreError> {
         self.done(Write::TouchSession { id: id.to_owned(), at }).await
+    }
+
+    /// As [`Self::touch_session`], once all that was sent before is written, by whoever sent it and whatever its size.
+    ///
+    /// # Errors
+    ///
+    /// Likewise.
+    pub async fn touch_session_behind_all(&self, id: &str, at: Timestamp) -> Result<bool, StoreError> {
+        let touch = |line| self.writer.write_in(line, Write::TouchSession { id: id.to_owned(), at });
+        let (small, large) = tokio::join!(touch(Line::Small), touch(Line::Large));
+        Ok([small?, large?].iter().all(|written| matches!(written, Written::Done(true))))
     }
 
     /// Ends a session: stores its policy and links them. Says whether it was open.

@@ -2,7 +2,8 @@
 //!
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies it in one
 //! transaction, and answers all of it after the commit. Before it takes it, it lets everybody go on who is ready to and may bring it
-//! more: so groups grow with the load, and nobody waits for a clock. Observations, which are most of it, only arrive with a commit,
+//! more: so groups grow with the load, and nobody waits for a clock. What is small waits in a line of its own, and a group has all of
+//! it, but of what is large only about as much as a disk writes in no time: so nobody waits behind what others have sent. Observations, which are most of it, only arrive with a commit,
 //! and are settled in their table later (`arrivals`). A group of nothing but observations, or nothing but policies, takes a single
 //! statement, as each costs the driver a change of threads.
 //!
@@ -15,6 +16,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use rustc_hash::FxHashSet;
 use sqlx::{Connection, SqliteConnection};
 use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -22,19 +24,31 @@ use jiff::Timestamp;
 
 use super::alive::{self, Alive};
 use super::arrivals::Arrivals;
-use super::database::Database;
+use super::database::{Database, Readers};
 use super::models::DeleteModel;
 use super::{
-    ExpiredSession, FailTrial, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement, NewReward, NewSession,
-    NewTrial, PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError, Unavailable, WeightsRow,
-    definitions, learners, models, policies, refinements, sessions, trials,
+    ExpiredSession, FailTrial, NewDefinition, NewLearner, NewModel, NewObservations, NewPolicy, NewRefinement,
+    NewReward, NewSession, NewTrial, PutLearner, PutModel, PutReward, RefinementEnd, SessionEnd, StoreError,
+    Unavailable, WeightsRow, definitions, learners, models, policies, refinements, sessions, trials,
 };
 
-/// Most writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
+/// Most small writes in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
 const MAX_GROUP: usize = 256;
 
-/// Most writes that wait. Beyond this, writers wait to get in line, which slows their clients down.
+/// Writes of more bytes are large. A group of small ones comes to 1 MiB at most.
+const MAX_SMALL_BYTES: usize = 4 << 10;
+
+/// A group that has so much of large writes takes no more of them. One piece of a definition comes to about twice as much.
+const MAX_LARGE_BYTES: usize = 512 << 10;
+
+/// Most writes that wait in a line. Beyond this, writers wait to get in line, which slows their clients down.
 const MAX_WAITING: usize = 1024;
+
+/// What is written to the log between two checkpoints, roughly: as much as SQLite itself lets be written.
+const CHECKPOINT_BYTES: usize = 4 << 20;
+
+/// What a commit writes whatever it holds, roughly: four pages.
+const COMMIT_BYTES: usize = 16 << 10;
 
 /// Something to be written.
 #[derive(Debug)]
@@ -92,6 +106,58 @@ impl Write {
             _ => None,
         }
     }
+
+    /// How much there is to be written, roughly.
+    fn n_bytes(&self) -> usize {
+        let of_refinement = |refinement: &Option<NewRefinement>| refinement.as_ref().map_or(0, NewRefinement::n_bytes);
+        let of_trial =
+            |trial: &NewTrial| trial.policy.as_ref().map_or(0, NewPolicy::n_bytes) + of_refinement(&trial.refinement);
+        match self {
+            Self::PutModel(model) => match &model.definition {
+                NewDefinition::Text(text) => text.len(),
+                // It may have as many labels, which are stored once more.
+                NewDefinition::Pieces(_) => MAX_LARGE_BYTES,
+            },
+            Self::AddPiece { piece, .. } => piece.len(),
+            Self::AddPolicies(added, to_refine) => {
+                let n_bytes: usize = added.iter().map(NewPolicy::n_bytes).sum();
+                n_bytes + to_refine.iter().map(NewRefinement::n_bytes).sum::<usize>()
+            }
+            Self::EndRefinement(end) => end.refined.as_ref().map_or(0, NewPolicy::n_bytes),
+            Self::OpenSession(session) => session.trial.as_ref().map_or(0, of_trial),
+            Self::AddObservations(new) => new.states.len(),
+            Self::EndSession(end) => end.policy.n_bytes() + of_refinement(&end.refinement),
+            Self::PutLearner(learner) => learner.definition.len(),
+            Self::AddTrial(trial) => of_trial(trial),
+            // Of several pieces. It comes behind those that were sent before.
+            Self::SweepDefinition(_) => MAX_LARGE_BYTES,
+            Self::DeleteModel(_)
+            | Self::BeginDefinition
+            | Self::BeginRefinement(_)
+            | Self::ReturnRefinement(_)
+            | Self::TouchSession { .. }
+            | Self::Settle
+            | Self::ExpireSessions { .. }
+            | Self::Alive(_)
+            | Self::DeleteLearner(_)
+            | Self::AddWeights { .. }
+            | Self::FailTrial { .. }
+            | Self::PutReward(_) => 0,
+        }
+    }
+
+    fn line(&self) -> Line {
+        if self.n_bytes() > MAX_SMALL_BYTES { Line::Large } else { Line::Small }
+    }
+}
+
+/// Where a write waits. Writes of a line are done in the order in which they came, and nothing is said about those of two.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Line {
+    /// All of it goes into the next group.
+    Small,
+    /// A part of it goes into the next group. As whoever writes waits for its answer, all of them have their turns.
+    Large,
 }
 
 /// What became of a [`Write`].
@@ -124,36 +190,58 @@ struct Job {
 /// The way to the writer.
 #[derive(Clone, Debug)]
 pub(super) struct Writer {
-    queue: mpsc::Sender<Job>,
+    small: mpsc::Sender<Job>,
+    large: mpsc::Sender<Job>,
     closing: CancellationToken,
     models_generation: Arc<AtomicU64>,
 }
 
 impl Writer {
-    /// Starts the writer in `tasks`, with its way to the database if there is one yet. It ends when it is closed or dropped, and
-    /// everything waiting has been written.
-    pub(super) fn start(database: Database, connection: Option<SqliteConnection>, tasks: &TaskTracker) -> Self {
-        let (queue, jobs) = mpsc::channel(MAX_WAITING);
-        let closing = CancellationToken::new();
-        let models_generation = Arc::new(AtomicU64::new(0));
+    /// Starts the writer in `tasks`, with its way to the database if there is one yet, and ways to read beside it. It ends when it is
+    /// closed or dropped, and everything waiting has been written.
+    pub(super) fn start(
+        database: Database,
+        connection: Option<SqliteConnection>,
+        readers: Arc<Readers>,
+        tasks: &TaskTracker,
+    ) -> Self {
+        let (writer, lines) = Self::with_lines();
         let open = Open {
             database,
             connection,
+            readers,
+            tasks: tasks.clone(),
+            n_logged_bytes: 0,
+            checkpoint: None,
             known: Known::default(),
             was_interrupted: true,
             trouble: None,
-            models_generation: Arc::clone(&models_generation),
+            models_generation: Arc::clone(&writer.models_generation),
         };
-        tasks.spawn(open.run(jobs, closing.clone()));
-        Self { queue, closing, models_generation }
+        tasks.spawn(open.run(lines));
+        writer
     }
 
     /// The way to no writer.
     pub(super) fn none() -> Self {
-        let (queue, _) = mpsc::channel(1);
+        let (writer, _) = Self::with_lines();
+        writer.close();
+        writer
+    }
+
+    /// The way to whoever takes what is in the lines.
+    fn with_lines() -> (Self, Lines) {
+        let (small, small_jobs) = mpsc::channel(MAX_WAITING);
+        let (large, large_jobs) = mpsc::channel(MAX_WAITING);
         let closing = CancellationToken::new();
-        closing.cancel();
-        Self { queue, closing, models_generation: Arc::default() }
+        let lines = Lines {
+            small: small_jobs,
+            large: large_jobs,
+            closing: closing.clone(),
+            has_small_ended: false,
+            has_large_ended: false,
+        };
+        (Self { small, large, closing, models_generation: Arc::default() }, lines)
     }
 
     /// Counts up whenever a model was registered or deleted, before whoever did so is told.
@@ -177,9 +265,72 @@ impl Writer {
     ///
     /// If the database failed; then nothing of `write` was done.
     pub(super) async fn write(&self, write: Write) -> Result<Written, StoreError> {
+        let line = write.line();
+        self.write_in(line, write).await
+    }
+
+    /// As [`Self::write`], in this line.
+    ///
+    /// # Errors
+    ///
+    /// Likewise.
+    pub(super) async fn write_in(&self, line: Line, write: Write) -> Result<Written, StoreError> {
+        let line = match line {
+            Line::Small => &self.small,
+            Line::Large => &self.large,
+        };
         let (answer, answered) = oneshot::channel();
-        self.queue.send(Job { write, answer }).await.map_err(|_| StoreError::Closed)?;
+        line.send(Job { write, answer }).await.map_err(|_| StoreError::Closed)?;
         answered.await.map_err(|_| StoreError::Closed)?
+    }
+}
+
+/// What waits for the writer.
+#[derive(Debug)]
+struct Lines {
+    small: mpsc::Receiver<Job>,
+    large: mpsc::Receiver<Job>,
+    closing: CancellationToken,
+    has_small_ended: bool,
+    has_large_ended: bool,
+}
+
+impl Lines {
+    /// Waits until there is something for a group, and takes it. Says whether there was any: not once everything was taken and nobody
+    /// may bring more.
+    async fn take(&mut self, group: &mut Vec<Job>) -> bool {
+        let mut n_large_bytes = 0;
+        while group.is_empty() {
+            if self.has_small_ended && self.has_large_ended {
+                return false;
+            }
+            tokio::select! {
+                biased;
+                () = self.closing.cancelled(), if !(self.small.is_closed() && self.large.is_closed()) => {
+                    // What waits is still received.
+                    self.small.close();
+                    self.large.close();
+                }
+                n_jobs = self.small.recv_many(group, MAX_GROUP), if !self.has_small_ended => {
+                    self.has_small_ended = n_jobs == 0;
+                }
+                job = self.large.recv(), if !self.has_large_ended => match job {
+                    Some(job) => {
+                        n_large_bytes += job.write.n_bytes();
+                        group.push(job);
+                    }
+                    None => self.has_large_ended = true,
+                },
+            }
+        }
+        while n_large_bytes < MAX_LARGE_BYTES
+            && group.len() < 2 * MAX_GROUP
+            && let Ok(job) = self.large.try_recv()
+        {
+            n_large_bytes += job.write.n_bytes();
+            group.push(job);
+        }
+        true
     }
 }
 
@@ -196,6 +347,12 @@ struct Open {
     database: Database,
     /// `None` after an error, until something is to be written.
     connection: Option<SqliteConnection>,
+    readers: Arc<Readers>,
+    tasks: TaskTracker,
+    /// Roughly, since the last checkpoint was begun.
+    n_logged_bytes: usize,
+    /// The last checkpoint.
+    checkpoint: Option<JoinHandle<()>>,
     known: Known,
     /// Whether no sign of life was written since the start, or since the database was unavailable.
     was_interrupted: bool,
@@ -205,18 +362,13 @@ struct Open {
 }
 
 impl Open {
-    async fn run(mut self, mut jobs: mpsc::Receiver<Job>, closing: CancellationToken) {
+    async fn run(mut self, mut lines: Lines) {
         let mut group = Vec::with_capacity(MAX_GROUP);
         loop {
             // Whoever is ready to go on may have something for this group too.
             tokio::task::yield_now().await;
-            tokio::select! {
-                n_jobs = jobs.recv_many(&mut group, MAX_GROUP) => if n_jobs == 0 { break },
-                () = closing.cancelled(), if !jobs.is_closed() => {
-                    // What waits is still received.
-                    jobs.close();
-                    continue;
-                }
+            if !lines.take(&mut group).await {
+                break;
             }
             match self.commit(&group).await {
                 Ok(written) => {
@@ -257,6 +409,10 @@ impl Open {
         }
         match committed {
             Ok(written) => {
+                self.n_logged_bytes += COMMIT_BYTES + group.iter().map(|job| job.write.n_bytes()).sum::<usize>();
+                if self.n_logged_bytes >= CHECKPOINT_BYTES {
+                    self.checkpoint();
+                }
                 if self.trouble.take().is_some() {
                     tracing::info!("the database takes writes again");
                 }
@@ -277,6 +433,20 @@ impl Open {
         self.database.check_written()?;
         self.was_interrupted &= !gives_life;
         Ok(written)
+    }
+
+    /// Has the log copied to the database's file, beside the writing.
+    fn checkpoint(&mut self) {
+        if self.checkpoint.as_ref().is_none_or(JoinHandle::is_finished) {
+            self.n_logged_bytes = 0;
+            let readers = Arc::clone(&self.readers);
+            self.checkpoint = Some(self.tasks.spawn(async move {
+                if let Err(error) = readers.checkpoint().await {
+                    // A commit does it, once the log is long; and where nothing can be written, writers are told so.
+                    tracing::debug!(error = &error as &dyn std::error::Error, "the log was not copied");
+                }
+            }));
+        }
     }
 
     async fn failed(&mut self, error: StoreError) -> StoreError {
@@ -499,4 +669,123 @@ async fn apply(
         | Write::ExpireSessions { .. }
         | Write::AddWeights { .. } => unreachable!("applied with what is known of others"),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::Path;
+
+    use futures_util::{FutureExt, poll};
+
+    use super::*;
+    use crate::store::database::N_READERS;
+    use crate::store::{NewObservations, NewSession, Store};
+
+    fn policy(id: &str, n_bytes: usize) -> Write {
+        let steps = vec![0; n_bytes];
+        let (id, summary) = (id.to_owned(), "{}".to_owned());
+        Write::AddPolicies(vec![NewPolicy { id, summary, steps, created_at: Timestamp::UNIX_EPOCH }], Vec::new())
+    }
+
+    async fn open(directory: &Path) -> Store {
+        Store::open(&directory.join("etude.db"), &TaskTracker::new()).await.unwrap()
+    }
+
+    /// Sizes of what is in the next group.
+    async fn group(lines: &mut Lines) -> Vec<usize> {
+        let mut group = Vec::new();
+        lines.take(&mut group).await;
+        group.iter().map(|job| job.write.n_bytes() >> 10).collect()
+    }
+
+    #[tokio::test]
+    async fn what_is_small_goes_first_and_of_what_is_large_each_has_its_turn() {
+        let (writer, mut lines) = Writer::with_lines();
+        let send = |n_kib: usize| Box::pin(writer.write(policy("p", n_kib << 10)));
+        let mut sent: Vec<_> = [700, 800, 100, 200, 300, 5, 900, 1, 2].map(send).into();
+        for sent in &mut sent {
+            assert!(poll!(sent).is_pending());
+        }
+        assert_eq!(group(&mut lines).await, [1, 2, 700]);
+        let mut later = send(3);
+        assert!(poll!(&mut later).is_pending());
+        assert_eq!(group(&mut lines).await, [3, 800]);
+        assert_eq!(group(&mut lines).await, [100, 200, 300]);
+        writer.close();
+        assert_eq!(group(&mut lines).await, [5, 900], "what waits is still written");
+        assert!(!lines.take(&mut Vec::new()).await);
+        assert!(matches!(writer.write(policy("p", 0)).await, Err(StoreError::Closed)));
+    }
+
+    #[tokio::test]
+    async fn lines_end_with_those_who_might_bring_something() {
+        let (writer, mut lines) = Writer::with_lines();
+        let mut group = Vec::new();
+        let mut taken = Box::pin(lines.take(&mut group));
+        assert!(poll!(&mut taken).is_pending());
+        drop(writer);
+        assert!(!taken.await);
+    }
+
+    #[tokio::test]
+    async fn a_session_is_resumed_behind_what_was_large_and_sent_for_the_owner_before() {
+        let directory = tempfile::tempdir().unwrap();
+        let store = open(directory.path()).await;
+        let session = NewSession {
+            id: "s".to_owned(),
+            model: "m".to_owned(),
+            model_hash: "0".to_owned(),
+            weights: [("x".into(), 1.0)].into_iter().collect(),
+            lookahead: None,
+            start: None,
+            learner: None,
+            weights_version: None,
+            trial: None,
+            created_at: Timestamp::UNIX_EPOCH,
+        };
+        assert!(store.open_session(session).await.unwrap());
+        let mut others: Vec<_> = ["a", "b", "c"].map(|id| Box::pin(store.writer.write(policy(id, 1 << 20)))).into();
+        for other in &mut others {
+            assert!(poll!(other).is_pending());
+        }
+        let states = format!("[{}1]", " ".repeat(2 * MAX_SMALL_BYTES));
+        let at = Timestamp::UNIX_EPOCH;
+        let new = NewObservations { session_id: "s".to_owned(), seq: 0, n_states: 1, states, at };
+        assert!(poll!(Box::pin(store.add_observations(new))).is_pending(), "and its owner is gone");
+        assert!(store.touch_session_behind_all("s", at).await.unwrap());
+        assert_eq!(store.session("s").await.unwrap().unwrap().n_observations, 1);
+        // So that it is not only the order in which things happen to go.
+        assert!(others.into_iter().all(|other| other.now_or_never().is_some()));
+    }
+
+    #[tokio::test]
+    async fn a_commit_leaves_it_to_others_to_copy_the_log() {
+        let directory = tempfile::tempdir().unwrap();
+        let store = open(directory.path()).await;
+        let n_bytes = || fs::metadata(directory.path().join("etude.db")).unwrap().len();
+        // As long as nobody else can.
+        let mut taken = Vec::new();
+        for _ in 0..N_READERS {
+            taken.push(store.reader().await.unwrap());
+        }
+        store.writer.write(policy("a", CHECKPOINT_BYTES)).await.unwrap();
+        store.writer.write(policy("b", 0)).await.unwrap();
+        assert!(n_bytes() < CHECKPOINT_BYTES as u64);
+        taken.clear();
+        while n_bytes() < CHECKPOINT_BYTES as u64 {
+            tokio::task::yield_now().await;
+        }
+    }
+
+    #[tokio::test]
+    async fn copying_the_log_is_no_writing_by_others() {
+        let directory = tempfile::tempdir().unwrap();
+        let store = open(directory.path()).await;
+        let version = "SELECT data_version FROM pragma_data_version";
+        let mut connection = store.reader().await.unwrap();
+        let before: i64 = sqlx::query_scalar(version).fetch_one(&mut *connection).await.unwrap();
+        store.readers.checkpoint().await.unwrap();
+        assert_eq!(sqlx::query_scalar::<_, i64>(version).fetch_one(&mut *connection).await.unwrap(), before);
+    }
 }

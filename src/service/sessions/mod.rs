@@ -196,7 +196,7 @@ impl Etude {
 
     async fn resume_owned(&self, id: &str, ownership: Ownership, caller: Caller) -> Result<Resumed, SessionError> {
         // Behind whatever is still to be written for the owner before. It may be done already.
-        let _is_open = self.store.touch_session(id, caller.now).await?;
+        let _is_open = self.store.touch_session_behind_all(id, caller.now).await?;
         let row = self.session(id).await?;
         if row.status == SessionStatus::Expired {
             return Err(SessionError::NotOpen);
