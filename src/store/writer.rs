@@ -12,9 +12,11 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use rustc_hash::FxHashSet;
 use sqlx::{Connection, SqliteConnection};
+use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -43,6 +45,9 @@ const MAX_LARGE_BYTES: usize = 512 << 10;
 
 /// Most writes that wait in a line. Beyond this, writers wait to get in line, which slows their clients down.
 const MAX_WAITING: usize = 1024;
+
+/// How long they wait for that.
+const LINE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// What is written to the log between two checkpoints, roughly: as much as SQLite itself lets be written.
 const CHECKPOINT_BYTES: usize = 4 << 20;
@@ -280,7 +285,14 @@ impl Writer {
             Line::Large => &self.large,
         };
         let (answer, answered) = oneshot::channel();
-        line.send(Job { write, answer }).await.map_err(|_| StoreError::Closed)?;
+        match line.try_send(Job { write, answer }) {
+            Ok(()) => {}
+            Err(TrySendError::Closed(_)) => return Err(StoreError::Closed),
+            Err(TrySendError::Full(job)) => match tokio::time::timeout(LINE_TIMEOUT, line.send(job)).await {
+                Ok(sent) => sent.map_err(|_| StoreError::Closed)?,
+                Err(_) => return Err(Unavailable::Slow.into()),
+            },
+        }
         answered.await.map_err(|_| StoreError::Closed)?
     }
 }
@@ -332,6 +344,13 @@ impl Lines {
         }
         true
     }
+
+    /// Takes what waits now, and nothing that comes meanwhile.
+    fn drain(&mut self) -> impl Iterator<Item = Job> {
+        let (n_small, n_large) = (self.small.len(), self.large.len());
+        let small = (0..n_small).map_while(|_| self.small.try_recv().ok());
+        small.chain((0..n_large).map_while(|_| self.large.try_recv().ok()))
+    }
 }
 
 /// What the writer knows of the database without looking, as long as what it writes succeeds.
@@ -381,6 +400,12 @@ impl Open {
                     // Each on its own would fare no better.
                     for job in group.drain(..) {
                         let _ = job.answer.send(Err(unavailable.into()));
+                    }
+                    // What has waited meanwhile has waited as long for the lock.
+                    if unavailable == Unavailable::Locked {
+                        for job in lines.drain() {
+                            let _ = job.answer.send(Err(unavailable.into()));
+                        }
                     }
                 }
                 Err(_) if group.len() > 1 => {
@@ -676,10 +701,12 @@ mod tests {
     use std::fs;
     use std::path::Path;
 
+    use futures_util::future::join_all;
     use futures_util::{FutureExt, poll};
+    use tokio::task::unconstrained;
 
     use super::*;
-    use crate::store::database::N_READERS;
+    use crate::store::database::{Locking, N_READERS};
     use crate::store::{NewObservations, NewSession, Store};
 
     fn policy(id: &str, n_bytes: usize) -> Write {
@@ -726,6 +753,42 @@ mod tests {
         assert!(poll!(&mut taken).is_pending());
         drop(writer);
         assert!(!taken.await);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_does_not_get_in_line_for_long_is_told_so() {
+        let (writer, mut lines) = Writer::with_lines();
+        let waiting = (0..MAX_WAITING).map(|_| writer.write(Write::Settle));
+        let mut waiting = Box::pin(join_all(waiting));
+        assert!(poll!(&mut waiting).is_pending());
+        let one_more = writer.write(Write::Settle).await;
+        assert!(matches!(one_more, Err(StoreError::Unavailable(Unavailable::Slow))), "{one_more:?}");
+        assert!(poll!(&mut waiting).is_pending());
+        assert_eq!(lines.drain().count(), MAX_WAITING, "it is not written later");
+    }
+
+    #[tokio::test]
+    async fn who_has_waited_behind_a_locked_database_does_not_wait_as_long_once_more() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("etude.db");
+        let mut database = Database::new(&path, Locking::None).unwrap();
+        let mut connection = database.connect().await.unwrap();
+        sqlx::query("PRAGMA busy_timeout = 1").execute(&mut connection).await.unwrap();
+        let mut other = Database::new(&path, Locking::None).unwrap().connect().await.unwrap();
+        let held = other.begin_with("BEGIN IMMEDIATE").await.unwrap();
+        let readers = database.readers().unwrap();
+        let writer = Writer::start(database, Some(connection), readers, &TaskTracker::new());
+        let sizes = [0; MAX_GROUP + 1].into_iter().chain([1 << 20; 2]);
+        let mut sent: Vec<_> = sizes.map(|n_bytes| Box::pin(writer.write(policy("p", n_bytes)))).collect();
+        for sent in &mut sent {
+            assert!(poll!(sent).is_pending());
+        }
+        let is_locked =
+            |written: Result<Written, StoreError>| matches!(written, Err(StoreError::Unavailable(Unavailable::Locked)));
+        assert!(is_locked(sent.remove(0).await));
+        assert!(sent.into_iter().all(|sent| unconstrained(sent).now_or_never().is_some_and(is_locked)));
+        held.rollback().await.unwrap();
+        writer.write(policy("p", 0)).await.unwrap();
     }
 
     #[tokio::test]
