@@ -1,7 +1,7 @@
 //! The files of the database, and the ways to them.
 //!
 //! ```text
-//! etude.db       0600; its identity (device and inode) is that of the first look at it
+//! etude.db       0600, as are the others; its identity (device and inode) is that of the first look at it
 //! etude.db-lock  locked by the process that writes, for as long as it lives
 //! etude.db-wal, etude.db-shm: SQLite's
 //! ```
@@ -10,13 +10,14 @@
 //! version's schema. Where nothing can be written, the database is read all the same if that can be: until a writer gets its way.
 //! The file of the database is never opened here but by SQLite, which would lose its locks if another descriptor were closed.
 
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File, OpenOptions, Permissions};
 use std::io::{self, ErrorKind};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
+use rustix::process::geteuid;
 use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{SqliteConnectOptions, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
@@ -221,6 +222,7 @@ impl Database {
             Ok(_) | Err(StoreError::Unavailable(Unavailable::Locked)) => {}
             Err(error) => return Err(error),
         }
+        self.keep_from_others();
         let readers = readers(options(&self.path).pragma("query_only", "ON")).await?;
         self.check_written()?;
         self.is_looked_at = true;
@@ -319,6 +321,27 @@ impl Database {
         }
     }
 
+    /// Keeps others from files that were there before, and that only this process writes to.
+    fn keep_from_others(&self) {
+        if self.locking == Locking::None {
+            return;
+        }
+        for path in [self.path.clone(), self.beside("-wal"), self.beside("-shm"), self.beside("-lock")] {
+            let file = path.display();
+            match keep_from_others(&path) {
+                Ok(true) => {
+                    tracing::info!(%file, "others could read or write this file of the database; now only its owner can");
+                }
+                Ok(false) => {}
+                Err(error) => tracing::warn!(
+                    error = &error as &dyn std::error::Error,
+                    %file,
+                    "others can read or write this file of the database, and its mode cannot be changed"
+                ),
+            }
+        }
+    }
+
     /// Makes an empty file, which is an empty database; others by SQLite have its mode.
     fn create(&mut self) -> Result<(), StoreError> {
         let made = OpenOptions::new().write(true).create_new(true).mode(MODE).open(&self.path);
@@ -362,6 +385,19 @@ fn resolve(path: &Path) -> io::Result<PathBuf> {
     let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
     let name = path.file_name().ok_or(ErrorKind::InvalidFilename)?;
     Ok(fs::canonicalize(directory)?.join(name))
+}
+
+/// Makes a file its owner's alone, if that is this process's user. Says whether it was not.
+fn keep_from_others(path: &Path) -> io::Result<bool> {
+    let file = match fs::symlink_metadata(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(false),
+        file => file?,
+    };
+    let is_to_be_kept = file.is_file() && file.uid() == geteuid().as_raw() && file.mode() & 0o077 != 0;
+    if is_to_be_kept {
+        fs::set_permissions(path, Permissions::from_mode(file.mode() & MODE))?;
+    }
+    Ok(is_to_be_kept)
 }
 
 /// Writes a little beside the database, and removes it, on a thread of its own, as a disk may take its time.
@@ -546,6 +582,52 @@ mod tests {
         assert_eq!(store.policies(0, 10).await.unwrap().items[0].summary, refined);
         let id = sqlx::query("PRAGMA application_id").fetch_one(&mut *store.reader().await.unwrap()).await.unwrap();
         assert_eq!(id.get::<i64, _>(0), APPLICATION_ID);
+    }
+
+    #[tokio::test]
+    async fn a_service_keeps_others_from_files_that_they_could_read_and_whoever_only_reads_leaves_them() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("etude.db");
+        let at = |end: &str| directory.path().join(format!("etude.db{end}"));
+        let of_all = ["", "-wal", "-shm", "-lock"];
+        let modes = || of_all.map(|end| fs::metadata(at(end)).unwrap().mode() & 0o777);
+        let tasks = TaskTracker::new();
+        let store = Store::open_alone(&path, &tasks).await.unwrap();
+        store.close().await;
+        tasks.close();
+        tasks.wait().await;
+        for end in ["", "-lock"] {
+            fs::set_permissions(at(end), Permissions::from_mode(0o644)).unwrap();
+        }
+        // SQLite gives what it makes the mode of the database.
+        let reading = Store::open_to_read(&path, &TaskTracker::new()).await.unwrap();
+        assert_eq!(modes(), [0o644; 4]);
+        let _store = Store::open_alone(&path, &TaskTracker::new()).await.unwrap();
+        assert_eq!(modes(), [0o600; 4]);
+        reading.policies(0, 1).await.unwrap();
+
+        let foreign = directory.path().join("foreign.db");
+        let mut other = options(&foreign).create_if_missing(true).connect().await.unwrap();
+        sqlx::query("CREATE TABLE others (id INTEGER)").execute(&mut other).await.unwrap();
+        fs::set_permissions(&foreign, Permissions::from_mode(0o644)).unwrap();
+        assert!(matches!(Store::open_alone(&foreign, &TaskTracker::new()).await, Err(StoreError::Foreign)));
+        assert_eq!(fs::metadata(&foreign).unwrap().mode() & 0o777, 0o644);
+    }
+
+    #[test]
+    fn what_its_owner_must_not_write_to_stays_so_and_what_a_link_leads_to_is_left() {
+        let directory = tempfile::tempdir().unwrap();
+        let (path, link) = (directory.path().join("file"), directory.path().join("link"));
+        fs::write(&path, "").unwrap();
+        fs::set_permissions(&path, Permissions::from_mode(0o444)).unwrap();
+        std::os::unix::fs::symlink(&path, &link).unwrap();
+        let mode = || fs::metadata(&path).unwrap().mode() & 0o777;
+        assert!(!keep_from_others(&link).unwrap());
+        assert_eq!(mode(), 0o444);
+        assert!(keep_from_others(&path).unwrap());
+        assert_eq!(mode(), 0o400);
+        assert!(!keep_from_others(&path).unwrap());
+        assert!(!keep_from_others(&directory.path().join("none")).unwrap());
     }
 
     #[tokio::test]
