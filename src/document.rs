@@ -102,6 +102,11 @@ impl Faults {
         self.listed.len() + self.n_unlisted
     }
 
+    /// How many bytes of memory they take.
+    pub(crate) fn size_bytes(&self) -> usize {
+        self.listed.iter().map(|fault| size_of::<Fault>() + fault.pointer.len() + fault.detail.len()).sum()
+    }
+
     /// The first [`Self::MAX_LISTED`] faults.
     #[must_use]
     pub fn listed(&self) -> &[Fault] {
@@ -171,13 +176,31 @@ pub fn parse(text: &[u8]) -> Result<Value, ParseError> {
     serde_json::from_slice(text).map_err(|error| explain_parse_error(text, &error))
 }
 
+/// What a value takes in a list that has grown, or a name.
+const VALUE_BYTES: usize = 2 * size_of::<Value>();
+
+/// What a map takes, which has room for eleven members.
+const MAP_BYTES: usize = 11 * (size_of::<Value>() + size_of::<String>()) + 32;
+
+/// About how much memory a document takes, in bytes.
+pub(crate) fn size_bytes(document: &Value) -> usize {
+    let inside = match document {
+        Value::Null | Value::Bool(_) | Value::Number(_) => 0,
+        Value::String(text) => text.len(),
+        Value::Array(items) => items.iter().map(size_bytes).sum(),
+        Value::Object(members) => {
+            let inside =
+                members.iter().map(|(name, value)| VALUE_BYTES + name.len() + size_bytes(value)).sum::<usize>();
+            MAP_BYTES + inside
+        }
+    };
+    VALUE_BYTES + inside
+}
+
 /// About how much memory the values in `text` take once they are parsed, in bytes: up to eighty times as much as the text. Looks at
 /// nothing but punctuation, and takes that in strings for more of it.
 #[must_use]
 pub fn parsed_bytes(text: &[u8]) -> usize {
-    /// A value in a list that has grown, or a name; a map, which has room for eleven members.
-    const VALUE_BYTES: usize = 2 * size_of::<Value>();
-    const MAP_BYTES: usize = 11 * (size_of::<Value>() + size_of::<String>()) + 32;
     let bytes_of = |byte: &u8| match byte {
         b',' | b':' => VALUE_BYTES,
         b'{' => MAP_BYTES,

@@ -26,6 +26,9 @@ const UNIT_BYTES: u64 = 4096;
 /// Most that is small, for which an eighth of the room is kept.
 pub const SMALL_BYTES: u64 = 1 << 20;
 
+/// Most that need not be counted at all.
+pub const UNCOUNTED_BYTES: u64 = 64 << 10;
+
 /// There is no room for so much now; or there never is, if it is more than all the room.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{wanted} bytes do not fit into the memory of this service (ETUDE_MAX_MEMORY), which has {room} for requests")]
@@ -121,6 +124,21 @@ impl Memory {
     /// [`NoRoom`] if they are not.
     pub fn try_take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
         self.try_take_for(n_bytes, n_bytes)
+    }
+
+    /// Takes what `held` lacks to hold `n_bytes`, unless they are so few that they need not be counted.
+    ///
+    /// # Errors
+    ///
+    /// [`NoRoom`] if it is not free; then this holds what it did before.
+    pub fn hold(&self, held: &mut Option<Held>, n_bytes: usize) -> Result<(), NoRoom> {
+        let n_bytes = n_bytes as u64;
+        match held {
+            _ if n_bytes <= UNCOUNTED_BYTES => {}
+            Some(held) => held.grow_to(n_bytes)?,
+            None => *held = Some(self.try_take(n_bytes)?),
+        }
+        Ok(())
     }
 
     /// Takes `n_bytes` more for what will then have `n_in_all`.
@@ -277,6 +295,18 @@ mod tests {
         assert_eq!((held.n_bytes(), memory.free()), (8192, MIB / 2 - 8192));
         drop((held, other));
         assert_eq!(memory.free(), MIB);
+    }
+
+    #[test]
+    fn what_is_little_need_not_be_counted() {
+        let memory = Memory::with_room(MIB);
+        let mut held = None;
+        memory.hold(&mut held, 64 << 10).unwrap();
+        assert!(held.is_none());
+        memory.hold(&mut held, (64 << 10) + 1).unwrap();
+        memory.hold(&mut held, 512 << 10).unwrap();
+        assert!(memory.hold(&mut held, 2 << 20).is_err());
+        assert_eq!((held.unwrap().n_bytes(), memory.free()), (MIB / 2, MIB / 2));
     }
 
     #[test]

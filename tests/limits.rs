@@ -168,3 +168,23 @@ async fn a_batch_says_which_items_its_answer_has_no_room_for() {
     // What it took was given back.
     assert_eq!(service.post("/v1/policies", &json!({"model": "long", "demonstration": to_and_fro(9)})).await.0, 201);
 }
+
+#[tokio::test]
+async fn a_demonstration_that_takes_more_memory_than_there_is_is_refused() {
+    let service = Service::start(&["--max-memory", "160M"]).await;
+    let attribute = |n: usize| json!({"name": format!("{n}"), "kind": "number"});
+    let wide = json!({
+        "attributes": (0..256).map(attribute).collect::<Vec<_>>(), "actions": [],
+        "dynamics": {"kind": "table", "states": [vec![0; 256]], "transitions": []},
+    });
+    assert_eq!(service.put("/v1/models/wide", &wide).await.0, 201);
+    // Three bytes each, and seven kilobytes once they are read.
+    let demonstration = vec![json!({}); 25_000];
+    let request = json!({"model": "wide", "demonstration": demonstration, "max_expansions": 1});
+    let (status, answer) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, &answer["type"]), (503, &json!("/problems/busy")), "{answer}");
+    let items = json!([{"demonstration": demonstration}, {"demonstration": [{}]}]);
+    let (status, answer) = service.post("/v1/policies:batch", &json!({"model": "wide", "items": items})).await;
+    assert_eq!((status, &answer["items"][0]["problem"]["type"]), (200, &json!("/problems/batch-full")));
+    assert!(answer["items"][1]["id"].is_string(), "there is room for the other one");
+}

@@ -9,10 +9,11 @@ use axum::response::Response;
 use hyper::body::{Frame, SizeHint};
 use tokio::time::Instant;
 
-use crate::memory::{Held, Memory, NoRoom};
+use crate::memory::{self, Held, Memory, NoRoom};
 
 /// Bodies and answers up to this are not counted: the budget of memory keeps room for what is small.
-pub(super) const UNCOUNTED_BYTES: usize = 64 * 1024;
+#[expect(clippy::cast_possible_truncation, reason = "64 KiB")]
+pub(super) const UNCOUNTED_BYTES: usize = memory::UNCOUNTED_BYTES as usize;
 
 /// How long a client may take to read an answer, however slowly it does.
 const READ_TIMEOUT: Duration = Duration::from_mins(1);
@@ -27,12 +28,29 @@ const MIN_BYTES_PER_S: u64 = 64 * 1024;
 /// If there is no room. Then the answer is what it was.
 pub(super) fn count(response: &mut Response, memory: &Memory) -> Result<(), NoRoom> {
     let n_bytes = HttpBody::size_hint(response.body()).exact().unwrap_or(0);
-    if n_bytes > UNCOUNTED_BYTES as u64 {
-        let held = memory.try_take(n_bytes)?;
-        let body = std::mem::take(response.body_mut());
-        *response.body_mut() = Body::new(Paced { held: Some(held), ..Paced::new(body) });
+    if n_bytes > UNCOUNTED_BYTES as u64 && response.extensions_mut().remove::<IsCounted>().is_none() {
+        hold(response, memory.try_take(n_bytes)?);
     }
     Ok(())
+}
+
+/// The memory of an answer is held already.
+#[derive(Clone, Copy)]
+struct IsCounted;
+
+/// An answer whose memory was taken before, if it is much. It is not counted again.
+pub(super) fn counted(mut response: Response, held: Option<Held>) -> Response {
+    if let Some(mut held) = held {
+        held.shrink_to(HttpBody::size_hint(response.body()).exact().unwrap_or(u64::MAX));
+        hold(&mut response, held);
+        response.extensions_mut().insert(IsCounted);
+    }
+    response
+}
+
+fn hold(response: &mut Response, held: Held) {
+    let body = std::mem::take(response.body_mut());
+    *response.body_mut() = Body::new(Paced { held: Some(held), ..Paced::new(body) });
 }
 
 /// An answer that is cut off if it is read too slowly.
@@ -149,6 +167,18 @@ mod tests {
         assert_eq!(memory.free(), 1 << 20);
         let mut too_large = vec![b' '; 2 << 20].into_response();
         assert!(count(&mut too_large, &memory).is_err());
+    }
+
+    #[tokio::test]
+    async fn an_answer_whose_memory_was_taken_before_is_not_counted_again() {
+        let memory = Memory::with_room(1 << 20);
+        let held = memory.try_take(1 << 20).unwrap();
+        let mut response = counted(vec![b' '; 1 << 19].into_response(), Some(held));
+        assert_eq!(memory.free(), 1 << 19, "what it does not need is given back");
+        let _others = memory.try_take(1 << 19).unwrap();
+        count(&mut response, &memory).unwrap();
+        drop(response);
+        assert_eq!(memory.free(), 1 << 19);
     }
 
     #[tokio::test]

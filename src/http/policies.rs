@@ -8,12 +8,12 @@ use axum::response::Response;
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::SharedContext;
 use super::body::{json, json_text, read_json};
 use super::observe::RequestId;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::Problem;
+use super::{SharedContext, answer};
 use crate::mapping::{Policy, PolicySummary, RequestDocument};
 use crate::service::{BatchRequest, Caller, ServiceError};
 
@@ -40,7 +40,7 @@ pub(super) async fn make_policy(
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
     let made = context.etude.make_policy(body, caller).await?;
-    let mut response = json_text(StatusCode::CREATED, made.policy);
+    let mut response = answer::counted(json_text(StatusCode::CREATED, made.policy), made.held);
     if let Ok(location) = HeaderValue::try_from(format!("/v1/policies/{}", made.id)) {
         response.headers_mut().insert(LOCATION, location);
     }
@@ -74,13 +74,12 @@ pub(super) async fn make_policies(
     request: Request,
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
-    let mut made = context.etude.make_policies(body, caller).await?;
+    let made = context.etude.make_policies(body, caller).await?;
     let (before, after) = (r#"{"items":["#, "]}");
     let n_bytes: usize = made.items.iter().flatten().map(|made| made.policy.len() + 1).sum();
     let mut text = String::with_capacity(before.len() + n_bytes + after.len());
     let mut separator = before;
-    // What they take is held until the answer is written.
-    for item in std::mem::take(&mut made.items) {
+    for item in made.items {
         text.push_str(separator);
         match item {
             Ok(policy) => text.push_str(&policy.policy),
@@ -92,7 +91,7 @@ pub(super) async fn make_policies(
         separator = ",";
     }
     text.push_str(after);
-    Ok(json_text(StatusCode::OK, text))
+    Ok(answer::counted(json_text(StatusCode::OK, text), made.held))
 }
 
 /// A policy, as it was answered when it was made.

@@ -10,11 +10,11 @@ use serde::{Deserialize, Serialize};
 use serde_json::value::RawValue;
 use utoipa::{IntoParams, ToSchema};
 
-use super::SharedContext;
 use super::body::{json, read_json, read_small_json};
 use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
 use super::problem::Problem;
+use super::{SharedContext, answer};
 use crate::mapping::{ObservationDocument, Policy, StartReference};
 use crate::service::{Caller, TrialAnswer};
 use crate::store::{StoreError, TrialStatus};
@@ -80,7 +80,7 @@ pub(super) struct TrialBody {
 
 impl TrialBody {
     fn of(answer: TrialAnswer) -> Result<Self, StoreError> {
-        let TrialAnswer { row, status, policy } = answer;
+        let TrialAnswer { row, status, policy, held: _ } = answer;
         let weights = RawValue::from_string(row.weights);
         let weights = weights.map_err(|error| StoreError::corrupt("trials", "weights", &row.id, error))?;
         Ok(Self {
@@ -143,9 +143,11 @@ pub(super) async fn make_trial(
     request: Request,
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
-    let made = TrialBody::of(context.etude.make_trial(&name, body, caller).await?)?;
+    let mut made = context.etude.make_trial(&name, body, caller).await?;
+    let held = made.held.take();
+    let made = TrialBody::of(made)?;
     let location = HeaderValue::from_str(&format!("/v1/trials/{}", made.id));
-    let mut response = json(StatusCode::CREATED, &made);
+    let mut response = answer::counted(json(StatusCode::CREATED, &made), held);
     if let Ok(location) = location {
         response.headers_mut().insert(LOCATION, location);
     }
@@ -213,8 +215,9 @@ pub(super) async fn list_trials(
     ),
 )]
 pub(super) async fn get_trial(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
-    let trial = context.etude.trial(&id, Timestamp::now()).await?;
-    Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
+    let mut trial = context.etude.trial(&id, Timestamp::now()).await?;
+    let held = trial.held.take();
+    Ok(answer::counted(json(StatusCode::OK, &TrialBody::of(trial)?), held))
 }
 
 /// Give a trial its reward; durable before it is answered. Counts once, however often it is sent.

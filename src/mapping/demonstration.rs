@@ -35,6 +35,18 @@ impl Demonstration {
         (faults.count() == n_before).then_some(Self { values, n_attributes: schema.len() })
     }
 
+    /// About how many bytes a demonstration of so many observations takes, with what is looked up of them: little of it may be in the
+    /// text that it is read from.
+    pub(crate) fn bytes_of(schema: &Schema, n_observations: usize) -> usize {
+        const VALUE_BYTES: usize = size_of::<Option<Value>>() + size_of::<u32>();
+        n_observations.saturating_mul(schema.len() * VALUE_BYTES)
+    }
+
+    /// How many bytes of memory it takes.
+    pub(crate) fn size_bytes(&self) -> usize {
+        self.values.capacity() * size_of::<Option<Value>>()
+    }
+
     /// How many observations there are: n + 1.
     #[must_use]
     #[expect(clippy::len_without_is_empty, reason = "it is never empty")]

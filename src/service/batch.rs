@@ -23,7 +23,9 @@ use utoipa::ToSchema;
 use uuid::Uuid;
 
 use super::outline::{AtHand, BatchOutline};
-use super::policies::{Envelope, MAX_INLINE_BYTES, Named, Searched, base_weights, follow, parse};
+use super::policies::{
+    Envelope, Extent, MAX_INLINE_BYTES, Named, Searched, base_weights, follow, parse, take_for_demonstration,
+};
 use super::{Admission, Caller, Etude, MadePolicy, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Object, Path, Place};
@@ -59,8 +61,8 @@ const SHARED_OPTIONS: [&str; 4] = ["lookahead", "start", "heuristic", "max_expan
 pub struct MadePolicies {
     /// For each item, in order, its policy or what is wrong with it.
     pub items: Vec<Result<MadePolicy, ServiceError>>,
-    /// Holds the memory of the items.
-    _batch: Arc<Batch>,
+    /// For the policies, and as much again while they are put together, if they are much.
+    pub held: Option<Held>,
 }
 
 impl Etude {
@@ -88,7 +90,7 @@ impl Etude {
         } else {
             // Another model was given this name meanwhile.
             let (document, held) = parse(body, &place, &self.memory).await?;
-            SentBatch { document, read: None, _held: held }
+            SentBatch { document, read: None, held }
         };
         let memory = self.memory.clone();
         let read = move |_: &mut dyn Interrupt| Ok(Batch::read(sent, envelope, named, memory));
@@ -117,17 +119,20 @@ impl Etude {
                 let id = row.id.clone();
                 rows.push(row);
                 refinements.extend(refinement);
-                MadePolicy { id, policy }
+                MadePolicy { id, policy, held: None }
             }));
         }
         let are_refined = !refinements.is_empty();
-        if !rows.is_empty() {
+        let is_any_stored = !rows.is_empty();
+        if is_any_stored {
             self.store.add_policies(rows, refinements).await?;
         }
         if are_refined {
             self.refiner.wake();
         }
-        Ok(MadePolicies { items, _batch: batch })
+        // Once they are stored, they are answered, whatever else is told.
+        let held = batch.answer().held.take().or_else(|| self.memory.try_take(0).ok().filter(|_| is_any_stored));
+        Ok(MadePolicies { items, held })
     }
 
     /// Reads a batch, by its `place` in the pool if it is large.
@@ -152,23 +157,23 @@ struct SentBatch {
     document: Value,
     /// The items that were read for a model.
     read: Option<(Arc<Mapper>, Vec<Item>)>,
-    /// For the document, unless the items were read already.
-    _held: Option<Held>,
+    /// For both, if they are much.
+    held: Option<Held>,
 }
 
 impl SentBatch {
     /// Reads a batch in one pass if that can be, else as a document. Items with a lookahead need documents: their requests are stored, to
     /// be refined.
     fn read(body: &[u8], at_hand: AtHand<'_>, memory: &Memory) -> Result<Self, ServiceError> {
-        let outline = BatchOutline::read(body, at_hand).filter(|BatchOutline { document, items, .. }| {
+        let outline = BatchOutline::read(body, at_hand, memory).filter(|BatchOutline { document, items, .. }| {
             document["lookahead"].is_null() && items.iter().all(|(item, _)| item["lookahead"].is_null())
         });
-        let Some(BatchOutline { document, items, mapper }) = outline else {
+        let Some(BatchOutline { document, items, mapper, held }) = outline else {
             let held = memory.try_take(document::parsed_bytes(body) as u64)?;
-            return Ok(Self { document: document::parse(body)?, read: None, _held: Some(held) });
+            return Ok(Self { document: document::parse(body)?, read: None, held: Some(held) });
         };
         let as_item = |(document, demonstration)| Item { document, demonstration: Some(demonstration) };
-        Ok(Self { document, read: Some((mapper, items.into_iter().map(as_item).collect())), _held: None })
+        Ok(Self { document, read: Some((mapper, items.into_iter().map(as_item).collect())), held })
     }
 
     /// Whether it can be followed by this model.
@@ -202,7 +207,8 @@ struct Batch {
     /// What an item has unless it has its own.
     options: Map<String, Value>,
     memory: Memory,
-    _document_held: Option<Held>,
+    /// For what waits.
+    _sent_held: Option<Held>,
     /// What the answer takes.
     answer: Mutex<Answer>,
     /// The items that wait, with their places in the batch.
@@ -216,7 +222,7 @@ impl Batch {
     /// Reads all but the items against the model.
     fn read(sent: SentBatch, envelope: Envelope, named: Named, memory: Memory) -> Result<Self, ServiceError> {
         let Envelope { model, over_limits: mut faults, .. } = envelope;
-        let SentBatch { mut document, read, _held: document_held } = sent;
+        let SentBatch { mut document, read, held } = sent;
         let Named { learner, model_hash, mapper } = named;
         let root = Place::root(&document);
         let object = root.object(&BATCH_FIELDS, &mut faults);
@@ -252,9 +258,9 @@ impl Batch {
             weights_version: learner.as_ref().map(|ready| ready.weights.version),
             ..Stamp::default()
         };
-        let answer = Mutex::new(Answer { held: memory.try_take(0)?, n_bytes: 0, is_full: false });
+        let answer = Mutex::new(Answer { held: None, n_bytes: 0, n_other_bytes: 0, is_full: false });
         let waiting = Mutex::new(items.into_iter().enumerate());
-        Ok(Self { _document_held: document_held, mapper, stamp, weights, options, memory, answer, waiting })
+        Ok(Self { _sent_held: held, mapper, stamp, weights, options, memory, answer, waiting })
     }
 
     /// Follows items that wait, one after the other, until a slice is over. Nothing if none waits any more.
@@ -266,7 +272,7 @@ impl Batch {
             let Some((n, item)) = next else { break };
             let searched =
                 if self.answer().is_full { Err(ServiceError::BatchFull) } else { self.follow(n, item, interrupt)? };
-            let taken_in = searched.and_then(|searched| self.answer().take_in(searched));
+            let taken_in = self.answer().take_in(searched, &self.memory);
             // With less in it, the next batch may have room for it.
             let taken_in = taken_in.map_err(|error| match error {
                 ServiceError::NoRoom(_) => ServiceError::BatchFull,
@@ -296,6 +302,11 @@ impl Batch {
             return Ok(Err(faults.into()));
         }
         let document = self.as_single(document);
+        let unread = if demonstration.is_none() { n_observations(&document) } else { 0 };
+        let _demonstration_held = match take_for_demonstration(self.mapper.model(), unread, &self.memory) {
+            Ok(held) => held,
+            Err(no_room) => return Ok(Err(no_room.into())),
+        };
         let request = document.as_object().and_then(|members| {
             let (model, object) = (self.mapper.model(), Object { members, path });
             let base = |_: &mut Faults| Some(self.weights.clone());
@@ -311,7 +322,7 @@ impl Batch {
         };
         let stamp = Stamp { id: Some(Uuid::now_v7().to_string()), ..self.stamp.clone() };
         let place = Path::Member(&path, "demonstration");
-        follow(&self.mapper, request, (&document, &place), stamp, Some(&self.memory), interrupt)
+        follow(&self.mapper, request, (&document, &place), stamp, &self.memory, Extent::Any, interrupt)
     }
 
     /// The item as a request of its own.
@@ -329,23 +340,43 @@ impl Batch {
 /// What the answer to a batch takes.
 #[derive(Debug)]
 struct Answer {
-    /// For the policies as they will be answered, as they will be stored, and as they are put together.
-    held: Held,
+    /// For the policies as they will be answered, as they will be stored, and as they are put together; for what is to be refined, and
+    /// for what is wrong.
+    held: Option<Held>,
+    /// Of the policies.
     n_bytes: usize,
+    /// For the rest.
+    n_other_bytes: usize,
     is_full: bool,
 }
 
 impl Answer {
-    /// Takes in a policy, if the answer has room for it.
-    fn take_in(&mut self, searched: Searched) -> Result<Searched, ServiceError> {
+    /// Takes in what became of an item, if the answer has room for it.
+    fn take_in(&mut self, searched: Result<Searched, ServiceError>, memory: &Memory) -> Result<Searched, ServiceError> {
         const N_COPIES: usize = 3;
-        let n_bytes = self.n_bytes + searched.policy.len();
-        self.is_full |= n_bytes > MAX_ANSWER_BYTES || self.held.grow_to((N_COPIES * n_bytes) as u64).is_err();
-        if self.is_full {
-            return Err(ServiceError::BatchFull);
+        /// As it is told, and as it is put together.
+        const PROBLEM_BYTES: usize = 1024;
+        let (n_bytes, n_other_bytes) = match &searched {
+            Ok(Searched { policy, refinement, .. }) => {
+                (policy.len(), refinement.as_ref().map_or(0, |refinement| refinement.request.len()))
+            }
+            Err(ServiceError::Faults(faults)) => (0, PROBLEM_BYTES + N_COPIES * faults.size_bytes()),
+            Err(_) => (0, PROBLEM_BYTES),
+        };
+        let (n_bytes, n_other_bytes) = (self.n_bytes + n_bytes, self.n_other_bytes + n_other_bytes);
+        let no_room = memory.hold(&mut self.held, N_COPIES * n_bytes + n_other_bytes).is_err();
+        self.is_full |= no_room || n_bytes > MAX_ANSWER_BYTES;
+        match searched {
+            Ok(searched) if !self.is_full => {
+                (self.n_bytes, self.n_other_bytes) = (n_bytes, n_other_bytes);
+                Ok(Searched { held: None, ..searched })
+            }
+            Err(error) if !no_room => {
+                self.n_other_bytes = n_other_bytes;
+                Err(error)
+            }
+            _ => Err(ServiceError::BatchFull),
         }
-        self.n_bytes = n_bytes;
-        Ok(searched)
     }
 }
 
@@ -557,5 +588,31 @@ mod tests {
             let text = format!(r#"{{{options}"items": {items}, "model": "figure-4"}}"#);
             assert_eq!(follow(&text, &mapper, true), follow(&text, &mapper, false), "{text}");
         }
+    }
+
+    #[test]
+    fn what_is_wrong_with_items_takes_memory_too() {
+        let mapper = mapper();
+        let item = format!(r#"{{"demonstration": [{}]}}"#, vec!["9"; 500].join(","));
+        let text = format!(r#"{{"model": "figure-4", "items": [{}]}}"#, vec![item.as_str(); 100].join(","));
+        let told = |room: u64| {
+            let memory = Memory::with_room(room);
+            let sent = SentBatch::read(text.as_bytes(), &|_| None, &Memory::with_room(1 << 30)).unwrap();
+            let (envelope, _) = Envelope::read(&sent.document, &BATCH_FIELDS, "items");
+            let named = Named { learner: None, model_hash: "hash".to_owned(), mapper: Arc::clone(&mapper) };
+            let batch = Batch::read(sent, envelope.unwrap(), named, memory.clone()).unwrap();
+            let mut n_told = 0;
+            loop {
+                let slice = batch.run_slice(&mut Uninterrupted).unwrap();
+                if slice.is_empty() {
+                    return (n_told, room - memory.free());
+                }
+                n_told += slice.iter().filter(|(_, outcome)| matches!(outcome, Err(ServiceError::Faults(_)))).count();
+            }
+        };
+        let (n_told, taken) = told(1 << 30);
+        assert!(n_told == 100 && taken > 100 * 500 * 200, "{n_told}, {taken}");
+        let (n_told, taken) = told(taken / 2);
+        assert!((10..60).contains(&n_told), "{n_told}, {taken}");
     }
 }

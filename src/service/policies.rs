@@ -1,11 +1,13 @@
 //! Policies: searched, stored, read.
 
+use std::io;
 use std::num::NonZeroU32;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
-use serde::Serialize;
+use serde::ser::SerializeMap;
+use serde::{Serialize, Serializer};
 use serde_json::Value;
 use serde_json::value::RawValue;
 use uuid::Uuid;
@@ -16,7 +18,7 @@ use super::{Admission, Caller, Etude, ServiceError};
 use crate::attribute::Weights;
 use crate::document::{self, Faults, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt, time_until_finish};
-use crate::mapping::{Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
+use crate::mapping::{Demonstration, Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::model::Model;
 use crate::store::{NewPolicy, NewRefinement, Page, PolicySummaryRow, StoreError};
@@ -32,6 +34,8 @@ pub struct MadePolicy {
     pub id: String,
     /// The policy: JSON.
     pub policy: String,
+    /// For the policy, and as much again while it is written into an answer, if it is much.
+    pub held: Option<Held>,
 }
 
 impl Etude {
@@ -59,13 +63,13 @@ impl Etude {
             }
             None => self.search_at_length(body, &id, caller).await?,
         };
-        let Searched { policy, row, refinement, held: _held } = searched;
+        let Searched { policy, row, refinement, held } = searched;
         let is_refined = refinement.is_some();
         self.store.add_policies(vec![row.at(caller.now)], refinement.into_iter().collect()).await?;
         if is_refined {
             self.refiner.wake();
         }
-        Ok(MadePolicy { id, policy })
+        Ok(MadePolicy { id, policy, held })
     }
 
     /// Searches for the policy of a request that is well-formed in all its parts, and for which [`is_quick`]. Nothing for others, of
@@ -103,7 +107,8 @@ impl Etude {
                 Request::read_beside(Some(demonstration), model, &object, base, &mut faults)
             });
             let Ok(request) = faults.check(request) else { return Ok(Ok(None)) };
-            let searched = follow(mapper, request, (&document, &DEMONSTRATION), stamp, None, interrupt)?;
+            let document = (&document, &DEMONSTRATION);
+            let searched = follow(mapper, request, document, stamp, &self.memory, Extent::Quick, interrupt)?;
             Ok(searched.map(Some))
         };
         self.pool.run_here(deadline, job)?
@@ -209,19 +214,22 @@ impl Etude {
     }
 }
 
+/// Bodies up to this size take little once they are parsed, whatever is in them: some 300 KiB.
+const MAX_UNCOUNTED_BODY_BYTES: usize = 4096;
+
 /// Parses a body, by its `place` in the pool if it is large: without waiting for searches, as how long it may wait is written in it. What
-/// a large one takes is held as well.
+/// it takes is held as well, unless that is little.
 pub(super) async fn parse(
     body: impl AsRef<[u8]> + Send + 'static,
     place: &Admission,
     memory: &Memory,
 ) -> Result<(Value, Option<Held>), ServiceError> {
-    if body.as_ref().len() <= MAX_INLINE_BYTES {
-        return Ok((document::parse(body.as_ref())?, None));
-    }
-    let held = memory.try_take(document::parsed_bytes(body.as_ref()) as u64)?;
-    let document = place.run_reading(body.as_ref().len(), move || document::parse(body.as_ref())).await??;
-    Ok((document, Some(held)))
+    let n_bytes = body.as_ref().len();
+    let is_counted = n_bytes > MAX_UNCOUNTED_BODY_BYTES;
+    let held = is_counted.then(|| memory.try_take(document::parsed_bytes(body.as_ref()) as u64)).transpose()?;
+    let parse = move || document::parse(body.as_ref());
+    let document = if n_bytes <= MAX_INLINE_BYTES { parse()? } else { place.run_reading(n_bytes, parse).await?? };
+    Ok((document, held))
 }
 
 /// What must be known of a request before its model is at hand.
@@ -291,9 +299,31 @@ pub(super) fn is_quick(model: &Model, document: &Value, n_observations: usize) -
         && n_observations <= max_quick_observations(model)
 }
 
-/// Most observations of a request that is quick, whose answer has a state for each of them.
+/// Most observations of a request that is quick, whose answer has a state for each of them. They take as little memory.
 pub(super) fn max_quick_observations(model: &Model) -> usize {
-    MAX_INLINE_BYTES / model.state_bytes().max(1)
+    MAX_INLINE_BYTES / model.state_bytes().max(Demonstration::bytes_of(model.schema(), 1)).max(1)
+}
+
+/// Takes what `n_observations` need once they are read, if that is much and they may be so many.
+pub(super) fn take_for_demonstration(
+    model: &Model,
+    n_observations: usize,
+    memory: &Memory,
+) -> Result<Option<Held>, NoRoom> {
+    let mut held = None;
+    if n_observations <= Policy::max_observations(model).min(Demonstration::MAX_OBSERVATIONS) {
+        memory.hold(&mut held, Demonstration::bytes_of(model.schema(), n_observations))?;
+    }
+    Ok(held)
+}
+
+/// How much of a search there is to be counted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Extent {
+    /// Nothing but a large policy, as [`is_quick`].
+    Quick,
+    /// Anything.
+    Any,
 }
 
 /// Where a request's demonstration is.
@@ -344,24 +374,30 @@ pub(super) fn search(
     memory: &Memory,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
+    let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
+    let _demonstration_held = match take_for_demonstration(mapper.model(), n_observations, memory) {
+        Ok(held) => held,
+        Err(no_room) => return Ok(Err(no_room.into())),
+    };
     match read_request(mapper.model(), document, fields, faults, base) {
-        Ok(request) => follow(mapper, request, (document, &DEMONSTRATION), stamp, Some(memory), interrupt),
+        Ok(request) => follow(mapper, request, (document, &DEMONSTRATION), stamp, memory, Extent::Any, interrupt),
         Err(faults) => Ok(Err(faults.into())),
     }
 }
 
-/// Searches with what it needs of `memory` (nothing is counted for a search that is quick), and writes the policy, unless that is too
-/// large. The request was read from the document, its demonstration from the place there that a fault would name.
+/// Searches with what it needs of `memory`, and writes the policy, unless that is too large. The request was read from the document, its demonstration from the place there that a fault would name.
 pub(super) fn follow(
     mapper: &Arc<Mapper>,
     mut request: Request<'_>,
     (document, place): (&Value, &Path<'_>),
     stamp: Stamp,
-    memory: Option<&Memory>,
+    memory: &Memory,
+    extent: Extent,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
     let started = Instant::now();
-    let searching = match memory.map(|memory| take_for_search(mapper, &mut request, memory)).transpose() {
+    let is_counted = extent == Extent::Any;
+    let searching = match is_counted.then(|| take_for_search(mapper, &mut request, memory)).transpose() {
         Ok(held) => held,
         Err(no_room) => return Ok(Err(no_room.into())),
     };
@@ -375,31 +411,95 @@ pub(super) fn follow(
         return Ok(Err(faults.into()));
     }
     // As it will be answered, and as it will be stored.
-    let n_bytes = 2 * Policy::steps_bytes(mapper.model(), &mapping);
-    let held =
-        match memory.filter(|_| n_bytes > MAX_INLINE_BYTES).map(|memory| memory.try_take(n_bytes as u64)).transpose() {
-            Ok(held) => held,
-            Err(no_room) => return Ok(Err(no_room.into())),
-        };
-    if memory.is_some_and(|memory| memory.free_for_large() < memory.room() / 4) {
+    const N_COPIES: usize = 2;
+    let n_bytes = N_COPIES * Policy::steps_bytes(mapper.model(), &mapping);
+    let mut held = None;
+    if let Err(no_room) = memory.hold(&mut held, n_bytes) {
+        return Ok(Err(no_room.into()));
+    }
+    if is_counted && memory.free_for_large() < memory.room() / 4 {
         mapper.release();
     }
     let refinement = (mapping.status == Status::Local).then(|| {
-        let mut request_for_refined = document.clone();
-        // The weights that are used, wherever they came from.
-        request_for_refined["weights"] = serde_json::json!(request.problem.named_weights());
-        // The optimum does not depend on how it is searched for, and nobody waits for it.
-        for name in ["learner", "lookahead", "heuristic", "max_expansions", "deadline_ms"] {
-            request_for_refined[name] = Value::Null;
-        }
-        NewRefinement {
+        let mut text = CountedText { text: Vec::new(), memory, held: &mut held, n_others: n_bytes, refused: None };
+        let written = serde_json::to_writer(&mut text, &RefinedRequest { document, request: &request });
+        let text = text.end(written)?;
+        Ok::<_, ServiceError>(NewRefinement {
             policy_id: stamp.id.clone().unwrap_or_default(),
             model_hash: stamp.model_hash.clone(),
-            request: request_for_refined.to_string(),
-        }
+            request: text,
+        })
     });
-    let written = write_policy(stamp, &request.problem, &mapping);
-    Ok(written.map(|(policy, row)| Searched { policy, row, refinement, held }))
+    let written = refinement.transpose().and_then(|refinement| {
+        let (policy, row) = write_policy(stamp, &request.problem, &mapping)?;
+        // What was estimated may have been too little.
+        let n_bytes = N_COPIES * policy.len() + refinement.as_ref().map_or(0, |refinement| refinement.request.len());
+        memory.hold(&mut held, n_bytes)?;
+        Ok(Searched { policy, row, refinement, held })
+    });
+    Ok(written)
+}
+
+/// The request for the policy that refines the one of `request`, which was read from `document`.
+struct RefinedRequest<'r> {
+    document: &'r Value,
+    request: &'r Request<'r>,
+}
+
+impl Serialize for RefinedRequest<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        /// The optimum does not depend on how it is searched for, and nobody waits for it. The weights are those that were used, wherever
+        /// they came from.
+        const LEFT_OUT: [&str; 6] = ["learner", "lookahead", "heuristic", "max_expansions", "deadline_ms", "weights"];
+        let mut members = serializer.serialize_map(None)?;
+        let sent = self.document.as_object().into_iter().flatten();
+        for (name, value) in sent.filter(|(name, _)| !LEFT_OUT.contains(&name.as_str())) {
+            members.serialize_entry(name, value)?;
+        }
+        members.serialize_entry("weights", &self.request.problem.named_weights())?;
+        members.end()
+    }
+}
+
+/// Text that is written, for which memory is taken as it grows.
+struct CountedText<'m> {
+    text: Vec<u8>,
+    memory: &'m Memory,
+    held: &'m mut Option<Held>,
+    /// What is held for something else.
+    n_others: usize,
+    refused: Option<NoRoom>,
+}
+
+impl CountedText<'_> {
+    /// The text, if it was `written`.
+    fn end(self, written: serde_json::Result<()>) -> Result<String, ServiceError> {
+        if let Some(no_room) = self.refused {
+            return Err(no_room.into());
+        }
+        let text = written.and_then(|()| String::from_utf8(self.text).map_err(serde::ser::Error::custom));
+        text.map_err(ServiceError::Write)
+    }
+}
+
+impl io::Write for CountedText<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        /// As it is copied to where it has room, twice as much.
+        const COPIES: usize = 3;
+        let n_bytes = self.text.len() + bytes.len();
+        if n_bytes > self.text.capacity()
+            && let Err(no_room) = self.memory.hold(self.held, self.n_others + COPIES * n_bytes)
+        {
+            self.refused = Some(no_room);
+            return Err(io::ErrorKind::OutOfMemory.into());
+        }
+        self.text.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
 }
 
 /// Takes the memory that a search may need, and lets the search use no more than that: a quarter of what is left at most, so that others
@@ -464,4 +564,117 @@ pub(super) fn as_micros(since: Instant) -> u64 {
 
 pub(super) fn write(document: &impl Serialize) -> Result<String, ServiceError> {
     serde_json::to_string(document).map_err(ServiceError::Write)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+    use tokio_util::sync::CancellationToken;
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::interrupt::Uninterrupted;
+    use crate::model::{Definition, Format, Limits};
+    use crate::service::{Client, ModelText, Name, PoolSettings, Settings, TimeLimits};
+
+    fn caller() -> Caller {
+        Caller { client: Client::LOCAL, arrived: Instant::now(), now: Timestamp::UNIX_EPOCH }
+    }
+
+    /// A service that has `model`, called `m`.
+    async fn etude(directory: &std::path::Path, model: &Value) -> Etude {
+        let settings = Settings {
+            database: directory.join("etude.db"),
+            limits: Limits::DEFAULT,
+            memory: Memory::with_room(1 << 30),
+            model_cache_bytes: 1 << 20,
+            session_idle_timeout: Duration::MAX,
+            time_limits: TimeLimits::DEFAULT,
+            pool: PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
+        };
+        let etude = Etude::open(&settings, &TaskTracker::new(), CancellationToken::new()).await.unwrap();
+        let text = ModelText::Whole(model.to_string().into_bytes());
+        etude.put_model(&Name::new("m").unwrap(), text, Format::Json, caller()).await.unwrap();
+        etude
+    }
+
+    /// A line of so many states, to whose end leads a policy of as many steps.
+    fn line(n_states: usize) -> Value {
+        let states: Vec<_> = (0..n_states).map(|state| json!([u8::from(state + 1 == n_states)])).collect();
+        let transitions: Vec<_> = (1..n_states).map(|state| json!([state - 1, "on", state])).collect();
+        json!({
+            "attributes": [{"name": "end", "kind": "number", "weight": 1e9}], "actions": [{"name": "on", "cost": 0.3}],
+            "dynamics": {"kind": "table", "start": 0, "states": states, "transitions": transitions},
+        })
+    }
+
+    #[tokio::test]
+    async fn a_policy_that_cannot_be_answered_is_not_stored() {
+        let directory = tempfile::tempdir().unwrap();
+        let etude = etude(directory.path(), &line(1000)).await;
+        let body = json!({"model": "m", "demonstration": [{}, {"end": 1}]}).to_string();
+        let large = etude.memory.try_take(etude.memory.free_for_large()).unwrap();
+        let small: Vec<_> = std::iter::from_fn(|| etude.memory.try_take(SMALL_BYTES).ok()).collect();
+        let refused = etude.make_policy(body.clone().into_bytes(), caller()).await;
+        assert!(matches!(refused, Err(ServiceError::NoRoom(_))), "{refused:?}");
+        assert_eq!(etude.policies(0, 10).await.unwrap().items.len(), 0);
+        drop((large, small));
+        let free = etude.memory.free();
+        let made = etude.make_policy(body.into_bytes(), caller()).await.unwrap();
+        assert!(made.policy.len() > 64 << 10 && free - etude.memory.free() >= made.policy.len() as u64);
+        drop(made);
+        assert_eq!(etude.memory.free(), free);
+    }
+
+    #[tokio::test]
+    async fn a_small_body_that_becomes_much_is_counted() {
+        let pool = crate::service::SearchPool::new(
+            PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
+            TaskTracker::new(),
+            CancellationToken::new(),
+        );
+        let (place, memory) = (pool.admit_when_needed(Client::LOCAL), Memory::with_room(1 << 30));
+        let (_, held) = parse(
+            vec![b' '; MAX_UNCOUNTED_BODY_BYTES - 4].into_iter().chain(*b"null").collect::<Vec<_>>(),
+            &place,
+            &memory,
+        )
+        .await
+        .unwrap();
+        assert!(held.is_none());
+        let body = format!("[{}]", vec![r#"{"":0}"#; 5000].join(","));
+        let (_, held) = parse(body.clone(), &place, &memory).await.unwrap();
+        assert!(body.len() < MAX_INLINE_BYTES && held.unwrap().n_bytes() > 5000 * 600);
+        assert!(parse(body, &place, &Memory::with_room(1 << 20)).await.is_err());
+    }
+
+    #[test]
+    fn what_is_to_be_refined_is_counted() {
+        let model = json!({
+            "attributes": [{"name": "x", "kind": "number"}, {"name": "door", "kind": "category"}],
+            "actions": [{"name": "on"}, {"name": "back"}],
+            "dynamics": {
+                "kind": "table", "states": (0..9).map(|x| json!([x, "open"])).collect::<Vec<_>>(),
+                "transitions": (1..9).flat_map(|x| [json!([x - 1, "on", x]), json!([x, "back", x - 1])]).collect::<Vec<_>>(),
+            },
+        });
+        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap());
+        let document = json!({
+            "model": "m", "demonstration": (0..100).map(|n| json!({"x": n % 4 * 2, "door": "x".repeat(1000)})).collect::<Vec<_>>(), "lookahead": 1, "deadline_ms": 1000,
+        });
+        let search = |memory: &Memory| {
+            let (fields, stamp) = ((&document, &Request::FIELDS[..], Faults::default()), Stamp::default());
+            let base = |_: &mut Faults| Some(mapper.model().schema().weights());
+            search(&mapper, fields, base, stamp, memory, &mut Uninterrupted).unwrap()
+        };
+        let searched = search(&Memory::with_room(1 << 30)).unwrap();
+        let request = searched.refinement.unwrap().request;
+        assert!(searched.policy.len() < 64 << 10 && searched.held.unwrap().n_bytes() > 100_000);
+        let written: Value = serde_json::from_str(&request).unwrap();
+        let expected =
+            json!({"model": "m", "demonstration": document["demonstration"], "weights": {"x": 1.0, "door": 1.0}});
+        assert_eq!(written, expected);
+    }
 }

@@ -19,7 +19,9 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::policies::{PolicyText, as_micros, read_weighted_request, report, take_for_search, write_policy};
+use super::policies::{
+    PolicyText, as_micros, read_weighted_request, report, take_for_demonstration, take_for_search, write_policy,
+};
 use super::{Etude, PoolError, ServiceError};
 use crate::document;
 use crate::interrupt::{Cancelled, Interrupt, Signal};
@@ -209,6 +211,11 @@ fn optimum(
     memory: &Memory,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Option<PolicyText>, ServiceError>, Cancelled> {
+    let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
+    let _demonstration_held = match take_for_demonstration(mapper.model(), n_observations, memory) {
+        Ok(held) => held,
+        Err(no_room) => return Ok(Err(no_room.into())),
+    };
     let mut request = match read_weighted_request(mapper.model(), document) {
         Ok(request) => request,
         Err(faults) => return Ok(Err(faults.into())),

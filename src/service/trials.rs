@@ -16,6 +16,7 @@ use crate::attribute::{Schema, Weights};
 use crate::document::{Faults, Path, Place, Range};
 use crate::interrupt::Interrupt;
 use crate::mapping::Stamp;
+use crate::memory::Held;
 use crate::store::{FailTrial, NewReward, NewTrial, Page, PutReward, Store, StoreError, TrialRow, TrialStatus};
 
 /// Longest reason for a failure, in characters.
@@ -30,6 +31,8 @@ pub struct TrialAnswer {
     pub status: TrialStatus,
     /// Its policy: JSON. Not in lists.
     pub policy: Option<Box<RawValue>>,
+    /// For the policy, and as much again while it is written into an answer, if it is much.
+    pub held: Option<Held>,
 }
 
 impl Etude {
@@ -100,7 +103,7 @@ impl Etude {
             Ok(searched.map(|searched| (searched, drawn)))
         };
         let made = if is_quick { self.pool.run_here(deadline, job)? } else { place.run(deadline, job).await? };
-        let (Searched { policy, row, refinement, held: _held }, drawn) = made?;
+        let (Searched { policy, row, refinement, held }, drawn) = made?;
         drop(place);
         let (number, weights) = drawn.ok_or(StoreError::Closed)?;
         let weights = weights?;
@@ -141,7 +144,7 @@ impl Etude {
             learned_version: None,
         };
         let policy = Some(read_policy(policy, &row.policy_id)?);
-        Ok(TrialAnswer { row, status: TrialStatus::Active, policy })
+        Ok(TrialAnswer { row, status: TrialStatus::Active, policy, held })
     }
 
     /// Draws a trial for a policy that is still in the making. The caller stores it.
@@ -178,7 +181,7 @@ impl Etude {
         let row = self.store.trial(id).await?.ok_or_else(|| unknown_trial(id))?;
         let policy = self.store.policy(&row.policy_id).await?;
         let policy = policy.map(|policy| read_policy(policy, &row.policy_id)).transpose()?;
-        Ok(TrialAnswer { status: row.status(now), row, policy })
+        Ok(TrialAnswer { status: row.status(now), row, policy, held: None })
     }
 
     /// At most `limit` trials of a learner in the order of their numbers, from the first after the number `after`; only those
@@ -197,7 +200,7 @@ impl Etude {
     ) -> Result<Page<TrialAnswer>, ServiceError> {
         let learner = self.learner_row(name).await?.sequence;
         let page = self.store.trials(learner, status, now, after, limit).await?;
-        Ok(page.map(|row| TrialAnswer { status: row.status(now), row, policy: None }))
+        Ok(page.map(|row| TrialAnswer { status: row.status(now), row, policy: None, held: None }))
     }
 
     /// Accepts the reward in `body` (JSON) for a trial; durable when this returns. The same reward again changes nothing.
@@ -233,7 +236,7 @@ impl Etude {
             PutReward::Failed => return Err(ServiceError::TrialFailed { trial: id.to_owned() }),
             PutReward::Unknown => return Err(unknown_trial(id)),
         };
-        Ok(TrialAnswer { status: row.status(now), row, policy: None })
+        Ok(TrialAnswer { status: row.status(now), row, policy: None, held: None })
     }
 
     /// Ends a trial without a reward, for the reason in `body` (JSON).
@@ -257,7 +260,7 @@ impl Etude {
         });
         let reason = faults.check(reason)?;
         match self.store.fail_trial(id, reason).await? {
-            FailTrial::Failed(row) => Ok(TrialAnswer { status: row.status(now), row, policy: None }),
+            FailTrial::Failed(row) => Ok(TrialAnswer { status: row.status(now), row, policy: None, held: None }),
             FailTrial::Conflict { .. } => Err(ServiceError::TrialFailed { trial: id.to_owned() }),
             FailTrial::Rewarded { existing } => Err(ServiceError::AlreadyRewarded { trial: id.to_owned(), existing }),
             FailTrial::Unknown => Err(unknown_trial(id)),
