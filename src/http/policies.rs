@@ -104,7 +104,8 @@ pub(super) async fn make_policies(
     ),
 )]
 pub(super) async fn get_policy(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
-    Ok(json_text(StatusCode::OK, context.etude.policy(&id).await?))
+    let (policy, held) = context.etude.policy(&id).await?;
+    Ok(answer::counted(json_text(StatusCode::OK, policy), held))
 }
 
 /// Policies without their steps, oldest first.

@@ -63,5 +63,5 @@ pub use request::{
     ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,
 };
 pub use search::{Move, MoveKind};
-pub(crate) use written::read_answer;
+pub(crate) use written::StoredPolicy;
 pub use written::{WriteError, WrittenPolicy};

@@ -7,7 +7,7 @@
 //! ```text
 //! Mapping --> summary, ShortSteps --> answer
 //!                |         |
-//!              store     store --> read_answer: the same bytes
+//!              store     store --> StoredPolicy: the same bytes
 //! ```
 
 use std::ops::Range;
@@ -73,7 +73,7 @@ impl WrittenPolicy {
         let mut text = Vec::with_capacity(SUMMARY_BYTES + weights.iter().count() * WEIGHT_BYTES);
         serde_json::to_writer(&mut text, &summary)?;
         let summary = String::from_utf8(text).map_err(serde_json::Error::custom)?;
-        let answer = answer(&summary, weights.iter().map(|(name, _)| name), &short)?;
+        let answer = answer(&summary, weights.iter().map(|(name, _)| name), &short, None)?;
         Ok(Self { answer, steps: short.pack()?, summary })
     }
 }
@@ -92,18 +92,76 @@ pub enum WriteError {
     Missing(&'static str),
 }
 
-/// The policy with this summary and these steps in short, as it was answered: JSON.
-///
-/// # Errors
-///
-/// If one of the two is not what this program writes.
-pub(crate) fn read_answer(summary: &str, steps: &[u8]) -> Result<String, WriteError> {
-    #[derive(Deserialize)]
-    struct Weights {
-        weights: ByAttribute<IgnoredAny>,
+/// A policy as it is stored, about to be written as it was answered.
+pub(crate) struct StoredPolicy<'s> {
+    summary: &'s str,
+    weights: ByAttribute<IgnoredAny>,
+    short: ShortSteps<'s>,
+}
+
+impl<'s> StoredPolicy<'s> {
+    /// The policy with this summary and these steps in short.
+    ///
+    /// # Errors
+    ///
+    /// If one of the two is not what this program writes.
+    pub(crate) fn read(summary: &'s str, steps: &'s [u8]) -> Result<Self, WriteError> {
+        #[derive(Deserialize)]
+        struct Weights {
+            weights: ByAttribute<IgnoredAny>,
+        }
+        let Weights { weights } = serde_json::from_str(summary)?;
+        Ok(Self { summary, weights, short: postcard::from_bytes(steps)? })
     }
-    let Weights { weights } = serde_json::from_str(summary)?;
-    answer(summary, weights.iter().map(|(name, _)| name), &postcard::from_bytes(steps)?)
+
+    fn names(&self) -> impl Iterator<Item = &str> {
+        self.weights.iter().map(|(name, _)| name)
+    }
+
+    /// Most bytes of its answer, with what a link to another policy needs: hardly more than there are.
+    ///
+    /// # Errors
+    ///
+    /// If what is stored is not what this program writes.
+    pub(crate) fn answer_bytes(&self) -> Result<usize, WriteError> {
+        /// The names of members, and numbers at their longest.
+        const STEP_BYTES: usize = 240;
+        const NUMBER_BYTES: usize = 25;
+        /// What is between the summary and the steps, and a link.
+        const OTHER_BYTES: usize = 256;
+        let pieces = Pieces::of(self.names(), &self.short.actions)?;
+        let mut value_bytes = vec![0; pieces.names.len()];
+        let mut state_bytes: usize = pieces.names.iter().map(|name| name.len() + 1).sum();
+        let (mut changed, mut terms) = (self.short.changed.iter(), self.short.terms.iter());
+        let (mut term_bytes, mut n_bytes) = (0, self.summary.len() + OTHER_BYTES);
+        for step in &self.short.steps {
+            for (position, n_bytes) in changed.by_ref().take(step.n_changed as usize) {
+                let value = value_bytes.get_mut(*position as usize).ok_or(WriteError::Missing("an attribute"))?;
+                let before = std::mem::replace(value, *n_bytes as usize);
+                state_bytes = state_bytes - before + *value;
+            }
+            if let Some(n_terms) = step.n_terms {
+                term_bytes = 0;
+                for (position, _) in terms.by_ref().take(n_terms as usize) {
+                    term_bytes += pieces.name(*position as usize)?.len() + NUMBER_BYTES;
+                }
+            }
+            let action = step.action.map(|place| pieces.action(place)).transpose()?;
+            // Once in its step, and once among the actions.
+            let action_bytes = action.map_or(0, |(name, cost)| 2 * name.len() + cost.len());
+            n_bytes = n_bytes.saturating_add(STEP_BYTES + state_bytes + term_bytes + action_bytes);
+        }
+        Ok(n_bytes)
+    }
+
+    /// The policy as it was answered (JSON), in room for so many bytes.
+    ///
+    /// # Errors
+    ///
+    /// If what is stored is not what this program writes.
+    pub(crate) fn answer(&self, n_bytes: usize) -> Result<String, WriteError> {
+        answer(self.summary, self.names(), &self.short, Some(n_bytes))
+    }
 }
 
 /// The steps of a policy, in short. What some steps have more of than others stands together, in the order of the steps.
@@ -231,17 +289,18 @@ fn count(n: usize) -> u32 {
 }
 
 /// Writes a policy as it is answered: its summary, with the actions and the steps before the coverage. `names` are those of the
-/// attributes.
+/// attributes. Begins with room for `n_bytes`, or for about as many as it takes.
 fn answer<'n>(
     summary: &str,
     names: impl Iterator<Item = &'n str>,
     short: &ShortSteps<'_>,
+    n_bytes: Option<usize>,
 ) -> Result<String, WriteError> {
     /// What comes after the steps. No string in JSON has a quote that is not escaped, and no weight is an object.
     const AFTER: &str = r#""coverage":{"#;
     let (before, after) = summary.split_at(summary.rfind(AFTER).ok_or(WriteError::Missing("a coverage"))?);
     let pieces = Pieces::of(names, &short.actions)?;
-    let mut writer = AnswerWriter::new(&pieces, summary.len(), short.steps.len())?;
+    let mut writer = AnswerWriter::new(&pieces, summary.len(), short.steps.len(), n_bytes)?;
     writer.raw(before);
     writer.raw(r#""actions":["#);
     for (n, place) in short.steps.iter().filter_map(|step| step.action).enumerate() {
@@ -354,13 +413,13 @@ struct StateValue<'p> {
 }
 
 impl<'p> AnswerWriter<'p> {
-    /// A writer of so many steps, with `n_bytes` around them.
-    fn new(pieces: &'p Pieces, n_bytes: usize, n_steps: usize) -> Result<Self, WriteError> {
+    /// A writer of so many steps, with `n_around` bytes around them, which are `n_bytes` in all if that is known.
+    fn new(pieces: &'p Pieces, n_around: usize, n_steps: usize, n_bytes: Option<usize>) -> Result<Self, WriteError> {
         /// About what a step takes, beside its state.
         const STEP_BYTES: usize = 192;
-        let state_bytes = pieces.names.iter().map(|name| name.len() + VALUE_BYTES).sum();
+        let state_bytes: usize = pieces.names.iter().map(|name| name.len() + VALUE_BYTES).sum();
         let mut writer = Self {
-            text: Vec::with_capacity(n_bytes + n_steps * (STEP_BYTES + state_bytes)),
+            text: Vec::with_capacity(n_bytes.unwrap_or(n_around + n_steps * (STEP_BYTES + state_bytes))),
             pieces,
             values: vec![StateValue::default(); pieces.names.len()],
             state: Vec::with_capacity(state_bytes),

@@ -170,13 +170,22 @@ pub enum ServiceError {
     },
     /// The store failed.
     #[error(transparent)]
-    Store(#[from] StoreError),
+    Store(StoreError),
     /// What was made could not be written as JSON: a defect.
     #[error("an answer could not be written")]
     Write(#[source] serde_json::Error),
     /// A policy could not be written: a defect.
     #[error("a policy could not be written")]
     WritePolicy(#[from] WriteError),
+}
+
+impl From<StoreError> for ServiceError {
+    fn from(error: StoreError) -> Self {
+        match error {
+            StoreError::NoRoom(no_room) => Self::NoRoom(no_room),
+            error => Self::Store(error),
+        }
+    }
 }
 
 /// The application.

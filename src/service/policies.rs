@@ -188,14 +188,14 @@ impl Etude {
         Err(faults.into())
     }
 
-    /// The policy with this id: JSON.
+    /// The policy with this id (JSON), and the memory that it takes, if that is much.
     ///
     /// # Errors
     ///
-    /// If there is none.
-    pub async fn policy(&self, id: &str) -> Result<String, ServiceError> {
+    /// If there is none, or no memory for it.
+    pub async fn policy(&self, id: &str) -> Result<(String, Option<Held>), ServiceError> {
         let unknown = || ServiceError::Unknown { kind: "policy", name: id.to_owned(), pointer: None };
-        self.store.policy(id).await?.ok_or_else(unknown)
+        self.store.policy_within(id, &self.memory).await?.ok_or_else(unknown)
     }
 
     /// At most `limit` policies without their steps (JSON), in the order in which they were stored, from the first after

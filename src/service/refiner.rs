@@ -15,6 +15,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
+use serde::Deserialize;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
@@ -25,7 +26,7 @@ use super::policies::{
 use super::{Etude, PoolError, ServiceError};
 use crate::document;
 use crate::interrupt::{Cancelled, Interrupt, Signal};
-use crate::mapping::{Mapper, Policy, Settings, Stamp, Status};
+use crate::mapping::{Cost, Mapper, Policy, Settings, Stamp, Status};
 use crate::memory::Memory;
 use crate::store::{MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError};
 
@@ -170,19 +171,31 @@ impl Etude {
     /// The refined policy; `None` if the budget does not suffice to find it.
     async fn refine(&self, refinement: NewRefinement) -> Result<Option<PolicyText>, ServiceError> {
         let NewRefinement { policy_id, model_hash, request } = refinement;
+        let mut held = None;
+        self.memory.hold(&mut held, request.len() + document::parsed_bytes(request.as_bytes()))?;
         let document = document::parse(request.as_bytes())?;
+        drop(request);
         let model = document["model"].as_str().unwrap_or_default().to_owned();
         let (hash, mapper) = self.mapper(&model, "/model", None, None).await?;
         if hash != model_hash {
             // Another one is there under its name.
             return Err(ServiceError::Unknown { kind: "model", name: model, pointer: None });
         }
-        let local: Policy = serde_json::from_str(&self.policy(&policy_id).await?).map_err(ServiceError::Write)?;
+        /// All that is wanted of the policy.
+        #[derive(Deserialize)]
+        struct Local {
+            cost: Cost,
+        }
+        let local: Local = {
+            let (local, _held) = self.policy(&policy_id).await?;
+            serde_json::from_str(&local).map_err(ServiceError::Write)?
+        };
         let id = Uuid::now_v7().to_string();
         let stamp = Stamp { id: Some(id), model, model_hash, refines: Some(policy_id), ..Stamp::default() };
         let local_cost = local.cost.total;
         let (memory, limit) = (self.memory.clone(), self.time_limits.max_deadline);
         let job = move |interrupt: &mut dyn Interrupt| {
+            let _held = held;
             let began = Instant::now();
             let mut limited = || if began.elapsed() < limit { interrupt.poll() } else { Signal::Finish };
             optimum(&mapper, &document, local_cost, stamp, &memory, &mut limited)
@@ -278,7 +291,7 @@ mod tests {
     }
 
     async fn read(etude: &Etude, id: &str) -> Value {
-        serde_json::from_str(&etude.policy(id).await.unwrap()).unwrap()
+        serde_json::from_str(&etude.policy(id).await.unwrap().0).unwrap()
     }
 
     #[tokio::test]

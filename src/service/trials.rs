@@ -179,9 +179,12 @@ impl Etude {
     /// If there is none.
     pub async fn trial(&self, id: &str, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
         let row = self.store.trial(id).await?.ok_or_else(|| unknown_trial(id))?;
-        let policy = self.store.policy(&row.policy_id).await?;
+        let (policy, held) = self.store.policy_within(&row.policy_id, &self.memory).await?.unzip();
         let policy = policy.map(|policy| read_policy(policy, &row.policy_id)).transpose()?;
-        Ok(TrialAnswer { status: row.status(now), row, policy, held: None })
+        // Once more in the answer.
+        let mut held = held.flatten();
+        self.memory.hold(&mut held, 2 * policy.as_ref().map_or(0, |policy| policy.get().len()))?;
+        Ok(TrialAnswer { status: row.status(now), row, policy, held })
     }
 
     /// At most `limit` trials of a learner in the order of their numbers, from the first after the number `after`; only those

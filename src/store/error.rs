@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use sqlx::migrate::MigrateError;
 
+use crate::memory::NoRoom;
+
 /// Why the store could not do as told.
 #[derive(Debug, thiserror::Error)]
 pub enum StoreError {
@@ -90,6 +92,9 @@ pub enum StoreError {
         #[source]
         source: Box<dyn std::error::Error + Send + Sync>,
     },
+    /// What is to be read takes more memory than there is.
+    #[error(transparent)]
+    NoRoom(#[from] NoRoom),
     /// What is read was removed while it was.
     #[error("it was removed while it was read")]
     Removed,

@@ -12,8 +12,9 @@ use sqlx::{AssertSqlSafe, Row, SqlSafeStr, SqlStr, SqliteConnection};
 use super::page::{Rest, Rows};
 use super::refinements::NewRefinement;
 use super::writer::Write;
-use super::{Page, Store, StoreError};
-use crate::mapping::read_answer;
+use super::{Page, Store, StoreError, as_integer};
+use crate::mapping::StoredPolicy;
+use crate::memory::{Held, Memory};
 
 /// A policy to be stored.
 #[derive(Clone, Debug)]
@@ -66,33 +67,82 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn policy(&self, id: &str) -> Result<Option<String>, StoreError> {
-        let query =
-            sqlx::query("SELECT summary, policy, steps, checksum, refined_by FROM policies WHERE id = $1").bind(id);
-        let Some(row) = query.fetch_optional(&mut *self.reader().await?).await? else { return Ok(None) };
-        match self.read_policy(&row).await {
-            Ok(policy) => Ok(Some(policy)),
-            Err(error) => Err(error.of_row("policies", id)),
-        }
+        /// Far more than any.
+        const ANY: u64 = 1 << 40;
+        Ok(self.policy_within(id, &Memory::with_room(ANY)).await?.map(|(policy, _)| policy))
     }
 
-    async fn read_policy(&self, row: &SqliteRow) -> Result<String, StoreError> {
+    /// The policy with this id, as it was answered (JSON), and what it takes of `memory`, if it is much: taken before it is read.
+    ///
+    /// # Errors
+    ///
+    /// [`StoreError::NoRoom`] if there is not so much, or if the database failed.
+    pub async fn policy_within(&self, id: &str, memory: &Memory) -> Result<Option<(String, Option<Held>)>, StoreError> {
+        /// As it is stored, and as it is read from that: steps in short take up to four times as much then.
+        const COPIES: usize = 6;
+        let read = async {
+            let Some(row) = self.policy_row(id, MAX_INLINE_BYTES).await? else { return Ok(None) };
+            let n_bytes = n_bytes_of(&row)?;
+            let mut held = None;
+            if n_bytes <= MAX_INLINE_BYTES {
+                return self.read_policy(&row, held, memory).await.map(Some);
+            }
+            memory.hold(&mut held, COPIES * n_bytes)?;
+            drop(row);
+            // Of what is stored, nothing but the link changes.
+            let Some(row) = self.policy_row(id, n_bytes).await? else { return Ok(None) };
+            self.read_policy(&row, held, memory).await.map(Some)
+        };
+        read.await.map_err(|error: StoreError| error.of_row("policies", id))
+    }
+
+    /// How many bytes are stored of a policy, and what that is, if it is no more than `max_bytes`.
+    async fn policy_row(&self, id: &str, max_bytes: usize) -> Result<Option<SqliteRow>, StoreError> {
+        let query = sqlx::query(
+            "SELECT n_bytes, checksum, refined_by, IIF(n_bytes <= $2, summary, '') AS summary,
+                 IIF(n_bytes <= $2, policy, '') AS policy, IIF(n_bytes <= $2, steps, NULL) AS steps
+             FROM (
+                 SELECT *, octet_length(summary) + octet_length(policy) + IFNULL(octet_length(steps), 0) AS n_bytes
+                 FROM policies WHERE id = $1
+             )",
+        );
+        let query = query.bind(id).bind(as_integer(max_bytes as u64));
+        Ok(query.fetch_optional(&mut *self.reader().await?).await?)
+    }
+
+    async fn read_policy(
+        &self,
+        row: &SqliteRow,
+        held: Option<Held>,
+        memory: &Memory,
+    ) -> Result<(String, Option<Held>), StoreError> {
         let steps: Option<Vec<u8>> = row.try_get("steps")?;
         let summary: String = row.try_get("summary")?;
         let stored = stored_checksum(row)?;
         let Some(steps) = steps else {
             let policy: String = row.try_get("policy")?;
-            return linked(policy, row);
+            let mut held = held;
+            if let Some(held) = &mut held {
+                held.shrink_to(policy.len() as u64);
+            }
+            return Ok((linked(policy, row)?, held));
         };
         if stored.is_some_and(|stored| stored != checksum(&summary, &steps)) {
             return Err(corrupt("checksum")("it is not that of the summary and the steps"));
         }
-        let answer = if steps.len() <= MAX_INLINE_BYTES {
-            read_answer(&summary, &steps)
-        } else {
-            let reading = self.tasks.spawn_blocking(move || read_answer(&summary, &steps));
-            reading.await.map_err(corrupt("steps"))?
-        };
-        linked(answer.map_err(corrupt("steps"))?, row)
+        if summary.len() + steps.len() <= MAX_INLINE_BYTES
+            && let Some((answer, held)) = write_answer(&summary, &steps, MAX_INLINE_ANSWER_BYTES, memory)?
+        {
+            return Ok((linked(answer, row)?, held));
+        }
+        let memory = memory.clone();
+        let writing = self.tasks.spawn_blocking(move || {
+            let _held = held;
+            write_answer(&summary, &steps, usize::MAX, &memory)
+        });
+        let written = writing.await.map_err(corrupt("steps"))??;
+        let (answer, held) = written.ok_or_else(|| corrupt("steps")("they are too many"))?;
+        Ok((linked(answer, row)?, held))
     }
 
     /// At most `limit` policies in the order in which they became durable, from the first after the sequence number
@@ -142,8 +192,36 @@ fn read_summary(row: &SqliteRow) -> Result<PolicySummaryRow, StoreError> {
     Ok(PolicySummaryRow { sequence: row.try_get("sequence")?, id: row.try_get("id")?, summary: linked(summary, row)? })
 }
 
+/// Writes a policy as it was answered, and takes what that needs of `memory`. Nothing if that may be more than `max_bytes`.
+fn write_answer(
+    summary: &str,
+    steps: &[u8],
+    max_bytes: usize,
+    memory: &Memory,
+) -> Result<Option<(String, Option<Held>)>, StoreError> {
+    let stored = StoredPolicy::read(summary, steps).map_err(corrupt("steps"))?;
+    let n_bytes = stored.answer_bytes().map_err(corrupt("steps"))?;
+    if n_bytes > max_bytes {
+        return Ok(None);
+    }
+    let mut held = None;
+    memory.hold(&mut held, n_bytes)?;
+    let answer = stored.answer(n_bytes).map_err(corrupt("steps"))?;
+    debug_assert!(answer.len() + MAX_LINK_BYTES <= n_bytes, "{} of {n_bytes}", answer.len());
+    Ok(Some((answer, held)))
+}
+
+/// How many bytes are stored of a policy.
+fn n_bytes_of(row: &SqliteRow) -> Result<usize, StoreError> {
+    let n_bytes: i64 = row.try_get("n_bytes")?;
+    usize::try_from(n_bytes).map_err(corrupt("steps"))
+}
+
+/// Most that a link makes it longer.
+const MAX_LINK_BYTES: usize = 64;
+
 /// The text of a policy or its summary, with the link to the policy that refines it, if there is one.
-fn linked(text: String, row: &SqliteRow) -> Result<String, StoreError> {
+fn linked(mut text: String, row: &SqliteRow) -> Result<String, StoreError> {
     /// How all of them end that were not refined yet when they were written.
     const NOT_REFINED: &str = r#""refined_by":null}"#;
     let refined_by: Option<&str> = row.try_get("refined_by")?;
@@ -152,16 +230,21 @@ fn linked(text: String, row: &SqliteRow) -> Result<String, StoreError> {
         return Err(corrupt("refined_by")("the policy names another one, or none"));
     };
     let refined_by = serde_json::to_string(refined_by).map_err(corrupt("refined_by"))?;
-    Ok(format!(r#"{before}"refined_by":{refined_by}}}"#))
+    text.truncate(before.len());
+    text.extend([r#""refined_by":"#, &refined_by, "}"]);
+    Ok(text)
 }
 
 pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -> Result<(), StoreError> {
     add_all(connection, &[policy]).await
 }
 
-/// Policies whose steps in short are up to this size are written where they are asked for, which takes a millisecond or so; larger
-/// ones on a thread of their own.
+/// Policies that are stored in up to so many bytes are read at once, without asking for their size first.
 const MAX_INLINE_BYTES: usize = 32 * 1024;
+
+/// Policies of up to so many bytes are written where they are asked for, which takes a millisecond or so; larger ones on a thread of
+/// their own.
+const MAX_INLINE_ANSWER_BYTES: usize = 1 << 20;
 
 /// Most policies that a statement inserts. Each number of them is a statement of its own, which is prepared once and kept.
 const MAX_ROWS: usize = 64;
@@ -227,5 +310,69 @@ fn insert_of(n_rows: usize) -> SqlStr {
     match INSERTS.get(n_rows) {
         Some(insert) => insert.get_or_init(put_together).clone(),
         None => put_together(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::interrupt::Uninterrupted;
+    use crate::mapping::{Demonstration, Mapper, Problem, Stamp, WrittenPolicy};
+    use crate::model::{Definition, Limits, Model};
+
+    /// A policy of a line of so many states with long names, which goes all the way.
+    fn long(id: &str, n_states: usize) -> WrittenPolicy {
+        const N_ATTRIBUTES: usize = 32;
+        let attribute = |n| serde_json::json!({"name": format!("{n:0>64}"), "kind": "number", "weight": 1e9});
+        let states: Vec<_> = (0..n_states).map(|n| vec![u8::from(n + 1 == n_states); N_ATTRIBUTES]).collect();
+        let transitions: Vec<_> = (1..n_states).map(|state| serde_json::json!([state - 1, "on", state])).collect();
+        let document = serde_json::json!({
+            "attributes": (0..N_ATTRIBUTES).map(attribute).collect::<Vec<_>>(),
+            "actions": [{"name": "on", "cost": 0.3}],
+            "dynamics": {"kind": "table", "start": 0, "states": states, "transitions": transitions},
+        });
+        let definition = Definition::read(&document, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let mapper = Mapper::new(model, &mut Uninterrupted).unwrap();
+        let end =
+            mapper.model().states().domain(0)[mapper.model().states().row(n_states as u32 - 1)[0] as usize].clone();
+        let demonstration = Demonstration::of([vec![None; N_ATTRIBUTES], vec![Some(end); N_ATTRIBUTES]]).unwrap();
+        let weights = mapper.model().schema().weights();
+        let problem = Problem::new(mapper.model(), demonstration, weights, None);
+        let mapping = mapper.map(&problem, crate::mapping::Settings::default(), &mut Uninterrupted).unwrap();
+        WrittenPolicy::new(&Stamp { id: Some(id.to_owned()), ..Stamp::default() }, &problem, &mapping).unwrap()
+    }
+
+    #[tokio::test]
+    async fn a_policy_is_read_only_if_there_is_memory_for_it() {
+        let directory = tempfile::tempdir().unwrap();
+        let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+        // Stored in little, in little that becomes more than is written in passing, and in much.
+        for n_states in [3, 700, 7000] {
+            let id = n_states.to_string();
+            let WrittenPolicy { answer, summary, steps } = long(&id, n_states);
+            let created_at = Timestamp::UNIX_EPOCH;
+            let is_small = summary.len() + steps.len() <= MAX_INLINE_BYTES;
+            assert_eq!((is_small, answer.len() > MAX_INLINE_ANSWER_BYTES), (n_states < 7000, n_states > 3));
+            let new = NewPolicy { id: id.clone(), summary, steps, created_at };
+            store.add_policies(vec![new], Vec::new()).await.unwrap();
+            let memory = Memory::with_room(1 << 30);
+            let (read, held) = store.policy_within(&id, &memory).await.unwrap().unwrap();
+            assert_eq!(read, answer);
+            let n_held = held.as_ref().map_or(0, Held::n_bytes);
+            if n_states > 3 {
+                let n_bytes = answer.len() as u64;
+                assert!((n_bytes..n_bytes * 5 / 4 + 4096).contains(&n_held), "{n_held} for {n_bytes}");
+                let little = Memory::with_room(n_bytes / 2);
+                let refused = store.policy_within(&id, &little).await;
+                assert!(matches!(refused, Err(StoreError::NoRoom(_))), "{n_states}: {refused:?}");
+                assert_eq!(little.free(), little.room() / 4096 * 4096);
+            }
+            drop(held);
+            assert_eq!(memory.free(), 1 << 30);
+        }
+        assert!(store.policy_within("none", &Memory::with_room(0)).await.unwrap().is_none());
     }
 }

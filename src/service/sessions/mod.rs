@@ -236,7 +236,7 @@ impl Etude {
                 let rest = session.online.take().and_then(OnlineMapping::end);
                 steps.extend(rest.map(|(rest, _)| rest).unwrap_or_default());
                 session.n_steps = steps.len();
-                let policy = self.policy(&policy_id).await?;
+                let (policy, _held) = self.policy(&policy_id).await?;
                 let read = serde_json::from_str(&policy);
                 Some(read.map_err(|error| StoreError::corrupt("policies", "policy", policy_id, error))?)
             }
