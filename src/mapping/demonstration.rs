@@ -35,6 +35,27 @@ impl Demonstration {
         (faults.count() == n_before).then_some(Self { values, n_attributes: schema.len() })
     }
 
+    /// Reads observations that were read without faults before: arrays of them, one after the other, `n_observations` in all. `None` if
+    /// there are none.
+    ///
+    /// # Errors
+    ///
+    /// If they are something else.
+    pub(crate) fn read_again(
+        schema: &Schema,
+        texts: &[String],
+        n_observations: usize,
+    ) -> Result<Option<Self>, serde_json::Error> {
+        let mut values = Vec::with_capacity(n_observations * schema.len());
+        for text in texts {
+            let mut deserializer = serde_json::Deserializer::from_str(text);
+            let read = WellFormed::in_text(schema, text.len()).deserialize(&mut deserializer)?;
+            deserializer.end()?;
+            values.extend(read.values);
+        }
+        Ok((!values.is_empty()).then_some(Self { values, n_attributes: schema.len() }))
+    }
+
     /// About how many bytes a demonstration of so many observations takes, with what is looked up of them: little of it may be in the
     /// text that it is read from.
     pub(crate) fn bytes_of(schema: &Schema, n_observations: usize) -> usize {

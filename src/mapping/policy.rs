@@ -234,7 +234,12 @@ impl Policy {
     /// About how many bytes of JSON the steps of the policy of `mapping` are, which must be of `model`.
     #[must_use]
     pub fn steps_bytes(model: &Model, mapping: &Mapping) -> usize {
-        mapping.moves.len().saturating_mul(STEP_BYTES.saturating_add(model.state_bytes()))
+        mapping.moves.len().saturating_mul(Self::step_bytes(model))
+    }
+
+    /// About how many bytes of JSON a step is.
+    pub(crate) fn step_bytes(model: &Model) -> usize {
+        STEP_BYTES.saturating_add(model.state_bytes())
     }
 
     /// Notes at `place` that a policy of `n_observations`, each of which has a step at least, would be too large; says

@@ -40,7 +40,7 @@ pub use name::{InvalidName, Name};
 pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
 pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
-pub use sessions::{Ended, Observation, Received, Resumed, RewardState, Session, SessionError};
+pub use sessions::{CommittedSteps, Ended, Observation, Received, Resumed, RewardState, Session, SessionError};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 pub use trials::TrialAnswer;

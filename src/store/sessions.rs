@@ -271,6 +271,20 @@ impl Store {
         Ok(page)
     }
 
+    /// How many bytes the observations of a session are, as [`Self::observations`] gives them.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn observations_bytes(&self, session_id: &str) -> Result<u64, StoreError> {
+        let arrived = self.settle().await?;
+        let query =
+            sqlx::query_scalar("SELECT IFNULL(SUM(octet_length(states)), 0) FROM observations WHERE session_id = $1");
+        let stored: i64 = query.bind(session_id).fetch_one(&mut *self.reader().await?).await?;
+        let new = arrived.get(session_id).map_or(0, |new| new.states.len());
+        Ok(stored.unsigned_abs() + new as u64)
+    }
+
     /// The observations of a session, in order: JSON arrays of states.
     ///
     /// # Errors

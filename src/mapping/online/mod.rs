@@ -57,7 +57,7 @@ use super::distances::ObservedDistances;
 use super::policy::{Step, StepWriter};
 use super::problem::choose_start;
 use super::{Mapper, Mapping, Move, MoveKind, Status};
-use crate::attribute::{Value, Weights};
+use crate::attribute::{Scalar, Value, Weights};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::model::{Model, StateIdx};
 use layer::{Layer, Node, Sweep};
@@ -74,6 +74,14 @@ pub struct CommittedStep {
     pub is_proven: bool,
     /// How many observations had come when it was committed.
     pub after: u32,
+}
+
+impl CommittedStep {
+    /// About how many bytes of memory a step of `model` takes.
+    pub(crate) fn bytes_of(model: &Model) -> usize {
+        const ATTRIBUTE_BYTES: usize = size_of::<(Arc<str>, Scalar)>() + size_of::<(Arc<str>, f64)>();
+        size_of::<Self>() + model.schema().len() * ATTRIBUTE_BYTES
+    }
 }
 
 /// Why an observation was not taken.
@@ -297,6 +305,12 @@ impl OnlineMapping {
             self.commit_shared(&mut committed);
         }
         Ok(committed)
+    }
+
+    /// How many steps would be committed if the demonstration ended now.
+    pub(crate) fn n_rest(&self) -> usize {
+        let survivor = self.window.layers.back().and_then(Layer::cheapest);
+        survivor.map_or(0, |survivor| self.window.path(survivor).len())
     }
 
     /// Ends the demonstration, and commits the rest of the cheapest mapping. `None` if nothing was observed.

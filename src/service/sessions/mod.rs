@@ -15,15 +15,17 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use session::Source;
-pub use session::{Ended, Observation, Received, RewardState, Session};
+pub use session::{CommittedSteps, Ended, Observation, Received, RewardState, Session};
 
 use super::opening::{Names, Opening};
 use super::owners::{Ownership, TakenOver};
-use super::policies::Named;
+use super::policies::{MAX_INLINE_BYTES, Named};
 use super::{Caller, Etude, PoolError, ServiceError};
 use crate::attribute::{Schema, Weights};
-use crate::document::{self, Faults, Place};
+use crate::document::{Faults, Place};
+use crate::interrupt::{Interrupt, time_until_finish};
 use crate::mapping::{Budget, CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, TooManySteps};
+use crate::memory::Held;
 use crate::store::{MAX_EXPIRED_AT_ONCE, NewSession, Page, SessionRow, SessionStatus, SessionWeights, StoreError};
 
 /// Why a session could not do as told.
@@ -94,8 +96,8 @@ pub struct Resumed {
     /// The session.
     pub session: Session,
     /// Every step that was committed so far.
-    pub steps: Vec<CommittedStep>,
-    /// Its policy, if it has ended.
+    pub steps: CommittedSteps,
+    /// Its policy, if it has ended. Its memory is held with the steps.
     pub policy: Option<Policy>,
 }
 
@@ -201,7 +203,11 @@ impl Etude {
         if row.status == SessionStatus::Expired {
             return Err(SessionError::NotOpen);
         }
-        let (hash, mapper) = self.mapper(&row.model, "/model", None, None).await?;
+        // Nobody says how long it may take.
+        let deadline = caller.arrived.checked_add(time_until_finish(self.time_limits.default_deadline));
+        let place = self.pool.admit_when_needed(caller.client).with_patience(deadline);
+        let (hash, mapper) = self.mapper(&row.model, "/model", Some(&place), deadline).await?;
+        drop(place);
         // Registered anew, the same world may have become too large to be known in full.
         if hash != row.model_hash || mapper.model().is_lazy() {
             let name = format!("{} with hash {}", row.model, row.model_hash);
@@ -225,23 +231,71 @@ impl Etude {
             client: caller.client,
             ownership,
         };
-        let texts = self.store.observations(id).await?;
-        let observations = read_stored(&session.mapper, &texts, id)?;
-        let mut steps = session.advance(self, observations).await?;
+        let mut steps = CommittedSteps::default();
+        if session.n_received > 0 {
+            let (texts, _held) = self.stored_observations(&session).await?;
+            let reading = {
+                let (mapper, id, n_received) = (Arc::clone(&session.mapper), session.id.clone(), session.n_received);
+                move || -> Result<Vec<Observation>, SessionError> {
+                    let demonstration = read_stored(&mapper, &texts, (&id, n_received))?;
+                    Ok(demonstration.iter().map(<[_]>::to_vec).collect())
+                }
+            };
+            let n_values = session.n_received as usize * session.mapper.model().schema().len();
+            let observations = if n_values <= MAX_INLINE_VALUES {
+                reading()?
+            } else {
+                // About what a value takes.
+                self.pool.read_patiently(caller.client, 8 * n_values, reading).await??
+            };
+            steps = session.advance(self, observations).await?;
+        }
         let policy = match row.policy_id {
             None => None,
             Some(policy_id) => {
                 // Whoever ended it may have been gone before there was something to refine.
                 self.refiner.wake();
-                let rest = session.online.take().and_then(OnlineMapping::end);
-                steps.extend(rest.map(|(rest, _)| rest).unwrap_or_default());
+                if let Some(online) = session.online.take() {
+                    let (mapper, memory) = (Arc::clone(&session.mapper), self.memory.clone());
+                    let end = move |_: &mut dyn Interrupt| {
+                        let ended = steps.take_for(online.n_rest(), mapper.model(), &memory);
+                        Ok(ended.map(|()| {
+                            steps.extend(online.end().map(|(rest, _)| rest).unwrap_or_default());
+                            steps
+                        }))
+                    };
+                    steps = self.pool.run_patiently(caller.client, end).await?.map_err(ServiceError::from)?;
+                }
                 session.n_steps = steps.len();
                 let (policy, _held) = self.policy(&policy_id).await?;
-                let read = serde_json::from_str(&policy);
+                // It has the same steps, each of which names its attributes anew.
+                let n_bytes = steps.len() * CommittedStep::bytes_of(session.mapper.model()) + NAMES * policy.len();
+                steps.take_more(n_bytes, &self.memory).map_err(ServiceError::from)?;
+                let n_policy_bytes = policy.len();
+                let read = move || serde_json::from_str(&policy);
+                let read = if n_policy_bytes <= MAX_INLINE_BYTES {
+                    read()
+                } else {
+                    self.pool.read_patiently(caller.client, n_policy_bytes, read).await?
+                };
                 Some(read.map_err(|error| StoreError::corrupt("policies", "policy", policy_id, error))?)
             }
         };
         Ok(Resumed { session, steps, policy })
+    }
+
+    /// The observations of a session as they are stored, and the memory that these, what is read of them, and what is written of
+    /// them take, if it is much: taken before they are read.
+    async fn stored_observations(&self, session: &Session) -> Result<(Vec<String>, Option<Held>), SessionError> {
+        /// In a row, as they are given, and in a request.
+        const COPIES: usize = 3;
+        let n_bytes = usize::try_from(self.store.observations_bytes(&session.id).await?).unwrap_or(usize::MAX);
+        let (schema, n_received) = (session.mapper.model().schema(), session.n_received as usize);
+        // All together, and one by one.
+        let read_bytes = 2 * Demonstration::bytes_of(schema, n_received) + n_received * size_of::<Observation>();
+        let mut held = None;
+        self.memory.hold(&mut held, COPIES.saturating_mul(n_bytes) + read_bytes).map_err(ServiceError::from)?;
+        Ok((self.store.observations(&session.id).await?, held))
     }
 
     /// The session with this id.
@@ -331,19 +385,127 @@ fn read_weights(weights: SessionWeights, schema: &Schema, id: &str) -> Result<We
     Ok(Weights::of(weights?))
 }
 
-/// Reads observations that were stored, which were read without faults before.
-fn read_stored(mapper: &Mapper, texts: &[String], id: &str) -> Result<Vec<Observation>, SessionError> {
-    let corrupt =
-        |source: Box<dyn std::error::Error + Send + Sync>| StoreError::corrupt("observations", "states", id, source);
-    let mut observations = Vec::new();
-    for text in texts {
-        let document = document::parse(text.as_bytes()).map_err(|error| corrupt(error.into()))?;
-        let mut faults = Faults::default();
-        let root = Place::root(&document);
-        for (n, state) in root.array(&mut faults).unwrap_or_default().iter().enumerate() {
-            observations.extend(mapper.model().schema().read_observation(&root.item(n, state), &mut faults));
-        }
-        faults.check(Some(())).map_err(|faults| corrupt(faults.into()))?;
+/// Observations of up to so many values are read where they are needed, which takes less than a millisecond.
+const MAX_INLINE_VALUES: usize = 8192;
+
+/// What the names in a policy take once it is read, for each of its bytes: one of each for every attribute of a step.
+const NAMES: usize = 8;
+
+/// Reads observations of the session `id` that were stored, which were read without faults before.
+fn read_stored(
+    mapper: &Mapper,
+    texts: &[String],
+    (id, n_observations): (&str, u32),
+) -> Result<Demonstration, SessionError> {
+    let read = Demonstration::read_again(mapper.model().schema(), texts, n_observations as usize);
+    let read = read.map_err(|error| StoreError::corrupt("observations", "states", id, error))?;
+    read.ok_or(SessionError::Empty)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use serde_json::json;
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::memory::Memory;
+    use crate::model::{Format, Limits};
+    use crate::service::{Client, ModelText, Name, PoolSettings, Settings, TimeLimits};
+
+    const NOW: Timestamp = Timestamp::UNIX_EPOCH;
+
+    fn caller() -> Caller {
+        Caller { client: Client::LOCAL, arrived: Instant::now(), now: NOW }
     }
-    Ok(observations)
+
+    async fn open(directory: &std::path::Path, time_limits: TimeLimits, tasks: &TaskTracker) -> Etude {
+        let settings = Settings {
+            database: directory.join("etude.db"),
+            limits: Limits::DEFAULT,
+            memory: Memory::with_room(256 << 20),
+            model_cache_bytes: 1 << 20,
+            session_idle_timeout: Duration::MAX,
+            time_limits,
+            pool: PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
+        };
+        Etude::open(&settings, tasks, CancellationToken::new()).await.unwrap()
+    }
+
+    /// A service with a model of 256 attributes, and a session that has observed nothing of them 1200 times.
+    async fn observed(directory: &std::path::Path, tasks: &TaskTracker) -> (Etude, Session) {
+        let attribute = |n: usize| json!({"name": format!("{n}"), "kind": "number"});
+        let wide = json!({
+            "attributes": (0..256).map(attribute).collect::<Vec<_>>(), "actions": [],
+            "dynamics": {"kind": "table", "states": [vec![0; 256]], "transitions": []},
+        });
+        let etude = open(directory, TimeLimits::DEFAULT, tasks).await;
+        let text = ModelText::Whole(wide.to_string().into_bytes());
+        etude.put_model(&Name::new("wide").unwrap(), text, Format::Json, caller()).await.unwrap();
+        let mut session = etude.open_session(&json!({"type": "open", "model": "wide"}), caller()).await.unwrap();
+        let states = json!(vec![json!({}); 300]);
+        for n in 0..4 {
+            if let Received::Waiting(states) =
+                session.receive(&etude, 300 * n, &Place::root(&states), NOW).await.unwrap()
+            {
+                session.advance(&etude, states).await.unwrap();
+            }
+        }
+        (etude, session)
+    }
+
+    fn is_no_room<T>(result: &Result<T, SessionError>) -> bool {
+        matches!(result, Err(SessionError::Service(ServiceError::NoRoom(_))))
+    }
+
+    #[tokio::test]
+    async fn a_session_is_resumed_and_ended_only_if_there_is_memory_for_all_of_it() {
+        let directory = tempfile::tempdir().unwrap();
+        let (etude, mut session) = observed(directory.path(), &TaskTracker::new()).await;
+        let id = session.id().to_owned();
+        // What is small has room.
+        let others = etude.memory.try_take(etude.memory.free_for_large()).unwrap();
+        assert!(is_no_room(&session.end(&etude, 1200, NOW).await));
+        assert!(!session.has_ended());
+        drop(session);
+        let before = etude.memory.free();
+        assert!(is_no_room(&etude.resume_session(&id, caller()).await));
+        assert_eq!(etude.memory.free(), before);
+        drop(others);
+
+        let before = etude.memory.free();
+        let mut resumed = etude.resume_session(&id, caller()).await.unwrap();
+        assert!(resumed.steps.len() > 1000 && before - etude.memory.free() > 16 << 20, "{}", etude.memory.free());
+        let ended = resumed.session.end(&etude, 1200, NOW).await.unwrap();
+        assert_eq!((resumed.steps.len() + ended.steps.len(), ended.policy.steps.len()), (1200, 1200));
+        drop((resumed, ended));
+        assert_eq!(etude.memory.free(), before);
+
+        let again = etude.resume_session(&id, caller()).await.unwrap();
+        assert_eq!((again.steps.len(), again.policy.as_ref().unwrap().steps.len()), (1200, 1200));
+        assert!(before - etude.memory.free() > 32 << 20);
+        drop(again);
+        assert_eq!(etude.memory.free(), before);
+        let others = etude.memory.try_take(etude.memory.free_for_large()).unwrap();
+        assert!(is_no_room(&etude.resume_session(&id, caller()).await));
+        drop(others);
+    }
+
+    #[tokio::test]
+    async fn who_resumes_a_session_does_not_wait_for_ever_for_its_model() {
+        let directory = tempfile::tempdir().unwrap();
+        let tasks = TaskTracker::new();
+        let (etude, session) = observed(directory.path(), &tasks).await;
+        let id = session.id().to_owned();
+        drop(session);
+        etude.close().await;
+        drop(etude);
+        tasks.close();
+        tasks.wait().await;
+        let time_limits = TimeLimits { default_deadline: Duration::ZERO, ..TimeLimits::DEFAULT };
+        let etude = open(directory.path(), time_limits, &TaskTracker::new()).await;
+        let resumed = etude.resume_session(&id, caller()).await;
+        assert!(matches!(resumed, Err(SessionError::Service(ServiceError::Compiling { .. }))), "{resumed:?}");
+    }
 }

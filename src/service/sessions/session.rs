@@ -1,11 +1,11 @@
 //! An open session: observations in, committed steps out.
 
 use std::num::NonZeroU32;
+use std::ops::Deref;
 use std::sync::Arc;
 use std::time::Instant;
 
 use jiff::Timestamp;
-use serde_json::Value;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
@@ -14,8 +14,8 @@ use crate::attribute::{ByAttribute, Weights};
 use crate::document::{Faults, Place};
 use crate::interrupt::{Interrupt, Uninterrupted};
 use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, Stopped};
-use crate::memory::{Held, NoRoom, SMALL_BYTES};
-use crate::model::Origin;
+use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
+use crate::model::{Model, Origin};
 use crate::service::owners::Ownership;
 use crate::service::policies::{PolicyText, as_micros, report, write_policy};
 use crate::service::{Client, Etude, PoolError, ServiceError};
@@ -59,17 +59,62 @@ pub(super) struct Source {
 #[derive(Debug)]
 pub enum Received {
     /// They were mapped at the same time, and commit these steps.
-    Mapped(Vec<CommittedStep>),
+    Mapped(CommittedSteps),
     /// They take longer to be mapped: see [`Session::advance`].
     Waiting(Vec<Observation>),
+}
+
+/// Steps that were committed, and the memory that they take, if it is much.
+#[derive(Debug, Default)]
+pub struct CommittedSteps {
+    steps: Vec<CommittedStep>,
+    held: Option<Held>,
+    /// How much is counted.
+    n_bytes: usize,
+}
+
+impl CommittedSteps {
+    /// Takes what `n_steps` more of `model` need.
+    pub(super) fn take_for(&mut self, n_steps: usize, model: &Model, memory: &Memory) -> Result<(), NoRoom> {
+        self.take_more(n_steps.saturating_mul(CommittedStep::bytes_of(model)), memory)
+    }
+
+    /// Takes `n_bytes` more, for what comes with the steps.
+    pub(super) fn take_more(&mut self, n_bytes: usize, memory: &Memory) -> Result<(), NoRoom> {
+        let n_bytes = self.n_bytes.saturating_add(n_bytes);
+        memory.hold(&mut self.held, n_bytes)?;
+        self.n_bytes = n_bytes;
+        Ok(())
+    }
+
+    /// Gives back `n_bytes` of what was taken more.
+    fn give_back(&mut self, n_bytes: usize) {
+        self.n_bytes -= n_bytes;
+        if let Some(held) = &mut self.held {
+            held.shrink_to(self.n_bytes as u64);
+        }
+    }
+
+    /// Appends steps, whose memory was taken.
+    pub(super) fn extend(&mut self, steps: Vec<CommittedStep>) {
+        self.steps.extend(steps);
+    }
+}
+
+impl Deref for CommittedSteps {
+    type Target = [CommittedStep];
+
+    fn deref(&self) -> &[CommittedStep] {
+        &self.steps
+    }
 }
 
 /// The end of a session.
 #[derive(Debug)]
 pub struct Ended {
     /// The steps committed by the end.
-    pub steps: Vec<CommittedStep>,
-    /// The policy of the whole, stored.
+    pub steps: CommittedSteps,
+    /// The policy of the whole, stored. Its memory is held with the steps.
     pub policy: Policy,
 }
 
@@ -177,7 +222,7 @@ impl Session {
             if !etude.store.touch_session(&self.id, now).await? {
                 return Err(SessionError::NotOpen);
             }
-            return Ok(Received::Mapped(Vec::new()));
+            return Ok(Received::Mapped(CommittedSteps::default()));
         }
         if self.n_received as usize + new.len() > Demonstration::MAX_OBSERVATIONS {
             return Err(SessionError::TooMany);
@@ -233,7 +278,7 @@ impl Session {
         &mut self,
         etude: &Etude,
         observations: Vec<Observation>,
-    ) -> Result<Vec<CommittedStep>, SessionError> {
+    ) -> Result<CommittedSteps, SessionError> {
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let is_inline = self.is_inline(observations.len());
         // Others find something too. What it really took is kept afterwards.
@@ -241,11 +286,17 @@ impl Session {
         let spare = etude.memory.try_take(free.max(SMALL_BYTES)).map_err(ServiceError::from)?;
         let most_bytes = usize::try_from(self.held.n_bytes() + spare.n_bytes()).unwrap_or(usize::MAX);
         let mut online = online.within(most_bytes);
+        let (mapper, memory) = (Arc::clone(&self.mapper), etude.memory.clone());
         let job = move |interrupt: &mut dyn Interrupt| {
-            let mut steps = Vec::new();
+            let mut steps = CommittedSteps::default();
             for observation in &observations {
                 match online.observe(observation, interrupt) {
-                    Ok(committed) => steps.extend(committed),
+                    Ok(committed) => {
+                        if steps.take_for(committed.len(), mapper.model(), &memory).is_err() {
+                            return Ok(None);
+                        }
+                        steps.extend(committed);
+                    }
                     Err(Stopped::Cancelled(cancelled)) => return Err(cancelled),
                     Err(Stopped::Memory) => return Ok(None),
                 }
@@ -290,10 +341,10 @@ impl Session {
         if seq == 0 {
             return Err(SessionError::Empty);
         }
-        let texts = etude.store.observations(&self.id).await?;
+        let (texts, texts_held) = etude.stored_observations(self).await?;
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let (mapper, weights, start) = (Arc::clone(&self.mapper), self.weights.clone(), self.start);
-        let id = self.id.clone();
+        let (id, n_committed, memory) = (self.id.clone(), self.n_steps, etude.memory.clone());
         let policy_id = match &self.source.trial_id {
             Some(trial) => etude.store.trial(trial).await?.map(|trial| trial.policy_id),
             None => None,
@@ -307,8 +358,15 @@ impl Session {
             lookahead: self.lookahead.map(NonZeroU32::get),
             ..Stamp::default()
         };
-        let job = move |_: &mut dyn Interrupt| Ok(conclude(online, &mapper, (&id, &texts), weights, start, stamp));
-        let (steps, policy, row, refinement) = etude.pool.run_patiently(self.client, job).await??;
+        let job = move |_: &mut dyn Interrupt| {
+            let steps = take_for_end(&online, n_committed, mapper.model(), &memory);
+            let concluded = steps
+                .map_err(|no_room| ServiceError::from(no_room).into())
+                .and_then(|steps| conclude(online, steps, &mapper, (&id, seq, &texts), weights, start, stamp));
+            // The request for a refinement is to be stored.
+            Ok(concluded.map(|concluded| (concluded, texts_held)))
+        };
+        let ((mut steps, policy, row, refinement), texts_held) = etude.pool.run_patiently(self.client, job).await??;
         let is_refined = refinement.is_some();
         let end = SessionEnd { session_id: self.id.clone(), policy: row.at(now), refinement };
         if !etude.store.end_session(end).await? {
@@ -317,6 +375,8 @@ impl Session {
         if is_refined {
             etude.refiner.wake();
         }
+        drop(texts_held);
+        steps.give_back(written_bytes(policy.steps.len(), self.mapper.model()));
         self.n_steps += steps.len();
         Ok(Ended { steps, policy })
     }
@@ -331,51 +391,83 @@ fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) 
 /// An observation as it was read. Shape `[n_attributes]`; `None` where an attribute was not observed.
 pub type Observation = Vec<Option<crate::attribute::Value>>;
 
-type Concluded = (Vec<CommittedStep>, Policy, PolicyText, Option<NewRefinement>);
+/// How many bytes so many steps take as they are written: as they are answered, and as they are stored.
+fn written_bytes(n_steps: usize, model: &Model) -> usize {
+    n_steps.saturating_mul(2 * Policy::step_bytes(model))
+}
 
-/// Commits the rest, and writes the policy of the whole session, which has this id and these observations.
+/// Takes what the end of a session of `n_committed` steps needs: for the steps that are left, for its policy, and for that as it is
+/// written.
+fn take_for_end(
+    online: &OnlineMapping,
+    n_committed: usize,
+    model: &Model,
+    memory: &Memory,
+) -> Result<CommittedSteps, NoRoom> {
+    let (n_rest, mut steps) = (online.n_rest(), CommittedSteps::default());
+    let n_steps = n_committed + n_rest;
+    steps.take_for(n_rest + n_steps, model, memory)?;
+    steps.take_more(written_bytes(n_steps, model), memory)?;
+    Ok(steps)
+}
+
+type Concluded = (CommittedSteps, Policy, PolicyText, Option<NewRefinement>);
+
+/// Commits the rest to `steps`, and writes the policy of the whole session, which has this id and these observations.
 fn conclude(
     online: OnlineMapping,
+    mut steps: CommittedSteps,
     mapper: &Mapper,
-    (id, texts): (&str, &[String]),
+    (id, n_observations, texts): (&str, u32, &[String]),
     weights: Weights,
     start: Option<u32>,
     stamp: Stamp,
 ) -> Result<Concluded, SessionError> {
     let started = Instant::now();
-    let (steps, mapping) = online.end().ok_or(SessionError::Empty)?;
+    let (rest, mapping) = online.end().ok_or(SessionError::Empty)?;
+    steps.extend(rest);
     Policy::check_steps(mapper.model(), &mapping)?;
-    let demonstration = Demonstration::of(read_stored(mapper, texts, id)?).ok_or(SessionError::Empty)?;
+    let demonstration = read_stored(mapper, texts, (id, n_observations))?;
     let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
     let policy = Policy::new(stamp.clone(), &problem, &mapping);
     let (_, row) = write_policy(stamp, &problem, &mapping)?;
     let refinement = (policy.status == Status::Local).then(|| {
-        let parsed = texts.iter().map(|text| serde_json::from_str::<Vec<Value>>(text).unwrap_or_default());
-        let demonstration: Vec<Value> = parsed.flatten().collect();
         let request = serde_json::json!({
             "model": policy.model,
             "weights": policy.weights,
             "start": problem.start(),
-            "demonstration": demonstration,
         });
-        let request = request.to_string();
         NewRefinement {
             policy_id: policy.id.clone().unwrap_or_default(),
             model_hash: policy.model_hash.clone(),
-            request,
+            request: with_demonstration(&request.to_string(), texts),
         }
     });
     Ok((steps, policy, row, refinement))
 }
 
+/// The object `request` with the member `demonstration`: the items of arrays, one after the other. All of it JSON.
+fn with_demonstration(request: &str, texts: &[String]) -> String {
+    let (before, between, after) = (request.strip_suffix('}').unwrap_or(request), r#","demonstration":["#, "]}");
+    let n_bytes = texts.iter().map(String::len).sum::<usize>();
+    let mut text = String::with_capacity(before.len() + between.len() + n_bytes + after.len());
+    text.extend([before, between]);
+    for (n, items) in texts.iter().enumerate() {
+        let items = items.strip_prefix('[').and_then(|items| items.strip_suffix(']'));
+        text.extend([if n == 0 { "" } else { "," }, items.unwrap_or_default()]);
+    }
+    text.push_str(after);
+    text
+}
+
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
+    use serde_json::{Value, json};
 
     use super::*;
-    use crate::model::{Definition, Limits, Model};
+    use crate::model::{Definition, Limits};
 
     #[test]
     fn what_is_mapped_where_it_arrives_is_measured_by_transitions_too() {
