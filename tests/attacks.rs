@@ -129,4 +129,7 @@ attacks! {
     slow_uploads_keep_nobody_from_uploading: SlowUploads until Answered,
     malformed_frames_end_nobody_elses_stream: MalformedFrames until Ended,
     half_open_websockets_keep_nobody_waiting: HalfOpen until Answered,
+    demonstrations_that_become_large_do_not_outgrow_the_memory: SparseDemonstrations until Ended,
+    long_sessions_that_are_resumed_and_ended_do_not_outgrow_the_memory: LongSessions until Ended,
+    policies_that_are_read_at_once_do_not_outgrow_the_memory: LargePolicy until Ended,
 }

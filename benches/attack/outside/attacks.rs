@@ -71,6 +71,12 @@ attacks! {
     MalformedFrames,
     /// Small bodies that become large ones once they are decompressed.
     Bombs,
+    /// Demonstrations that observe nothing of many attributes, alone and in batches.
+    SparseDemonstrations,
+    /// Long sessions of as many attributes that are resumed and ended at the same time.
+    LongSessions,
+    /// A large policy that is asked for on many connections at the same time.
+    LargePolicy,
 }
 
 /// How much of everything.
@@ -353,11 +359,63 @@ impl Target {
                 };
                 (16, Read, sent.map(send).into())
             }
+            Attack::SparseDemonstrations => {
+                self.put("wide", &wide()).await?;
+                let long = vec![json!({}); 10 * size.n_observations];
+                let single = json!({"model": "wide", "demonstration": long});
+                let one = json!({"model": "wide", "items": [{"demonstration": long}]});
+                let items: Vec<_> = long.chunks(100).map(|chunk| json!({"demonstration": chunk})).collect();
+                let many = json!({"model": "wide", "items": items});
+                let messages = [("/v1/policies", single), ("/v1/policies:batch", one), ("/v1/policies:batch", many)];
+                (12, Read, messages.map(|(path, body)| at_once(self.post(path, &body))).into())
+            }
+            Attack::LongSessions => {
+                const N_SESSIONS: usize = 8;
+                const N_STATES: usize = 200;
+                self.put("wide", &wide()).await?;
+                let n_frames = size.n_observations / N_STATES;
+                let states = vec![json!({}); N_STATES];
+                let frames = (0..n_frames).map(|n| json!({"type": "observe", "seq": n * N_STATES, "states": states}));
+                let frames = frames.map(|frame| format!("{frame}\n")).collect::<String>();
+                let lines = format!("{}\n{frames}", json!({"type": "open", "model": "wide"}));
+                let mut messages = Vec::new();
+                for _ in 0..N_SESSIONS {
+                    let session = self.begin(lines.clone()).await?;
+                    let resume = json!({"type": "resume", "session": session});
+                    let end = json!({"type": "end", "seq": n_frames * N_STATES});
+                    let lines = format!("{resume}\n{end}\n");
+                    messages.push(at_once(request("POST", "/v1/stream", &self.host(), LINES, lines.as_bytes())));
+                }
+                (N_SESSIONS, Read, messages)
+            }
+            Attack::LargePolicy => {
+                self.put("wide", &wide()).await?;
+                let path = self.make_policy(&vec![json!({}); 2 * size.n_observations]).await?;
+                (60, Read, vec![at_once(self.get(&path))])
+            }
         })
     }
 
     fn host(&self) -> String {
         self.address.to_string()
+    }
+
+    /// Begins a session with these frames. Gives its id.
+    async fn begin(&self, lines: String) -> Result<String, Failure> {
+        let post = self.client.post(format!("http://{}/v1/stream", self.address));
+        let answer = post.header("content-type", "application/x-ndjson").body(lines).send().await?;
+        let answer = answer.error_for_status()?.text().await?;
+        let mut frames = answer.lines().filter_map(|line| serde_json::from_str::<Value>(line).ok());
+        let opened = frames.find(|frame| frame["type"] == "opened").ok_or("no session")?;
+        Ok(opened["session"].as_str().unwrap_or_default().to_owned())
+    }
+
+    /// Makes a policy of the model `wide`. Gives its path.
+    async fn make_policy(&self, demonstration: &[Value]) -> Result<String, Failure> {
+        let request = json!({"model": "wide", "demonstration": demonstration});
+        let answer = self.client.post(format!("http://{}/v1/policies", self.address)).json(&request).send().await?;
+        let policy: Value = answer.error_for_status()?.json().await?;
+        Ok(format!("/v1/policies/{}", policy["id"].as_str().unwrap_or_default()))
     }
 
     fn get(&self, path: &str) -> Vec<u8> {
@@ -455,6 +513,15 @@ fn line(n_states: usize) -> String {
         let _ = writeln!(text, "{{\"transitions\":[[{},\"on\",{state}]]}}", state - 1);
     }
     text
+}
+
+/// A model of one state that has many attributes.
+fn wide() -> String {
+    const N_ATTRIBUTES: usize = 256;
+    let attribute = |n: usize| json!({"name": n.to_string(), "kind": "number"});
+    let attributes: Vec<_> = (0..N_ATTRIBUTES).map(attribute).collect();
+    let head = json!({"attributes": attributes, "actions": [], "dynamics": {"kind": "table", "start": 0}});
+    format!("{head}\n{{\"states\":[{}],\"transitions\":[]}}\n", json!(vec![0; N_ATTRIBUTES]))
 }
 
 /// A model of one state that is described at length.
