@@ -395,6 +395,8 @@ pub(super) fn follow(
     extent: Extent,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
+    /// As it will be answered, and as it will be stored.
+    const N_COPIES: usize = 2;
     let started = Instant::now();
     let is_counted = extent == Extent::Any;
     let searching = match is_counted.then(|| take_for_search(mapper, &mut request, memory)).transpose() {
@@ -410,8 +412,6 @@ pub(super) fn follow(
         faults.note_at(place, error.to_string());
         return Ok(Err(faults.into()));
     }
-    // As it will be answered, and as it will be stored.
-    const N_COPIES: usize = 2;
     let n_bytes = N_COPIES * Policy::steps_bytes(mapper.model(), &mapping);
     let mut held = None;
     if let Err(no_room) = memory.hold(&mut held, n_bytes) {

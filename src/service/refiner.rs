@@ -170,6 +170,11 @@ impl Etude {
 
     /// The refined policy; `None` if the budget does not suffice to find it.
     async fn refine(&self, refinement: NewRefinement) -> Result<Option<PolicyText>, ServiceError> {
+        /// All that is wanted of the policy.
+        #[derive(Deserialize)]
+        struct Local {
+            cost: Cost,
+        }
         let NewRefinement { policy_id, model_hash, request } = refinement;
         let mut held = None;
         self.memory.hold(&mut held, request.len() + document::parsed_bytes(request.as_bytes()))?;
@@ -180,11 +185,6 @@ impl Etude {
         if hash != model_hash {
             // Another one is there under its name.
             return Err(ServiceError::Unknown { kind: "model", name: model, pointer: None });
-        }
-        /// All that is wanted of the policy.
-        #[derive(Deserialize)]
-        struct Local {
-            cost: Cost,
         }
         let local: Local = {
             let (local, _held) = self.policy(&policy_id).await?;

@@ -336,8 +336,9 @@ mod tests {
         let definition = Definition::read(&document, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let mapper = Mapper::new(model, &mut Uninterrupted).unwrap();
-        let end =
-            mapper.model().states().domain(0)[mapper.model().states().row(n_states as u32 - 1)[0] as usize].clone();
+        let states = mapper.model().states();
+        let last = u32::try_from(n_states - 1).unwrap();
+        let end = states.domain(0)[states.row(last)[0] as usize].clone();
         let demonstration = Demonstration::of([vec![None; N_ATTRIBUTES], vec![Some(end); N_ATTRIBUTES]]).unwrap();
         let weights = mapper.model().schema().weights();
         let problem = Problem::new(mapper.model(), demonstration, weights, None);
