@@ -178,8 +178,8 @@ async fn a_demonstration_that_takes_more_memory_than_there_is_is_refused() {
         "dynamics": {"kind": "table", "states": [vec![0; 256]], "transitions": []},
     });
     assert_eq!(service.put("/v1/models/wide", &wide).await.0, 201);
-    // Three bytes each, and seven kilobytes once they are read.
-    let demonstration = vec![json!({}); 25_000];
+    // Three bytes each, and seven kilobytes once they are read. Their policy is half as large.
+    let demonstration = vec![json!({}); 13_000];
     let request = json!({"model": "wide", "demonstration": demonstration, "max_expansions": 1});
     let (status, answer) = service.post("/v1/policies", &request).await;
     assert_eq!((status, &answer["type"]), (503, &json!("/problems/busy")), "{answer}");
