@@ -51,7 +51,7 @@ pub(super) async fn websocket(
     upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
 ) -> Result<Response, Problem> {
     let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::UpgradeRequired, rejection.body_text()))?;
-    let place = context.admit_stream()?;
+    let room = context.admit_stream(client)?;
     let limits = context.stream_limits;
     let upgrade = upgrade
         .protocols([PROTOCOL])
@@ -65,8 +65,8 @@ pub(super) async fn websocket(
     Ok(upgrade.on_upgrade(move |socket| {
         let streams = context.streams.clone();
         let serving = async move {
-            Box::pin(websocket::serve(&context.etude, client, limits, socket, &place.room, &context.stopping)).await;
-            drop(place);
+            Box::pin(websocket::serve(&context.etude, client, limits, socket, &room, &context.stopping)).await;
+            drop(room);
         };
         streams.track_future(serving.instrument(span))
     }))
@@ -132,14 +132,14 @@ pub(super) async fn ndjson(
         let detail = "send frames, one per line, with the header `content-type: application/x-ndjson`";
         return Err(refuse(request, &context, Problem::new(ProblemKind::UnsupportedMediaType, detail)));
     }
-    let place = context.admit_stream()?;
+    let room = context.admit_stream(client)?;
     let body = ndjson::begin_reading(request).await;
     let (lines, answer) = mpsc::channel(1);
     let (streams, span) = (context.streams.clone(), tracing::Span::current());
     let serving = async move {
         let limits = context.stream_limits;
-        ndjson::serve(&context.etude, client, limits, body, lines, &place.room, &context.stopping).await;
-        drop(place);
+        ndjson::serve(&context.etude, client, limits, body, lines, &room, &context.stopping).await;
+        drop(room);
     };
     // The answer is read while the request is still being sent, so this runs beside it.
     streams.spawn(serving.instrument(span));

@@ -11,10 +11,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem, WriteError};
 use super::queue::{Gone, Receiver, Sender, Weighed};
-use super::room::{Crowded, SMALL_FRAME_BYTES};
+use super::room::{Crowded, SMALL_FRAME_BYTES, Taken};
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
-use crate::memory::Held;
 use crate::service::{
     Caller, Client, Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
@@ -71,7 +70,7 @@ pub enum Incoming {
         /// Its text.
         text: Bytes,
         /// What it takes of the memory of the service until it is handled, if it is not small.
-        memory: Option<Held>,
+        memory: Option<Taken>,
     },
     /// Something that is no frame: a binary message.
     Binary,
@@ -251,7 +250,7 @@ impl Connection<'_> {
     }
 
     /// Reads what came: a large frame off the threads that serve others. Gives its memory along.
-    async fn read(&self, came: Incoming) -> Result<(ClientFrame, Option<Held>), Over> {
+    async fn read(&self, came: Incoming) -> Result<(ClientFrame, Option<Taken>), Over> {
         let (text, memory) = text_of(came, self.limits)?;
         if text.len() <= SMALL_FRAME_BYTES {
             return Ok((read_frame(&text)?, memory));
@@ -261,7 +260,7 @@ impl Connection<'_> {
     }
 
     /// Answers a frame, whose memory is `memory`. Gives how the connection ends, if it does.
-    async fn answer(&mut self, frame: ClientFrame, memory: Option<Held>) -> Result<Option<Closed>, Over> {
+    async fn answer(&mut self, frame: ClientFrame, memory: Option<Taken>) -> Result<Option<Closed>, Over> {
         let now = Timestamp::now();
         let caller = Caller { client: self.client, arrived: Instant::now(), now };
         match (frame, &mut self.session) {
@@ -427,7 +426,7 @@ fn not_allowed(detail: &str) -> Over {
 }
 
 /// The text of what came, and its memory.
-fn text_of(came: Incoming, limits: Limits) -> Result<(Bytes, Option<Held>), Over> {
+fn text_of(came: Incoming, limits: Limits) -> Result<(Bytes, Option<Taken>), Over> {
     let bad = |problem| Over::because(Closed::BadFrame, problem);
     match came {
         Incoming::Frame { text, memory } if text.len() <= limits.frame_bytes => Ok((text, memory)),

@@ -1,5 +1,8 @@
-//! What a stream takes of the memory of the service.
+//! What streams take of the service: places and memory.
+//!
+//! All streams together take half of the memory at most, and half of that while they are idle.
 
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use tokio::sync::OnceCell;
@@ -7,6 +10,7 @@ use tokio::sync::OnceCell;
 use super::engine::Limits;
 use super::queue::QUEUE_BYTES;
 use crate::memory::{Held, Memory, NoRoom};
+use crate::service::{Client, Places};
 
 /// How much is read from a socket at once. Held by every stream, most of which wait for a small frame; a larger one is read in
 /// several goes.
@@ -30,15 +34,103 @@ const LARGE_FRAMES: u64 = 3;
 /// What a frame takes that is larger than small while it is handled, for each of its bytes: its text, and what is read from that.
 const BYTES_PER_FRAME_BYTE: u64 = 16;
 
-/// What a stream takes of the memory of the service.
+/// Room for all streams. Clones share it.
+#[derive(Clone, Debug)]
+pub struct Rooms(Arc<Shared>);
+
+#[derive(Debug)]
+struct Shared {
+    memory: Memory,
+    /// The part of it that is for streams.
+    part: Memory,
+    places: Mutex<Places>,
+    limits: Limits,
+}
+
+impl Rooms {
+    /// Room for as many streams as there may be.
+    #[must_use]
+    pub fn new(memory: &Memory, limits: Limits) -> Self {
+        let part = Memory::with_room(Self::part_bytes(memory));
+        let places = Mutex::new(Places::new(limits.streams));
+        Self(Arc::new(Shared { memory: memory.clone(), part, places, limits }))
+    }
+
+    /// How many streams there may be, however little each of them needs.
+    #[must_use]
+    pub fn most_streams(memory: &Memory) -> usize {
+        usize::try_from(Self::part_bytes(memory) / 2 / STREAM_BYTES).unwrap_or(usize::MAX)
+    }
+
+    fn part_bytes(memory: &Memory) -> u64 {
+        memory.room() / 2
+    }
+
+    /// Room for a stream of `client`: what every one takes. A client may have as many streams as it leaves to others.
+    ///
+    /// # Errors
+    ///
+    /// If there is no place for it, or no memory.
+    pub fn admit(&self, client: Client) -> Result<Room, NotAdmitted> {
+        if !self.places().take(client) {
+            return Err(NotAdmitted::NoPlace);
+        }
+        let place = Place { rooms: self.clone(), client };
+        Ok(Room { _small: self.try_take(STREAM_BYTES)?, large: OnceCell::new(), place })
+    }
+
+    fn try_take(&self, n_bytes: u64) -> Result<Taken, NoRoom> {
+        Ok(Taken { _part: self.0.part.try_take(n_bytes)?, _whole: self.0.memory.try_take(n_bytes)? })
+    }
+
+    async fn take(&self, n_bytes: u64) -> Result<Taken, NoRoom> {
+        Ok(Taken { _part: self.0.part.take(n_bytes).await?, _whole: self.0.memory.take(n_bytes).await? })
+    }
+
+    fn places(&self) -> MutexGuard<'_, Places> {
+        self.0.places.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Why there is no room for one more stream now.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum NotAdmitted {
+    /// As many streams run as may, or as many of this client's.
+    #[error("as many streams run as may")]
+    NoPlace,
+    /// There is no memory for it.
+    #[error("there is no memory for one more stream now")]
+    NoRoom(#[from] NoRoom),
+}
+
+/// Memory that a stream has taken, until this is dropped.
+#[derive(Debug)]
+pub struct Taken {
+    _part: Held,
+    _whole: Held,
+}
+
+/// A place for a stream, until this is dropped.
+#[derive(Debug)]
+struct Place {
+    rooms: Rooms,
+    client: Client,
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        self.rooms.places().give_back(self.client);
+    }
+}
+
+/// What a stream takes of the service.
 ///
 /// Not counted is what has come of a frame that is not complete, of which a transport may not tell.
 #[derive(Debug)]
 pub struct Room {
-    memory: Memory,
-    large: OnceCell<Held>,
-    limits: Limits,
-    _small: Held,
+    large: OnceCell<Taken>,
+    _small: Taken,
+    place: Place,
 }
 
 /// There was no memory for a frame for as long as it may wait for that.
@@ -47,15 +139,6 @@ pub struct Room {
 pub struct Crowded;
 
 impl Room {
-    /// Takes what every stream does.
-    ///
-    /// # Errors
-    ///
-    /// [`NoRoom`] if it is not free.
-    pub fn admit(memory: &Memory, limits: Limits) -> Result<Self, NoRoom> {
-        Ok(Self { memory: memory.clone(), large: OnceCell::new(), limits, _small: memory.try_take(STREAM_BYTES)? })
-    }
-
     /// Takes what buffers need for a frame of `n_bytes`, until the stream ends.
     ///
     /// # Errors
@@ -63,7 +146,7 @@ impl Room {
     /// [`Crowded`] if that is not free for as long as a slow reader is waited for.
     pub async fn take_for_buffers(&self, n_bytes: usize) -> Result<(), Crowded> {
         if n_bytes > SMALL_FRAME_BYTES {
-            let n_bytes = LARGE_FRAMES * self.limits.frame_bytes as u64;
+            let n_bytes = LARGE_FRAMES * self.limits().frame_bytes as u64;
             self.large.get_or_try_init(|| self.take(n_bytes)).await?;
         }
         Ok(())
@@ -74,15 +157,19 @@ impl Room {
     /// # Errors
     ///
     /// [`Crowded`] if that is not free for as long as a slow reader is waited for.
-    pub async fn take_for_frame(&self, n_bytes: usize) -> Result<Option<Held>, Crowded> {
+    pub async fn take_for_frame(&self, n_bytes: usize) -> Result<Option<Taken>, Crowded> {
         self.take_for_buffers(n_bytes).await?;
         let is_small = n_bytes <= SMALL_FRAME_BYTES;
         if is_small { Ok(None) } else { self.take(BYTES_PER_FRAME_BYTE * n_bytes as u64).await.map(Some) }
     }
 
-    async fn take(&self, n_bytes: u64) -> Result<Held, Crowded> {
-        let patience: Duration = self.limits.slow_after;
-        tokio::time::timeout(patience, self.memory.take(n_bytes)).await.map_err(|_| Crowded)?.map_err(|_| Crowded)
+    fn limits(&self) -> Limits {
+        self.place.rooms.0.limits
+    }
+
+    async fn take(&self, n_bytes: u64) -> Result<Taken, Crowded> {
+        let patience: Duration = self.limits().slow_after;
+        tokio::time::timeout(patience, self.place.rooms.take(n_bytes)).await.map_err(|_| Crowded)?.map_err(|_| Crowded)
     }
 }
 
@@ -94,7 +181,7 @@ mod tests {
 
     const LIMITS: Limits = Limits {
         frame_bytes: 256 << 10,
-        streams: 1,
+        streams: 8,
         slow_after: Duration::from_secs(10),
         idle_after: Duration::from_hours(1),
         ping_every: Duration::from_secs(30),
@@ -104,7 +191,7 @@ mod tests {
     async fn a_stream_takes_little_until_a_frame_is_large() {
         let memory = Memory::with_room(8 << 20);
         let taken = || ((8 << 20) - memory.free()) / KIB;
-        let room = Room::admit(&memory, LIMITS).unwrap();
+        let room = Rooms::new(&memory, LIMITS).admit(Client::LOCAL).unwrap();
         assert_eq!(taken(), 64);
         assert!(room.take_for_frame(SMALL_FRAME_BYTES).await.unwrap().is_none());
         assert_eq!(taken(), 64);
@@ -120,10 +207,15 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn a_large_frame_waits_for_memory_but_not_for_ever() {
-        let memory = Memory::with_room(1 << 20);
-        let room = Room::admit(&memory, LIMITS).unwrap();
-        let others = memory.try_take(memory.free()).unwrap();
-        assert!(Room::admit(&memory, LIMITS).is_err());
+        let memory = Memory::with_room(4 << 20);
+        let rooms = Rooms::new(&memory, LIMITS);
+        let room = rooms.admit(Client::LOCAL).unwrap();
+        let others = [1 << 20; 4].map(|most| memory.try_take(memory.free().min(most)).unwrap());
+        assert!(matches!(rooms.admit(Client::LOCAL), Err(NotAdmitted::NoRoom(_))));
+        assert!(
+            rooms.admit(Client::LOCAL).is_err_and(|error| error != NotAdmitted::NoPlace),
+            "its place is given back"
+        );
         let started = tokio::time::Instant::now();
         assert_eq!(room.take_for_buffers(SMALL_FRAME_BYTES + 1).await, Err(Crowded));
         assert_eq!(started.elapsed(), LIMITS.slow_after);
@@ -131,5 +223,30 @@ mod tests {
         assert!(futures_util::poll!(&mut waiting).is_pending());
         drop(others);
         assert_eq!(waiting.await, Ok(()));
+    }
+
+    #[tokio::test]
+    async fn one_client_leaves_as_many_streams_to_others_as_it_has() {
+        let rooms = Rooms::new(&Memory::with_room(16 << 20), LIMITS);
+        let client = |n| Client::from(std::net::IpAddr::from([10, 0, 0, n]));
+        let of_first: Vec<Room> = std::iter::from_fn(|| rooms.admit(client(1)).ok()).collect();
+        assert_eq!(rooms.admit(client(1)).err(), Some(NotAdmitted::NoPlace));
+        let of_second: Vec<Room> = std::iter::from_fn(|| rooms.admit(client(2)).ok()).collect();
+        assert_eq!((of_first.len(), of_second.len()), (5, 2), "of {}", LIMITS.streams);
+        drop(of_first);
+        assert!(rooms.admit(client(2)).is_ok());
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn all_streams_together_take_half_of_the_memory_at_most() {
+        let memory = Memory::with_room(16 << 20);
+        let rooms = Rooms::new(&memory, LIMITS);
+        let room = rooms.admit(Client::LOCAL).unwrap();
+        let mut held = Vec::new();
+        while let Ok(frame) = room.take_for_frame(100 << 10).await {
+            held.push(frame);
+        }
+        assert!(memory.free() >= 8 << 20 && !held.is_empty(), "{}", memory.free());
+        assert!(rooms.admit(Client::LOCAL).is_ok(), "what is small is left to others");
     }
 }

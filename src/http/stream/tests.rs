@@ -21,6 +21,7 @@ use super::*;
 use crate::config::ServeConfig;
 use crate::model::Format;
 use crate::service::{Client, Etude, ModelText, Name};
+use crate::stream::Rooms;
 
 /// Longer than anything here takes; a test that waits for this fails.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -83,7 +84,7 @@ async fn speak<T>(
     client: impl AsyncFnOnce(DuplexStream) -> T,
 ) -> T {
     let (ours, theirs) = tokio::io::duplex(max_bytes);
-    let room = Room::admit(etude.memory(), limits).unwrap();
+    let room = Rooms::new(etude.memory(), limits).admit(Client::LOCAL).unwrap();
     let stopping = CancellationToken::new();
     let socket = server_end(theirs, limits).await;
     let serving = Box::pin(websocket::serve(etude, Client::LOCAL, limits, socket, &room, &stopping));
@@ -239,7 +240,7 @@ async fn who_sends_lines_without_end_and_reads_none_is_let_go_and_gives_its_memo
     let caller = Caller { client: Client::LOCAL, arrived: std::time::Instant::now(), now: Timestamp::now() };
     etude.put_model(&Name::new("m").unwrap(), text, format, caller).await.unwrap();
     let free = etude.memory().free();
-    let room = Room::admit(etude.memory(), limits).unwrap();
+    let room = Rooms::new(etude.memory(), limits).admit(Client::LOCAL).unwrap();
     let open = json!({"type": "open", "model": "m", "lookahead": 1}).to_string();
     let observe = |seq: u32| json!({"type": "observe", "seq": seq, "states": [{"x": seq % 2}]}).to_string();
     let lines = std::iter::once(open).chain((0..).map(observe)).map(|line| Ok::<_, axum::Error>(line + "\n"));
@@ -259,7 +260,7 @@ async fn who_sends_lines_without_end_and_reads_none_is_let_go_and_gives_its_memo
 async fn a_line_without_an_end_takes_its_memory_before_it_is_complete_and_no_more_than_a_frame() {
     let memory = crate::memory::Memory::with_room(8 << 20);
     let limits = Flags::parse_from(["etude"]).config.stream_limits();
-    let room = Room::admit(&memory, limits).unwrap();
+    let room = Rooms::new(&memory, limits).admit(Client::LOCAL).unwrap();
     let before = memory.free();
     let (came, mut incoming) = crate::stream::queue(crate::stream::QUEUE_BYTES);
     let (begins, body) = mpsc::channel::<Result<Vec<u8>, axum::Error>>(1);

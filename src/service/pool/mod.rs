@@ -31,7 +31,7 @@ use tokio_util::task::TaskTracker;
 
 use super::Client;
 use crate::interrupt::{Cancelled, Interrupt, Signal};
-pub(super) use turns::Places;
+pub(crate) use turns::Places;
 use turns::{Class, LENT_AFTER, Level, Ticket, Turns};
 
 /// How long a job, or all jobs of a request together, may run before it is long. Most are over by then.
