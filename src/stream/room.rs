@@ -5,8 +5,6 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use tokio::sync::OnceCell;
-
 use super::engine::Limits;
 use super::queue::QUEUE_BYTES;
 use crate::memory::{Held, Memory, NoRoom};
@@ -22,14 +20,14 @@ pub const WRITE_BUFFER_BYTES: usize = 8 << 10;
 /// Frames up to this size need no more memory than every stream has; larger ones take theirs.
 pub const SMALL_FRAME_BYTES: usize = 16 << 10;
 
-/// What every stream takes for its buffers: what was read, frames that wait to be handled, frames that wait to be written, and a frame
-/// that is written with what was gathered before. 64 KiB.
+/// What every stream takes for its buffers: what was read, and may be a part of a frame of what was put together of it; frames that wait to
+/// be handled; frames that wait to be written; and a frame that is written with what was gathered before. 80 KiB.
 const STREAM_BYTES: u64 =
-    (READ_BUFFER_BYTES + QUEUE_BYTES as usize + QUEUE_BYTES as usize + WRITE_BUFFER_BYTES + SMALL_FRAME_BYTES) as u64;
+    (3 * READ_BUFFER_BYTES + QUEUE_BYTES as usize + QUEUE_BYTES as usize + WRITE_BUFFER_BYTES + SMALL_FRAME_BYTES)
+        as u64;
 
-/// What a stream takes besides, once a frame is larger than small, until its end, as buffers do not shrink: so many of the largest frames.
-/// One is read while another one waits to be written and a third one is.
-const LARGE_FRAMES: u64 = 3;
+/// What a frame takes that is larger than small while it comes, for each of its bytes, as what it is collected in may be twice as large.
+const BYTES_PER_READ_BYTE: u64 = 2;
 
 /// What a frame takes that is larger than small while it is handled, for each of its bytes: its text, and what is read from that.
 const BYTES_PER_FRAME_BYTE: u64 = 16;
@@ -76,7 +74,7 @@ impl Rooms {
             return Err(NotAdmitted::NoPlace);
         }
         let place = Place { rooms: self.clone(), client };
-        Ok(Room { _small: self.try_take(STREAM_BYTES)?, large: OnceCell::new(), place })
+        Ok(Room { _small: self.try_take(STREAM_BYTES)?, reading: Mutex::default(), place })
     }
 
     fn try_take(&self, n_bytes: u64) -> Result<Taken, NoRoom> {
@@ -124,11 +122,10 @@ impl Drop for Place {
 }
 
 /// What a stream takes of the service.
-///
-/// Not counted is what has come of a frame that is not complete, of which a transport may not tell.
 #[derive(Debug)]
 pub struct Room {
-    large: OnceCell<Taken>,
+    /// For the frame that comes.
+    reading: Mutex<Vec<Taken>>,
     _small: Taken,
     place: Place,
 }
@@ -139,28 +136,46 @@ pub struct Room {
 pub struct Crowded;
 
 impl Room {
-    /// Takes what buffers need for a frame of `n_bytes`, until the stream ends.
+    /// Takes what so many more bytes of a frame need that is larger than small, until [`Self::has_read`].
     ///
     /// # Errors
     ///
     /// [`Crowded`] if that is not free for as long as a slow reader is waited for.
-    pub async fn take_for_buffers(&self, n_bytes: usize) -> Result<(), Crowded> {
-        if n_bytes > SMALL_FRAME_BYTES {
-            let n_bytes = LARGE_FRAMES * self.limits().frame_bytes as u64;
-            self.large.get_or_try_init(|| self.take(n_bytes)).await?;
-        }
+    pub async fn take_to_read(&self, n_bytes: u64) -> Result<(), Crowded> {
+        let taken = self.take(BYTES_PER_READ_BYTE * n_bytes).await?;
+        self.reading().push(taken);
         Ok(())
     }
 
-    /// Takes what a frame of `n_bytes` needs that came, until it is handled.
+    /// Gives back what was taken to read a frame, which is complete.
+    pub fn has_read(&self) {
+        self.reading().clear();
+    }
+
+    /// Takes what a frame of `n_bytes` needs that came, until it is handled: nothing if it is small.
     ///
     /// # Errors
     ///
     /// [`Crowded`] if that is not free for as long as a slow reader is waited for.
-    pub async fn take_for_frame(&self, n_bytes: usize) -> Result<Option<Taken>, Crowded> {
-        self.take_for_buffers(n_bytes).await?;
-        let is_small = n_bytes <= SMALL_FRAME_BYTES;
-        if is_small { Ok(None) } else { self.take(BYTES_PER_FRAME_BYTE * n_bytes as u64).await.map(Some) }
+    pub async fn take_to_handle(&self, n_bytes: usize) -> Result<Option<Taken>, Crowded> {
+        self.take_if_large(n_bytes, BYTES_PER_FRAME_BYTE).await
+    }
+
+    /// Takes what a frame of `n_bytes` needs that goes to the client, until it is written: nothing if it is small.
+    ///
+    /// # Errors
+    ///
+    /// [`Crowded`] if that is not free for as long as a slow reader is waited for.
+    pub async fn take_to_write(&self, n_bytes: usize) -> Result<Option<Taken>, Crowded> {
+        self.take_if_large(n_bytes, 1).await
+    }
+
+    async fn take_if_large(&self, n_bytes: usize, bytes_per_byte: u64) -> Result<Option<Taken>, Crowded> {
+        if n_bytes <= SMALL_FRAME_BYTES { Ok(None) } else { self.take(bytes_per_byte * n_bytes as u64).await.map(Some) }
+    }
+
+    fn reading(&self) -> MutexGuard<'_, Vec<Taken>> {
+        self.reading.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     fn limits(&self) -> Limits {
@@ -188,19 +203,24 @@ mod tests {
     };
 
     #[tokio::test]
-    async fn a_stream_takes_little_until_a_frame_is_large() {
-        let memory = Memory::with_room(8 << 20);
-        let taken = || ((8 << 20) - memory.free()) / KIB;
+    async fn a_stream_takes_little_but_while_a_large_frame_is_read_handled_or_written() {
+        let memory = Memory::with_room(16 << 20);
+        let taken = || ((16 << 20) - memory.free()) / KIB;
         let room = Rooms::new(&memory, LIMITS).admit(Client::LOCAL).unwrap();
-        assert_eq!(taken(), 64);
-        assert!(room.take_for_frame(SMALL_FRAME_BYTES).await.unwrap().is_none());
-        assert_eq!(taken(), 64);
-        let held = room.take_for_frame(100 << 10).await.unwrap();
-        assert_eq!(taken(), 64 + 3 * 256 + 16 * 100);
+        assert_eq!(taken(), 80);
+        assert!(room.take_to_handle(SMALL_FRAME_BYTES).await.unwrap().is_none());
+        assert!(room.take_to_write(SMALL_FRAME_BYTES).await.unwrap().is_none());
+        room.take_to_read(60 * KIB).await.unwrap();
+        room.take_to_read(40 * KIB).await.unwrap();
+        assert_eq!(taken(), 80 + 2 * 100);
+        let held = room.take_to_handle(100 << 10).await.unwrap();
+        room.has_read();
+        assert_eq!(taken(), 80 + 16 * 100);
         drop(held);
-        assert_eq!(taken(), 64 + 3 * 256, "buffers do not shrink");
-        room.take_for_buffers(200 << 10).await.unwrap();
-        assert_eq!(taken(), 64 + 3 * 256);
+        let held = room.take_to_write(100 << 10).await.unwrap();
+        assert_eq!(taken(), 80 + 100);
+        drop(held);
+        assert_eq!(taken(), 80, "nothing large is left");
         drop(room);
         assert_eq!(taken(), 0);
     }
@@ -217,9 +237,9 @@ mod tests {
             "its place is given back"
         );
         let started = tokio::time::Instant::now();
-        assert_eq!(room.take_for_buffers(SMALL_FRAME_BYTES + 1).await, Err(Crowded));
+        assert_eq!(room.take_to_read(20 * KIB).await, Err(Crowded));
         assert_eq!(started.elapsed(), LIMITS.slow_after);
-        let mut waiting = Box::pin(room.take_for_buffers(SMALL_FRAME_BYTES + 1));
+        let mut waiting = Box::pin(room.take_to_read(20 * KIB));
         assert!(futures_util::poll!(&mut waiting).is_pending());
         drop(others);
         assert_eq!(waiting.await, Ok(()));
@@ -243,7 +263,7 @@ mod tests {
         let rooms = Rooms::new(&memory, LIMITS);
         let room = rooms.admit(Client::LOCAL).unwrap();
         let mut held = Vec::new();
-        while let Ok(frame) = room.take_for_frame(100 << 10).await {
+        while let Ok(frame) = room.take_to_handle(100 << 10).await {
             held.push(frame);
         }
         assert!(memory.free() >= 8 << 20 && !held.is_empty(), "{}", memory.free());
