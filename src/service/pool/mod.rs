@@ -459,6 +459,15 @@ impl Admission {
         Self { patience, ..self }
     }
 
+    /// Takes the place, if it was not taken before.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Busy`] if there is none.
+    pub(super) fn take(&self) -> Result<(), PoolError> {
+        self.place().map(|_| ())
+    }
+
     /// The place, which is taken if it was not before.
     fn place(&self) -> Result<Arc<Place>, PoolError> {
         if let Some(place) = self.place.get() {
