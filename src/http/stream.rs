@@ -83,14 +83,17 @@ struct Inlet<'s> {
 impl Inlet<'_> {
     /// Passes on a frame once there is room and memory for it. Breaks if nothing that comes after it will be wanted.
     async fn pass_on(&self, text: Bytes) -> ControlFlow<()> {
+        // It is not handled, and takes no memory for that, before there is room for it.
+        let Ok(reserved) = self.came.reserve(text.len()).await else { return ControlFlow::Break(()) };
         let memory = self.room.take_to_handle(text.len()).await;
         if text.len() > SMALL_FRAME_BYTES {
             self.room.has_read();
         }
-        match memory {
-            Ok(memory) => self.tell(Incoming::Frame { text, memory }).await,
-            Err(_) => self.tell(Incoming::Crowded).await,
-        }
+        let (incoming, is_last) = match memory {
+            Ok(memory) => (Incoming::Frame { text, memory }, false),
+            Err(_) => (Incoming::Crowded, true),
+        };
+        if reserved.send(incoming).is_err() || is_last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     }
 
     async fn tell(&self, incoming: Incoming) -> ControlFlow<()> {

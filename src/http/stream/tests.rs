@@ -126,6 +126,24 @@ async fn a_large_frame_takes_its_memory_before_it_comes_and_leaves_nothing_of_it
 }
 
 #[tokio::test]
+async fn a_frame_that_waits_for_the_one_before_it_takes_no_memory_to_be_handled() {
+    let memory = crate::memory::Memory::with_room(256 << 20);
+    let limits = Flags::parse_from(["etude"]).config.stream_limits();
+    let room = Rooms::new(&memory, limits).admit(Client::LOCAL).unwrap();
+    let (came, mut incoming) = crate::stream::queue(crate::stream::QUEUE_BYTES);
+    let inlet = Inlet { came, room: &room };
+    let large = || Bytes::from(vec![b' '; 100_000]);
+    assert!(inlet.pass_on(large()).await.is_continue());
+    let (free, first) = (memory.free(), incoming.recv().await.unwrap());
+    let mut second = Box::pin(inlet.pass_on(large()));
+    assert!(futures_util::poll!(&mut second).is_pending());
+    assert_eq!(memory.free(), free);
+    drop(first);
+    assert!(second.await.is_continue());
+    assert_eq!(memory.free(), free);
+}
+
+#[tokio::test]
 async fn a_websocket_hears_of_large_frames_in_pieces_and_of_all_else_as_it_came() {
     let (etude, limits, _directory) = application(&[]).await;
     let rooms = Rooms::new(etude.memory(), limits);
