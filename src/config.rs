@@ -12,7 +12,7 @@ use crate::http::{self, ConnectionLimits};
 use crate::memory::{self, Memory};
 use crate::model;
 use crate::service::{PoolSettings, Settings, TimeLimits};
-use crate::stream::Limits;
+use crate::stream::{Limits, Rooms};
 
 /// Settings of the service.
 #[derive(Args, Clone, Debug)]
@@ -78,7 +78,8 @@ pub struct ServeConfig {
         long, env = "ETUDE_MAX_CONNECTIONS", default_value_t = 10_000, value_parser = parse_connections, value_name = "N"
     )]
     pub max_connections: usize,
-    /// Streams that may run at the same time, of three quarters of the connections at most; further ones are answered 503.
+    /// Streams that may run at the same time, half of them of one client, on three quarters of the connections and in a quarter of the
+    /// memory at most; further ones are answered 503.
     #[arg(long, env = "ETUDE_MAX_STREAMS", default_value_t = 4096, value_parser = parse_places, value_name = "N")]
     pub max_streams: usize,
     /// How long a session may be idle before it expires.
@@ -162,10 +163,12 @@ impl ServeConfig {
     /// What a stream may use.
     #[must_use]
     pub fn stream_limits(&self) -> Limits {
+        let memory = Memory::new(self.max_memory.unwrap_or_else(memory::default_max_bytes));
+        let by_connections = self.max_connections - self.max_connections / 4;
         Limits {
             frame_bytes: STREAM_FRAME_BYTES,
             // Whatever streams there are, requests get through.
-            streams: self.max_streams.min(self.max_connections - self.max_connections / 4),
+            streams: self.max_streams.min(by_connections).min(Rooms::most_streams(&memory)),
             slow_after: self.slow_reader_timeout,
             idle_after: self.session_idle_timeout,
             ping_every: STREAM_PING_INTERVAL,

@@ -14,11 +14,12 @@
 //! `--max-memory` is, nothing large is begun, whatever was counted.
 
 use std::fs;
+use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore};
 
 /// Memory is taken in units of this size, of which there can be 2^32.
 const UNIT_BYTES: u64 = 4096;
@@ -39,12 +40,20 @@ pub struct NoRoom {
     pub room: u64,
 }
 
+/// How long whoever waits for memory leaves it at that, once what was given back was not enough: any number may wait.
+const WAITING_PAUSE: Duration = Duration::from_millis(20);
+
 /// The budget. Clones share it.
 #[derive(Clone, Debug)]
-pub struct Memory {
+pub struct Memory(Arc<Budget>);
+
+#[derive(Debug)]
+struct Budget {
     room: u64,
     free: Arc<Semaphore>,
-    resident: Arc<Resident>,
+    /// Told when something is given back, or less is resident.
+    given_back: Notify,
+    resident: Resident,
 }
 
 /// What the process has of the machine's memory.
@@ -69,17 +78,21 @@ impl Memory {
         let base = (max_bytes / 3).max(Self::MIN_BASE_BYTES);
         // What has begun may go on to use what is left beyond this.
         let most = max_bytes - max_bytes / 8;
-        let resident = Arc::new(Resident { most, measured: AtomicU64::new(0) });
-        Self { resident, ..Self::with_room(max_bytes.saturating_sub(base)) }
+        Self::with(max_bytes.saturating_sub(base), most)
     }
 
     /// A budget that has all of `n_bytes` for whoever asks.
     #[must_use]
     pub fn with_room(n_bytes: u64) -> Self {
+        Self::with(n_bytes, u64::MAX)
+    }
+
+    fn with(n_bytes: u64, most_resident: u64) -> Self {
         let n_units = (n_bytes / UNIT_BYTES).min(u64::from(u32::MAX));
         let n_permits = usize::try_from(n_units).unwrap_or(usize::MAX).min(Semaphore::MAX_PERMITS);
-        let resident = Resident { most: u64::MAX, measured: AtomicU64::new(0) };
-        Self { room: n_bytes, free: Arc::new(Semaphore::new(n_permits)), resident: Arc::new(resident) }
+        let resident = Resident { most: most_resident, measured: AtomicU64::new(0) };
+        let free = Arc::new(Semaphore::new(n_permits));
+        Self(Arc::new(Budget { room: n_bytes, free, given_back: Notify::new(), resident }))
     }
 
     /// Measures what is resident, again and again. Where that cannot be found out, the budget is what is counted.
@@ -95,26 +108,28 @@ impl Memory {
 
     /// Notes that the process has so much of the machine's memory now.
     fn note_resident(&self, n_bytes: u64) {
-        self.resident.measured.store(n_bytes, Ordering::Relaxed);
+        if n_bytes < self.0.resident.measured.swap(n_bytes, Ordering::Relaxed) {
+            self.0.given_back.notify_waiters();
+        }
     }
 
     /// How much there is when nobody uses any, in bytes.
     #[must_use]
     pub fn room(&self) -> u64 {
-        self.room
+        self.0.room
     }
 
     /// How much nobody uses now, in bytes.
     #[must_use]
     pub fn free(&self) -> u64 {
-        self.free.available_permits() as u64 * UNIT_BYTES
+        self.0.free.available_permits() as u64 * UNIT_BYTES
     }
 
     /// How much of that something large may take now, in bytes.
     #[must_use]
     pub fn free_for_large(&self) -> u64 {
-        let not_resident = self.resident.most.saturating_sub(self.resident.measured.load(Ordering::Relaxed));
-        self.free().saturating_sub(self.room / 8).min(not_resident)
+        let not_resident = self.0.resident.most.saturating_sub(self.0.resident.measured.load(Ordering::Relaxed));
+        self.free().saturating_sub(self.0.room / 8).min(not_resident)
     }
 
     /// Takes `n_bytes` if they are free.
@@ -146,30 +161,44 @@ impl Memory {
         if n_in_all > SMALL_BYTES && n_bytes > self.free_for_large() {
             return Err(self.no_room(n_bytes));
         }
-        let permit = Arc::clone(&self.free).try_acquire_many_owned(self.units(n_bytes)?);
+        let permit = Arc::clone(&self.0.free).try_acquire_many_owned(self.units(n_bytes)?);
         let permit = permit.map_err(|_| self.no_room(n_bytes))?;
         Ok(Held { memory: self.clone(), permit })
     }
 
-    /// Takes `n_bytes` once they are free. Whoever waits longest is served first.
+    /// Takes `n_bytes` once they are free. Whoever waits holds nothing back: others may take meanwhile what would not be enough for it,
+    /// so that it may wait for as long as it likes to.
     ///
     /// # Errors
     ///
     /// [`NoRoom`] if there is never so much.
     pub async fn take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
-        let n_units = self.units(n_bytes)?;
-        let permit = Arc::clone(&self.free).acquire_many_owned(n_units).await.map_err(|_| self.no_room(n_bytes))?;
-        Ok(Held { memory: self.clone(), permit })
+        let most = if n_bytes > SMALL_BYTES { self.0.room - self.0.room / 8 } else { self.0.room };
+        if n_bytes > most {
+            return Err(self.no_room(n_bytes));
+        }
+        loop {
+            let mut given_back = pin!(self.0.given_back.notified());
+            given_back.as_mut().enable();
+            if let Ok(held) = self.try_take(n_bytes) {
+                return Ok(held);
+            }
+            given_back.await;
+            if let Ok(held) = self.try_take(n_bytes) {
+                return Ok(held);
+            }
+            tokio::time::sleep(WAITING_PAUSE).await;
+        }
     }
 
     /// What `n_bytes` are in units, if there is so much at all.
     fn units(&self, n_bytes: u64) -> Result<u32, NoRoom> {
-        let n_units = if n_bytes <= self.room { u32::try_from(n_bytes.div_ceil(UNIT_BYTES)).ok() } else { None };
+        let n_units = if n_bytes <= self.0.room { u32::try_from(n_bytes.div_ceil(UNIT_BYTES)).ok() } else { None };
         n_units.ok_or_else(|| self.no_room(n_bytes))
     }
 
     fn no_room(&self, wanted: u64) -> NoRoom {
-        NoRoom { wanted, room: self.room }
+        NoRoom { wanted, room: self.0.room }
     }
 }
 
@@ -195,7 +224,10 @@ impl Held {
     pub fn grow_to(&mut self, n_bytes: u64) -> Result<(), NoRoom> {
         if n_bytes > self.n_bytes() {
             let more = self.memory.try_take_for(n_bytes, n_bytes - self.n_bytes());
-            self.permit.merge(more.map_err(|_| self.memory.no_room(n_bytes))?.permit);
+            let mut more = more.map_err(|_| self.memory.no_room(n_bytes))?;
+            if let Some(all) = more.permit.split(more.permit.num_permits()) {
+                self.permit.merge(all);
+            }
         }
         Ok(())
     }
@@ -204,6 +236,13 @@ impl Held {
     pub fn shrink_to(&mut self, n_bytes: u64) {
         let kept = usize::try_from(n_bytes.div_ceil(UNIT_BYTES)).unwrap_or(usize::MAX);
         drop(self.permit.split(self.permit.num_permits().saturating_sub(kept)));
+        self.memory.0.given_back.notify_waiters();
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        self.shrink_to(0);
     }
 }
 
@@ -336,18 +375,37 @@ mod tests {
         assert!((MIB..1 << 40).contains(&resident_bytes().unwrap()));
     }
 
+    #[tokio::test(start_paused = true)]
+    async fn who_waits_for_much_gets_it_in_the_end_and_keeps_nobody_waiting() {
+        let memory = Memory::with_room(16 * MIB);
+        let [half, quarter] = [8, 4].map(|n| memory.try_take(n * MIB).unwrap());
+        let mut much = Box::pin(memory.take(12 * MIB));
+        assert!(poll!(&mut much).is_pending());
+        let little = memory.try_take(2 * MIB).unwrap();
+        assert_eq!(memory.take(1).await.unwrap().n_bytes(), UNIT_BYTES);
+        drop(half);
+        assert!(poll!(&mut much).is_pending(), "it is not enough");
+        drop(memory.try_take(8 * MIB).unwrap());
+        drop(little);
+        drop(quarter);
+        assert_eq!(much.await.unwrap().n_bytes(), 12 * MIB);
+        assert!(memory.take(14 * MIB + 1).await.is_err(), "it would wait for ever");
+    }
+
     #[tokio::test]
-    async fn who_waits_for_much_is_not_passed_over_for_little() {
+    async fn who_waits_is_told_of_what_is_no_longer_needed() {
         let memory = Memory::with_room(MIB);
-        let held = memory.try_take(MIB).unwrap();
-        let mut much = Box::pin(memory.take(MIB));
-        let mut little = Box::pin(memory.take(1));
-        assert!(poll!(&mut much).is_pending() && poll!(&mut little).is_pending());
-        drop(held);
-        assert!(poll!(&mut little).is_pending());
-        drop(much.await.unwrap());
-        assert_eq!(little.await.unwrap().n_bytes(), UNIT_BYTES);
-        assert!(memory.take(MIB + 1).await.is_err(), "it would wait for ever");
+        let mut held = memory.try_take(MIB).unwrap();
+        let mut waiting = Box::pin(memory.take(MIB / 2));
+        assert!(poll!(&mut waiting).is_pending());
+        held.shrink_to(MIB / 2);
+        assert!(waiting.await.is_ok());
+        let memory = Memory::new(320 * MIB);
+        memory.note_resident(300 * MIB);
+        let mut waiting = Box::pin(memory.take(2 * MIB));
+        assert!(poll!(&mut waiting).is_pending());
+        memory.note_resident(20 * MIB);
+        assert!(waiting.await.is_ok(), "less is resident");
     }
 
     #[test]

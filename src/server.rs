@@ -13,7 +13,6 @@ use jiff::Timestamp;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{Signal, SignalKind, signal};
-use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -21,6 +20,7 @@ use crate::config::ServeConfig;
 use crate::http::{self, Access, ConnectionLimits, Context};
 use crate::service::Etude;
 use crate::store::StoreError;
+use crate::stream::Rooms;
 use crate::telemetry;
 
 /// How long answers may take to be sent after searches were aborted.
@@ -103,7 +103,7 @@ impl Server {
             max_model_text_bytes: config.max_model_text_bytes,
             metrics,
             stream_limits,
-            stream_places: Arc::new(Semaphore::new(stream_limits.streams)),
+            stream_rooms: Rooms::new(etude.memory(), stream_limits),
             streams: streams.clone(),
             tasks: tasks.clone(),
         });

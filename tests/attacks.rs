@@ -132,4 +132,7 @@ attacks! {
     demonstrations_that_become_large_do_not_outgrow_the_memory: SparseDemonstrations until Ended,
     long_sessions_that_are_resumed_and_ended_do_not_outgrow_the_memory: LongSessions until Ended,
     policies_that_are_read_at_once_do_not_outgrow_the_memory: LargePolicy until Ended,
+    streams_that_sent_a_large_frame_each_keep_nobody_waiting: LargeFrames until Answered,
+    streams_that_compute_at_once_keep_nobody_waiting: ComputingStreams until Answered,
+    a_cold_model_that_is_asked_for_again_and_again_keeps_nobody_waiting: ColdAgain until Answered,
 }

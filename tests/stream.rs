@@ -1086,6 +1086,42 @@ async fn who_stays_slow_is_closed_as_overloaded() {
     etude.close().await;
 }
 
+#[tokio::test]
+async fn many_frames_that_are_answered_at_once_let_others_have_their_turn() {
+    const N_FRAMES: u64 = 200;
+    let (service, _) = figure_4().await;
+    let abort = CancellationToken::new();
+    let (etude, _directory) = without_service(service, &abort).await;
+    let limits = service::flags(&[]).stream_limits();
+    let (came, mut incoming) = queue(65_536);
+    let (outgoing, mut goes) = queue(1 << 20);
+    came.send(frame(&json!({"type": "open", "model": "figure-4"}))).await.unwrap();
+    let there = std::future::pending();
+    let mut running = Box::pin(etude::stream::run(&etude, CLIENT, limits, &mut incoming, &outgoing, &abort, there));
+    let opened = async {
+        while !matches!(goes.recv().await.unwrap().item, Outgoing::Frame(frame) if frame.contains("opened")) {}
+    };
+    tokio::select! {
+        closed = &mut running => panic!("{closed:?}"),
+        () = opened => {}
+    }
+    for _ in 0..N_FRAMES {
+        came.send(frame(&json!({"type": "observe", "seq": 1, "states": [{"unknown": 1}]}))).await.unwrap();
+    }
+    let mut answered = Vec::new();
+    while answered.iter().sum::<u64>() < N_FRAMES {
+        // As if it was polled anew by the runtime.
+        let is_pending =
+            tokio::task::coop::unconstrained(async { futures_util::poll!(&mut running).is_pending() }).await;
+        assert!(is_pending);
+        answered.push(std::iter::from_fn(|| goes.try_recv()).count() as u64);
+        tokio::task::yield_now().await;
+    }
+    assert!(answered.iter().all(|n| *n <= 40), "{answered:?} at a time");
+    drop(running);
+    etude.close().await;
+}
+
 /// A frame that came.
 fn frame(frame: &Value) -> Incoming {
     Incoming::Frame { text: frame.to_string().into(), memory: None }

@@ -33,7 +33,6 @@ use std::sync::Arc;
 use axum::Router;
 use axum::middleware;
 use metrics_exporter_prometheus::PrometheusHandle;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use utoipa::OpenApi;
@@ -42,8 +41,8 @@ use utoipa::openapi::{Content, Ref, RefOr, ResponseBuilder};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use crate::service::Etude;
-use crate::stream::{Limits, Room};
+use crate::service::{Client, Etude};
+use crate::stream::{Limits, Room, Rooms};
 pub use access::Access;
 pub(crate) use access::{allowed_host, allowed_origin};
 pub use connections::{ConnectionLimits, serve};
@@ -67,8 +66,8 @@ pub struct Context {
     pub metrics: PrometheusHandle,
     /// What a stream may use.
     pub stream_limits: Limits,
-    /// One for each stream that may run.
-    pub stream_places: Arc<Semaphore>,
+    /// Room for them.
+    pub stream_rooms: Rooms,
     /// The streams that run.
     pub streams: TaskTracker,
     /// Whatever else runs.
@@ -79,23 +78,13 @@ pub struct Context {
 type SharedContext = Arc<Context>;
 
 impl Context {
-    /// A place and memory for one more stream, until that is dropped.
-    fn admit_stream(&self) -> Result<StreamPlace, Problem> {
+    /// Room for one more stream of `client`.
+    fn admit_stream(&self, client: Client) -> Result<Room, Problem> {
         if self.stopping.is_cancelled() {
             return Err(Problem::new(ProblemKind::Stopping, "the service is shutting down"));
         }
-        let place = Arc::clone(&self.stream_places).try_acquire_owned();
-        let place = place.map_err(|_| Problem::new(ProblemKind::Busy, "as many streams run as may"))?;
-        let room = Room::admit(self.etude.memory(), self.stream_limits);
-        let room = room.map_err(|_| Problem::new(ProblemKind::Busy, "there is no memory for one more stream now"))?;
-        Ok(StreamPlace { room, _place: place })
+        self.stream_rooms.admit(client).map_err(|error| Problem::new(ProblemKind::Busy, error.to_string()))
     }
-}
-
-/// What a stream takes of the service.
-struct StreamPlace {
-    room: Room,
-    _place: OwnedSemaphorePermit,
 }
 
 #[derive(OpenApi)]

@@ -1,17 +1,20 @@
 //! `/v1/stream` and `/v1/sessions`: the stream protocol over websockets and NDJSON.
 
+mod metered;
 mod ndjson;
+mod pause;
 mod websocket;
 
 use std::ops::ControlFlow;
 use std::time::Duration;
 
 use axum::body::{Body, Bytes};
-use axum::extract::ws::{WebSocketUpgrade, rejection::WebSocketUpgradeRejection};
-use axum::extract::{Request, State};
+use axum::extract::ws::WebSocketUpgrade;
+use axum::extract::{FromRequestParts, Request, State};
 use axum::http::header::CONTENT_TYPE;
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
+use hyper_util::rt::TokioIo;
 use jiff::Timestamp;
 use serde::Serialize;
 use tokio::sync::mpsc;
@@ -29,7 +32,7 @@ use super::problem::{Problem, ProblemKind};
 use crate::attribute::ByAttribute;
 use crate::service::Caller;
 use crate::store::{SessionRow, SessionWeights};
-use crate::stream::{Gone, Incoming, Limits, PROTOCOL, READ_BUFFER_BYTES, Room, Sender, WRITE_BUFFER_BYTES};
+use crate::stream::{Gone, Incoming, PROTOCOL, Room, SMALL_FRAME_BYTES, Sender};
 
 /// How long a closing handshake may take.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -48,37 +51,27 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 pub(super) async fn websocket(
     State(context): State<SharedContext>,
     Caller { client, .. }: Caller,
-    upgrade: Result<WebSocketUpgrade, WebSocketUpgradeRejection>,
+    mut request: Request,
 ) -> Result<Response, Problem> {
+    // The socket is ours, to be read with care. What is left is the handshake, which needs one to speak of.
+    let upgraded = hyper::upgrade::on(&mut request);
+    let (mut parts, _) = request.into_parts();
+    parts.extensions.insert(hyper::upgrade::on(axum::http::Request::new(())));
+    let upgrade = WebSocketUpgrade::from_request_parts(&mut parts, &()).await;
     let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::UpgradeRequired, rejection.body_text()))?;
-    let place = context.admit_stream()?;
-    let limits = context.stream_limits;
-    let upgrade = upgrade
-        .protocols([PROTOCOL])
-        // What is larger is answered without being read.
-        .max_message_size(limits.frame_bytes)
-        .max_frame_size(limits.frame_bytes)
-        .read_buffer_size(READ_BUFFER_BYTES)
-        .write_buffer_size(WRITE_BUFFER_BYTES)
-        .max_write_buffer_size(max_write_buffer_bytes(limits));
-    let span = tracing::Span::current();
-    Ok(upgrade.on_upgrade(move |socket| {
-        let streams = context.streams.clone();
-        let serving = async move {
-            Box::pin(websocket::serve(&context.etude, client, limits, socket, &place.room, &context.stopping)).await;
-            drop(place);
-        };
-        streams.track_future(serving.instrument(span))
-    }))
-}
-
-/// How much may wait in a websocket to be written: what is gathered, a message, and the header of that. There is no more of ours, as
-/// the next message waits for the one before. The rest is for pongs: while the client reads nothing, those that find no room are left out,
-/// but for the last one.
-fn max_write_buffer_bytes(limits: Limits) -> usize {
-    /// Of the headers of a message and of a close frame, and for the pongs.
-    const OTHERS_BYTES: usize = 1024;
-    WRITE_BUFFER_BYTES + limits.message_bytes() + OTHERS_BYTES
+    let room = context.admit_stream(client)?;
+    let (streams, span) = (context.streams.clone(), tracing::Span::current());
+    let serving = async move {
+        // It fails where the connection has ended.
+        if let Ok(socket) = upgraded.await {
+            let (limits, socket) = (context.stream_limits, TokioIo::new(socket));
+            Box::pin(websocket::serve(&context.etude, client, limits, socket, &room, &context.stopping)).await;
+        }
+        drop(room);
+    };
+    streams.spawn(serving.instrument(span));
+    // The one that it has leads nowhere.
+    Ok(upgrade.protocols([PROTOCOL]).on_upgrade(async |_| ()))
 }
 
 /// The way in for frames: a queue, and the memory that they take.
@@ -90,10 +83,17 @@ struct Inlet<'s> {
 impl Inlet<'_> {
     /// Passes on a frame once there is room and memory for it. Breaks if nothing that comes after it will be wanted.
     async fn pass_on(&self, text: Bytes) -> ControlFlow<()> {
-        match self.room.take_for_frame(text.len()).await {
-            Ok(memory) => self.tell(Incoming::Frame { text, memory }).await,
-            Err(_) => self.tell(Incoming::Crowded).await,
+        // It is not handled, and takes no memory for that, before there is room for it.
+        let Ok(reserved) = self.came.reserve(text.len()).await else { return ControlFlow::Break(()) };
+        let memory = self.room.take_to_handle(text.len()).await;
+        if text.len() > SMALL_FRAME_BYTES {
+            self.room.has_read();
         }
+        let (incoming, is_last) = match memory {
+            Ok(memory) => (Incoming::Frame { text, memory }, false),
+            Err(_) => (Incoming::Crowded, true),
+        };
+        if reserved.send(incoming).is_err() || is_last { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
     }
 
     async fn tell(&self, incoming: Incoming) -> ControlFlow<()> {
@@ -132,14 +132,14 @@ pub(super) async fn ndjson(
         let detail = "send frames, one per line, with the header `content-type: application/x-ndjson`";
         return Err(refuse(request, &context, Problem::new(ProblemKind::UnsupportedMediaType, detail)));
     }
-    let place = context.admit_stream()?;
+    let room = context.admit_stream(client)?;
     let body = ndjson::begin_reading(request).await;
     let (lines, answer) = mpsc::channel(1);
     let (streams, span) = (context.streams.clone(), tracing::Span::current());
     let serving = async move {
         let limits = context.stream_limits;
-        ndjson::serve(&context.etude, client, limits, body, lines, &place.room, &context.stopping).await;
-        drop(place);
+        ndjson::serve(&context.etude, client, limits, body, lines, &room, &context.stopping).await;
+        drop(room);
     };
     // The answer is read while the request is still being sent, so this runs beside it.
     streams.spawn(serving.instrument(span));

@@ -12,11 +12,11 @@ use crate::mapping::Mapper;
 use crate::memory::SMALL_BYTES;
 use crate::store::ModelKey;
 
-/// Compiled models by the hash of their content, the least useful evicted. Concurrent requests for a model that is not
-/// there compile it once.
+/// Compiled models by the hash of their content, the least useful evicted.
 ///
 /// A model that is larger than the whole cache is kept all the same until the next such one comes: compiling it takes longer than
-/// most searches, and these need it in memory anyway.
+/// most searches, and these need it in memory anyway. It takes up to a tenth of a second to free one, which is left to the threads that put
+/// others in their place.
 #[derive(Debug)]
 pub(super) struct MapperCache {
     cache: Cache<ModelKey, Kept, SizeBytes>,
@@ -59,9 +59,10 @@ impl MapperCache {
         Self { cache, oversized: Mutex::default() }
     }
 
-    /// Lets as many large models go that nobody searches now as give back `n_bytes`, or none if all of them would not. Small ones stay:
-    /// whoever asks for much memory does not keep others waiting for theirs.
-    pub(super) fn make_room(&self, n_bytes: u64) {
+    /// Lets as many large models go that nobody searches now as give back `n_bytes`, or none if all of them would not. Gives them, to be freed
+    /// where nobody waits for it. Small ones stay: whoever asks for much memory does not keep others waiting for theirs.
+    #[must_use]
+    pub(super) fn make_room(&self, n_bytes: u64) -> Vec<Arc<Mapper>> {
         let mut oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner);
         let idle_oversized = oversized.as_ref().filter(|(_, mapper)| Arc::strong_count(mapper) == 1);
         let oversized_bytes = idle_oversized.map_or(0, |(_, mapper)| mapper.size_bytes() as u64);
@@ -70,22 +71,24 @@ impl MapperCache {
             self.cache.iter().filter(|(_, kept)| kept.size_bytes > SMALL_BYTES && Arc::strong_count(&kept.mapper) == 2);
         let idle: Vec<(ModelKey, u64)> = idle.map(|(key, kept)| (key, kept.size_bytes)).collect();
         if oversized_bytes + idle.iter().map(|(_, size)| size).sum::<u64>() < n_bytes {
-            return;
+            return Vec::new();
         }
+        let mut gone = Vec::new();
         if oversized_bytes > 0 {
-            *oversized = None;
+            gone.extend(oversized.take().map(|(_, mapper)| mapper));
         }
         let mut n_left = n_bytes.saturating_sub(oversized_bytes);
         for (key, size_bytes) in idle {
             if n_left == 0 {
                 break;
             }
-            self.cache.remove(&key);
+            gone.extend(self.cache.remove(&key).map(|(_, kept)| kept.mapper));
             n_left = n_left.saturating_sub(size_bytes);
         }
+        gone
     }
 
-    /// Puts in a model that has just been compiled.
+    /// Puts in a model that has just been compiled. Frees what makes room for it.
     pub(super) fn insert(&self, key: &ModelKey, mapper: &Arc<Mapper>) {
         self.cache.insert(key.clone(), Arc::clone(mapper).into());
         self.keep_if_oversized(key, mapper);
@@ -93,24 +96,7 @@ impl MapperCache {
 
     /// The model with this key, if it is there.
     pub(super) fn get(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
-        self.cache.get(key).map(|kept| kept.mapper)
-    }
-
-    /// The model with this key; `compile` makes it if it is not there.
-    pub(super) async fn get_or_compile<E>(
-        &self,
-        key: &ModelKey,
-        compile: impl Future<Output = Result<Arc<Mapper>, E>>,
-    ) -> Result<Arc<Mapper>, E> {
-        let get_or_compile = async {
-            match self.oversized(key) {
-                Some(mapper) => Ok(mapper.into()),
-                None => compile.await.map(Kept::from),
-            }
-        };
-        let Kept { mapper, .. } = self.cache.get_or_insert_async(key, get_or_compile).await?;
-        self.keep_if_oversized(key, &mapper);
-        Ok(mapper)
+        self.cache.get(key).map(|kept| kept.mapper).or_else(|| self.oversized(key))
     }
 
     fn oversized(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
@@ -123,15 +109,14 @@ impl MapperCache {
         if self.cache.peek(key).is_none() && mapper.size_bytes() as u64 > self.cache.capacity() / 2 {
             let kept = (key.clone(), Arc::clone(mapper));
             // What it replaces may take long to free, which nobody should wait for with the lock in hand.
-            let _replaced = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).replace(kept);
+            let replaced = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).replace(kept);
+            drop(replaced);
         }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::convert::Infallible;
-
     use serde_json::json;
 
     use super::*;
@@ -152,32 +137,30 @@ mod tests {
     }
 
     /// Whether the model had to be compiled.
-    async fn is_compiled(cache: &MapperCache, key: &ModelKey, mapper: &Arc<Mapper>) -> bool {
-        let mut is_compiled = false;
-        let compile = async {
-            is_compiled = true;
-            Ok::<_, Infallible>(Arc::clone(mapper))
-        };
-        cache.get_or_compile(key, compile).await.unwrap();
+    fn is_compiled(cache: &MapperCache, key: &ModelKey, mapper: &Arc<Mapper>) -> bool {
+        let is_compiled = cache.get(key).is_none();
+        if is_compiled {
+            cache.insert(key, mapper);
+        }
         is_compiled
     }
 
-    #[tokio::test]
-    async fn a_model_larger_than_the_cache_is_kept_until_the_next_such_one() {
+    #[test]
+    fn a_model_larger_than_the_cache_is_kept_until_the_next_such_one() {
         let (small, large) = (mapper(2), mapper(9));
         let cache = MapperCache::new(2 * small.size_bytes() as u64);
         assert!(large.size_bytes() > 2 * small.size_bytes());
         cache.insert(&key("small"), &small);
         cache.insert(&key("large"), &large);
-        assert!(!is_compiled(&cache, &key("large"), &large).await);
-        assert!(!is_compiled(&cache, &key("small"), &small).await, "it was not driven out");
-        assert!(is_compiled(&cache, &key("other"), &large).await);
-        assert!(!is_compiled(&cache, &key("other"), &large).await);
-        assert!(is_compiled(&cache, &key("large"), &large).await);
+        assert!(!is_compiled(&cache, &key("large"), &large));
+        assert!(!is_compiled(&cache, &key("small"), &small), "it was not driven out");
+        assert!(is_compiled(&cache, &key("other"), &large));
+        assert!(!is_compiled(&cache, &key("other"), &large));
+        assert!(is_compiled(&cache, &key("large"), &large));
     }
 
-    #[tokio::test]
-    async fn a_model_that_grows_in_long_searches_leaves_the_cache_as_it_came() {
+    #[test]
+    fn a_model_that_grows_in_long_searches_leaves_the_cache_as_it_came() {
         let (growing, other) = (mapper(9), mapper(9));
         let size_bytes = growing.size_bytes();
         let cache = MapperCache::new(size_bytes as u64 * 3 / 2);
@@ -192,16 +175,31 @@ mod tests {
         for name in ["other", "growing", "other", "another", "other"] {
             cache.insert(&key(name), &other);
             assert!(cache.cache.weight() <= cache.cache.capacity(), "{}", cache.cache.weight());
-            assert!(!is_compiled(&cache, &key(name), &other).await);
+            assert!(!is_compiled(&cache, &key(name), &other));
         }
     }
 
-    #[tokio::test]
-    async fn a_model_that_fills_most_of_the_cache_is_kept_in_it() {
+    #[test]
+    fn what_makes_room_is_not_freed_while_others_wait_for_the_cache() {
+        let (large, searched) = (mapper(60), mapper(60));
+        let n_bytes = large.size_bytes() as u64;
+        assert!(n_bytes > SMALL_BYTES);
+        let cache = MapperCache::new(10 * n_bytes);
+        cache.insert(&key("searched"), &searched);
+        cache.insert(&key("large"), &large);
+        drop(large);
+        assert_eq!(cache.make_room(2 * n_bytes).len(), 0, "it would not be enough");
+        let gone = cache.make_room(n_bytes);
+        assert!(gone.iter().all(|mapper| Arc::strong_count(mapper) == 1) && gone.len() == 1);
+        assert!(cache.get(&key("large")).is_none() && cache.get(&key("searched")).is_some());
+    }
+
+    #[test]
+    fn a_model_that_fills_most_of_the_cache_is_kept_in_it() {
         let large = mapper(9);
         let cache = MapperCache::new(large.size_bytes() as u64 * 5 / 4);
-        assert!(is_compiled(&cache, &key("large"), &large).await);
-        assert!(!is_compiled(&cache, &key("large"), &large).await);
+        assert!(is_compiled(&cache, &key("large"), &large));
+        assert!(!is_compiled(&cache, &key("large"), &large));
         assert!(cache.oversized(&key("large")).is_none());
     }
 }

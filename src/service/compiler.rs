@@ -1,12 +1,20 @@
 //! Models made ready to be searched: read from the store, compiled once, however many ask for them.
 //!
-//! What was begun is finished, also if nobody waits for it any more: whoever asks again finds it.
+//! ```text
+//! whoever asks first: a place in the pool -> a task: store -> memory -> pool -> cache
+//!                                                |
+//! whoever asks meanwhile, without a place -------+ waits for it, until its deadline
+//! ```
+//!
+//! What was begun is finished, also if nobody waits for it any more: whoever asks again finds it. Whoever leaves leaves nothing behind.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use futures_util::future::OptionFuture;
+use rustc_hash::FxHashMap;
 use sha2::{Digest, Sha256};
+use tokio::sync::watch;
 use tokio_util::task::TaskTracker;
 use tracing::Instrument;
 
@@ -30,6 +38,23 @@ pub(super) struct Compiler {
     memory: Memory,
     max_time: Duration,
     tasks: TaskTracker,
+    /// What is being made ready.
+    coming: Arc<Mutex<FxHashMap<ModelKey, Coming>>>,
+}
+
+/// Gives a model, or why there is none, once that is known.
+type Coming = watch::Receiver<Option<Result<Arc<Mapper>, Arc<ServiceError>>>>;
+
+/// A model is being made ready until this is dropped.
+struct Begun {
+    compiler: Compiler,
+    key: ModelKey,
+}
+
+impl Drop for Begun {
+    fn drop(&mut self) {
+        self.compiler.coming().remove(&self.key);
+    }
 }
 
 impl Compiler {
@@ -41,21 +66,28 @@ impl Compiler {
             memory: settings.memory.clone(),
             max_time: settings.time_limits.compile,
             tasks,
+            coming: Arc::default(),
         }
     }
 
-    /// Takes the memory for compiling what needs about `n_bytes`, in place of large models that nobody searches now if need be.
+    fn coming(&self) -> MutexGuard<'_, FxHashMap<ModelKey, Coming>> {
+        self.coming.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Takes the memory for compiling what needs about `n_bytes`, in place of large models that nobody searches now if need be. It takes
+    /// time to free these.
     ///
     /// # Errors
     ///
     /// [`NoRoom`] if there is not so much.
     pub(super) fn take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
-        /// Where values differ from state to state, it takes up to three times what counts tell. If there is so much, it is taken, and
-        /// given back once it is known what was needed.
+        /// Where values differ from state to state, it takes up to three times what counts tell. Of what is free beyond that, half is
+        /// taken at most, as others search meanwhile; and given back once it is known what was needed.
         const MOST_OF_COUNTED: u64 = 3;
-        let n_bytes = (MOST_OF_COUNTED * n_bytes).min(n_bytes.max(self.memory.free_for_large()));
+        let beyond = self.memory.free_for_large().saturating_sub(n_bytes) / 2;
+        let n_bytes = n_bytes + beyond.min((MOST_OF_COUNTED - 1) * n_bytes);
         self.memory.try_take(n_bytes).or_else(|_| {
-            self.cache.make_room(n_bytes.saturating_sub(self.memory.free_for_large()));
+            drop(self.cache.make_room(n_bytes.saturating_sub(self.memory.free_for_large())));
             self.memory.try_take(n_bytes)
         })
     }
@@ -85,65 +117,123 @@ impl Compiler {
         Ok(mapper.keeping(held))
     }
 
-    /// The model with this name and key, ready to be searched; compiled by its `place` in the pool, if it has one.
-    async fn ready(
-        self,
-        name: String,
-        key: ModelKey,
-        place: Option<Admission>,
-        pointer: &'static str,
-    ) -> Result<Arc<Mapper>, ServiceError> {
-        let unknown = || unknown(&name, Some(pointer));
-        let compile = async {
-            // Deleted and registered anew in between, it has another hash; then the next request finds that.
-            let row = self.store.model(&name).await?.filter(|row| row.summary.hash == key.hash).ok_or_else(unknown)?;
-            let n_attributes = row.summary.attributes.len();
-            let needed =
-                |size: ModelSize| Model::compiled_bytes(size.n_states, size.n_transitions, n_attributes as u64);
-            let held = self.take(row.summary.size.map_or(0, needed))?;
-            let (text, feed) = match row.definition {
-                StoredDefinition::Text(text) => (ModelText::Whole(text.into_bytes()), None),
-                StoredDefinition::Pieces(id) => {
-                    let (to_reader, reader) = pipe();
-                    let pieces = DefinitionReader::new(&row.summary, id);
-                    (ModelText::Packed(Box::new(|| Ok(Box::new(reader)))), Some(feed(&self.store, pieces, to_reader)))
-                }
-            };
-            // What it was found to be when it was registered, whatever the limit is now.
-            let limits = if key.is_lazy { Limits { max_states: 0, ..Limits::NONE } } else { Limits::NONE };
-            let compiler = self.clone();
-            let ModelSummary { name: model, hash: expected, .. } = row.summary;
-            let job = move |interrupt: &mut dyn Interrupt| {
-                // That of pieces is checked as they come.
-                if let ModelText::Whole(text) = &text
-                    && let Err(error) = check_hash(&model, &hex(&Sha256::digest(text)), &expected)
-                {
-                    return Ok(Err(error.into()));
-                }
-                let definition = text.read(Format::Json, Limits::NONE, interrupt);
-                Ok(match definition {
-                    Ok(definition) => compiler.compile(definition, held, limits, interrupt),
-                    // What was once accepted is read again without faults.
-                    Err(ReadError::Cancelled(_)) => Err(PoolError::Stopped.into()),
-                    Err(error) => Err(corrupt_definition(&model, error.into())),
-                })
-            };
-            let compile = async {
-                match &place {
-                    Some(place) => place.run(None, job).await,
-                    None => self.pool.run_patiently(Client::LOCAL, job).await,
-                }
-            };
-            let (mapper, fed) = tokio::join!(compile, OptionFuture::from(feed));
-            match fed {
-                // It was deleted meanwhile.
-                Some(Err(ServiceError::Store(StoreError::Removed))) => return Err(unknown()),
-                Some(Err(error)) => return Err(error),
-                Some(Ok(())) | None => {}
-            }
-            Ok(Arc::new(mapper??))
+    /// Begins to make the model with this name and key ready, by its `place` in the pool, if it has one; or joins whoever has.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Busy`] if there is no place for it.
+    fn begin(&self, name: &str, key: &ModelKey, place: Option<&Admission>) -> Result<Coming, ServiceError> {
+        let mut coming = self.coming();
+        if let Some(begun) = coming.get(key) {
+            return Ok(begun.clone());
+        }
+        if let Some(mapper) = self.cache.get(key) {
+            return Ok(watch::channel(Some(Ok(mapper))).1);
+        }
+        // However soon its first requester leaves, it waits for its turn.
+        let place = place.map(|place| place.clone().with_patience(None));
+        if let Some(place) = &place {
+            place.take()?;
+        }
+        let (sender, receiver) = watch::channel(None);
+        coming.insert(key.clone(), receiver.clone());
+        let (name, begun) = (name.to_owned(), Begun { compiler: self.clone(), key: key.clone() });
+        let making = async move {
+            let Begun { compiler, key } = &begun;
+            let made = Box::pin(compiler.make_ready(name, key, place)).await;
+            // From here on, it is found in the cache.
+            drop(begun);
+            sender.send_replace(Some(made.map_err(Arc::new)));
         };
-        self.cache.get_or_compile(&key, compile).await
+        self.tasks.spawn(making.instrument(tracing::Span::current()));
+        Ok(receiver)
+    }
+
+    /// Makes the model with this name and key ready, and puts it into the cache.
+    async fn make_ready(
+        &self,
+        name: String,
+        key: &ModelKey,
+        place: Option<Admission>,
+    ) -> Result<Arc<Mapper>, ServiceError> {
+        let unknown = || unknown(&name, None);
+        // Deleted and registered anew in between, it has another hash; then the next request finds that.
+        let row = self.store.model(&name).await?.filter(|row| row.summary.hash == key.hash).ok_or_else(unknown)?;
+        let n_attributes = row.summary.attributes.len();
+        let needed = |size: ModelSize| Model::compiled_bytes(size.n_states, size.n_transitions, n_attributes as u64);
+        let n_bytes = row.summary.size.map_or(0, needed);
+        // Off the async threads, as it may free what takes long to be freed.
+        let compiler = self.clone();
+        let taking = self.tasks.spawn_blocking(move || compiler.take(n_bytes));
+        let held = taking.await.map_err(|_| PoolError::Panicked)??;
+        let (text, feed) = match row.definition {
+            StoredDefinition::Text(text) => (ModelText::Whole(text.into_bytes()), None),
+            StoredDefinition::Pieces(id) => {
+                let (to_reader, reader) = pipe();
+                let pieces = DefinitionReader::new(&row.summary, id);
+                (ModelText::Packed(Box::new(|| Ok(Box::new(reader)))), Some(feed(&self.store, pieces, to_reader)))
+            }
+        };
+        // What it was found to be when it was registered, whatever the limit is now.
+        let limits = if key.is_lazy { Limits { max_states: 0, ..Limits::NONE } } else { Limits::NONE };
+        let compiler = self.clone();
+        let ModelSummary { name: model, hash: expected, .. } = row.summary;
+        let job = move |interrupt: &mut dyn Interrupt| {
+            // That of pieces is checked as they come.
+            if let ModelText::Whole(text) = &text
+                && let Err(error) = check_hash(&model, &hex(&Sha256::digest(text)), &expected)
+            {
+                return Ok(Err(error.into()));
+            }
+            let definition = text.read(Format::Json, Limits::NONE, interrupt);
+            Ok(match definition {
+                Ok(definition) => compiler.compile(definition, held, limits, interrupt),
+                // What was once accepted is read again without faults.
+                Err(ReadError::Cancelled(_)) => Err(PoolError::Stopped.into()),
+                Err(error) => Err(corrupt_definition(&model, error.into())),
+            })
+        };
+        let compile = async {
+            match &place {
+                Some(place) => place.run(None, job).await,
+                None => self.pool.run_patiently(Client::LOCAL, job).await,
+            }
+        };
+        let (mapper, fed) = tokio::join!(compile, OptionFuture::from(feed));
+        match fed {
+            // It was deleted meanwhile.
+            Some(Err(ServiceError::Store(StoreError::Removed))) => return Err(unknown()),
+            Some(Err(error)) => return Err(error),
+            Some(Ok(())) | None => {}
+        }
+        let mapper = Arc::new(mapper??);
+        self.put(key.clone(), &mapper).await;
+        Ok(mapper)
+    }
+
+    /// Puts a model that has just been compiled into the cache.
+    pub(super) async fn put(&self, key: ModelKey, mapper: &Arc<Mapper>) {
+        let (cache, mapper) = (Arc::clone(&self.cache), Arc::clone(mapper));
+        // Off the async threads, as what makes room for it may take long to be freed. It does not fail.
+        let _ = self.tasks.spawn_blocking(move || cache.insert(&key, &mapper)).await;
+    }
+}
+
+/// The error of a compilation, for one of those who waited for it.
+fn shared(error: &ServiceError, name: &str, pointer: &'static str) -> ServiceError {
+    match error {
+        ServiceError::Unknown { .. } => unknown(name, Some(pointer)),
+        ServiceError::Faults(faults) => faults.clone().into(),
+        ServiceError::Pool(error) => (*error).into(),
+        ServiceError::NoRoom(error) => (*error).into(),
+        ServiceError::Store(StoreError::Unavailable(error)) => StoreError::from(*error).into(),
+        ServiceError::Store(StoreError::Closed) => StoreError::Closed.into(),
+        ServiceError::Store(StoreError::Database(error)) => {
+            StoreError::Database(sqlx::Error::Protocol(error.to_string())).into()
+        }
+        ServiceError::Store(StoreError::Corrupt { source, .. }) => corrupt_definition(name, source.to_string().into()),
+        // Nothing else comes of compiling.
+        error => corrupt_definition(name, error.to_string().into()),
     }
 }
 
@@ -212,10 +302,8 @@ impl Etude {
         if let Some(mapper) = self.compiler.cache.get(&key) {
             return Ok((hash, mapper));
         }
-        let compiler = self.compiler.clone();
-        let tasks = compiler.tasks.clone();
-        let ready = compiler.ready(name.to_owned(), key, place.cloned(), pointer);
-        let ready = tasks.spawn(ready.instrument(tracing::Span::current()));
+        let mut coming = self.compiler.begin(name, &key, place)?;
+        let ready = coming.wait_for(Option::is_some);
         let ready = match deadline {
             None => ready.await,
             Some(deadline) => match tokio::time::timeout_at(deadline.into(), ready).await {
@@ -223,6 +311,134 @@ impl Etude {
                 Err(_) => return Err(ServiceError::Compiling { name: name.to_owned() }),
             },
         };
-        Ok((hash, ready.map_err(|_| PoolError::Panicked)??))
+        match ready.ok().as_deref() {
+            Some(Some(Ok(mapper))) => Ok((hash, Arc::clone(mapper))),
+            Some(Some(Err(error))) => Err(shared(error, name, pointer)),
+            Some(None) | None => Err(PoolError::Panicked.into()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio_util::sync::CancellationToken;
+
+    use super::*;
+    use crate::service::{Caller, Name, PoolSettings, TimeLimits};
+
+    /// Longer than anything here takes; a test that waits for this fails.
+    const PATIENCE: Duration = Duration::from_secs(30);
+
+    fn settings(directory: &std::path::Path) -> Settings {
+        Settings {
+            database: directory.join("etude.db"),
+            limits: Limits::DEFAULT,
+            memory: Memory::with_room(64 << 20),
+            model_cache_bytes: 1 << 20,
+            session_idle_timeout: Duration::MAX,
+            time_limits: TimeLimits::DEFAULT,
+            pool: PoolSettings { n_threads: 1, max_waiting: 100, max_long: 1 },
+        }
+    }
+
+    /// An application that has a model, and none at hand.
+    async fn cold(directory: &std::path::Path, tasks: &TaskTracker) -> Etude {
+        let settings = settings(directory);
+        let mut etude = Etude::open(&settings, tasks, CancellationToken::new()).await.unwrap();
+        let world = ModelText::Whole(br#"{"dynamics": {"kind": "wumpus", "width": 4, "height": 4}}"#.to_vec());
+        let caller = Caller { client: Client::LOCAL, arrived: Instant::now(), now: jiff::Timestamp::UNIX_EPOCH };
+        etude.put_model(&Name::new("world").unwrap(), world, Format::Json, caller).await.unwrap();
+        etude.compiler.cache = Arc::new(MapperCache::new(settings.model_cache_bytes));
+        etude
+    }
+
+    /// Keeps all threads of the pool until what it gives is dropped.
+    async fn keep_all_threads(etude: &Etude) -> Vec<std::sync::mpsc::Sender<()>> {
+        let mut kept = Vec::new();
+        for _ in 0..3 {
+            let (until, ends) = std::sync::mpsc::channel::<()>();
+            let (begins, begun) = tokio::sync::oneshot::channel();
+            let pool = etude.pool().clone();
+            tokio::spawn(async move {
+                let job = move |_: &mut dyn Interrupt| {
+                    let _ = begins.send(());
+                    let _ = ends.recv();
+                    Ok(())
+                };
+                pool.run_patiently(Client::LOCAL, job).await
+            });
+            begun.await.unwrap();
+            kept.push(until);
+        }
+        kept
+    }
+
+    #[tokio::test(flavor = "multi_thread")]
+    async fn whoever_leaves_before_a_cold_model_is_ready_leaves_nothing_behind() {
+        let (directory, tasks) = (tempfile::tempdir().unwrap(), TaskTracker::new());
+        let etude = cold(directory.path(), &tasks).await;
+        let kept = keep_all_threads(&etude).await;
+        let before = (tasks.len(), etude.pool().n_jobs());
+        let mut others = Vec::new();
+        for _ in 0..50 {
+            let deadline = Some(Instant::now());
+            let place = etude.pool().admit_when_needed(Client::LOCAL).with_patience(deadline);
+            let left = etude.mapper("world", "/model", Some(&place), deadline).await;
+            assert!(matches!(left, Err(ServiceError::Compiling { .. })), "{left:?}");
+        }
+        assert_eq!(etude.pool().n_jobs(), before.1 + 1, "one place for all");
+        // One that compiles, and what that waits for.
+        assert!(tasks.len() <= before.0 + 2, "{} and {before:?}", tasks.len());
+        for _ in 0..10 {
+            others.push(etude.compiler.begin("world", &etude.store.model_key("world").await.unwrap().unwrap(), None));
+        }
+        drop(kept);
+        let (_, mapper) =
+            tokio::time::timeout(PATIENCE, etude.mapper("world", "/model", None, None)).await.unwrap().unwrap();
+        for other in others {
+            let mut other = other.unwrap();
+            let ready = tokio::time::timeout(PATIENCE, other.wait_for(Option::is_some)).await.unwrap().unwrap();
+            assert!(matches!(&*ready, Some(Ok(same)) if Arc::ptr_eq(same, &mapper)), "it is compiled once");
+        }
+        assert!(etude.compiler.coming().is_empty());
+        etude.close().await;
+    }
+
+    #[tokio::test]
+    async fn an_error_of_compiling_is_told_to_all_who_wait_and_the_next_one_tries_again() {
+        let (directory, tasks) = (tempfile::tempdir().unwrap(), TaskTracker::new());
+        let etude = cold(directory.path(), &tasks).await;
+        let memory = etude.memory().clone();
+        let mut taken: Vec<Held> =
+            [memory.free_for_large(), 1 << 20, 1 << 20, 1 << 20, 1 << 20, 1 << 20, 1 << 20, 1 << 20]
+                .into_iter()
+                .map(|most| memory.try_take(most).unwrap())
+                .collect();
+        taken.extend(std::iter::from_fn(|| memory.try_take(4096).ok()));
+        let asking = || etude.mapper("world", "/model", None, None);
+        let answers = tokio::join!(asking(), asking(), asking());
+        for answer in [answers.0, answers.1, answers.2] {
+            assert!(matches!(answer, Err(ServiceError::NoRoom(_))), "{answer:?}");
+        }
+        drop(taken);
+        assert!(asking().await.is_ok());
+        etude.close().await;
+    }
+
+    #[tokio::test]
+    async fn compiling_leaves_to_searches_half_of_what_is_free_beyond_what_was_counted() {
+        const MIB: u64 = 1 << 20;
+        let (directory, tasks) = (tempfile::tempdir().unwrap(), TaskTracker::new());
+        let etude = cold(directory.path(), &tasks).await;
+        let memory = etude.memory().clone();
+        let free = memory.free_for_large();
+        assert_eq!(free, 56 * MIB);
+        for (counted, expected) in
+            [(4 * MIB, 12 * MIB), (16 * MIB, 36 * MIB), (40 * MIB, 48 * MIB), (56 * MIB, 56 * MIB)]
+        {
+            assert_eq!(etude.compiler.take(counted).unwrap().n_bytes(), expected);
+        }
+        assert!(etude.compiler.take(57 * MIB).is_err());
+        etude.close().await;
     }
 }

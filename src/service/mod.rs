@@ -39,6 +39,7 @@ pub use models::{DefinitionReader, ModelAnswer, ModelDefinition, ModelText, Open
 pub use name::{InvalidName, Name};
 pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
+pub(crate) use pool::Places;
 pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
 pub use sessions::{CommittedSteps, Ended, Observation, Received, Resumed, RewardState, Session, SessionError};
 use tokio_util::sync::CancellationToken;

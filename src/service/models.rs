@@ -278,7 +278,7 @@ impl Etude {
             PutModel::Unchanged(summary) => (Registered::Already, summary),
             PutModel::Conflict { existing_hash } => return Err(conflict(name, existing_hash)),
         };
-        self.compiler.cache.insert(&key, &Arc::new(mapper));
+        self.compiler.put(key, &Arc::new(mapper)).await;
         Ok((registered, summary))
     }
 

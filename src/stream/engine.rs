@@ -11,10 +11,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem, WriteError};
 use super::queue::{Gone, Receiver, Sender, Weighed};
-use super::room::{Crowded, SMALL_FRAME_BYTES};
+use super::room::{Crowded, SMALL_FRAME_BYTES, Taken};
 use crate::document::{self, ParseError, Place};
 use crate::mapping::{CommittedStep, Demonstration};
-use crate::memory::Held;
 use crate::service::{
     Caller, Client, Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
@@ -22,6 +21,13 @@ use crate::store::{AcceptedReward, StoreError, Unavailable};
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
+
+/// After so many bytes of frames, which take about half a millisecond to be answered where nothing is to be searched or stored, others have
+/// their turn.
+const BYTES_IN_A_ROW: usize = 16 << 10;
+
+/// What a frame counts for at least, however short it is.
+const MIN_FRAME_BYTES: usize = 512;
 
 /// What a connection may use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -71,7 +77,7 @@ pub enum Incoming {
         /// Its text.
         text: Bytes,
         /// What it takes of the memory of the service until it is handled, if it is not small.
-        memory: Option<Held>,
+        memory: Option<Taken>,
     },
     /// Something that is no frame: a binary message.
     Binary,
@@ -237,11 +243,17 @@ impl Connection<'_> {
             limits: HelloLimits::from(self.limits),
         })
         .await?;
+        let mut n_bytes = 0;
         loop {
+            if n_bytes >= BYTES_IN_A_ROW {
+                n_bytes = 0;
+                tokio::task::yield_now().await;
+            }
             let Ok(came) = tokio::time::timeout(self.limits.idle_after, incoming.recv()).await else {
                 return Err(Over::because(Closed::NotAllowed, StreamProblem::new("idle", "nothing came for too long")));
             };
             let Some(came) = came else { return Ok(Closed::ByClient) };
+            n_bytes += came.item.n_bytes().max(MIN_FRAME_BYTES);
             // Its room in the queue is given back once it is answered.
             let (frame, memory) = self.read(came.item).await?;
             if let Some(closed) = self.answer(frame, memory).await? {
@@ -251,7 +263,7 @@ impl Connection<'_> {
     }
 
     /// Reads what came: a large frame off the threads that serve others. Gives its memory along.
-    async fn read(&self, came: Incoming) -> Result<(ClientFrame, Option<Held>), Over> {
+    async fn read(&self, came: Incoming) -> Result<(ClientFrame, Option<Taken>), Over> {
         let (text, memory) = text_of(came, self.limits)?;
         if text.len() <= SMALL_FRAME_BYTES {
             return Ok((read_frame(&text)?, memory));
@@ -261,7 +273,7 @@ impl Connection<'_> {
     }
 
     /// Answers a frame, whose memory is `memory`. Gives how the connection ends, if it does.
-    async fn answer(&mut self, frame: ClientFrame, memory: Option<Held>) -> Result<Option<Closed>, Over> {
+    async fn answer(&mut self, frame: ClientFrame, memory: Option<Taken>) -> Result<Option<Closed>, Over> {
         let now = Timestamp::now();
         let caller = Caller { client: self.client, arrived: Instant::now(), now };
         match (frame, &mut self.session) {
@@ -427,7 +439,7 @@ fn not_allowed(detail: &str) -> Over {
 }
 
 /// The text of what came, and its memory.
-fn text_of(came: Incoming, limits: Limits) -> Result<(Bytes, Option<Held>), Over> {
+fn text_of(came: Incoming, limits: Limits) -> Result<(Bytes, Option<Taken>), Over> {
     let bad = |problem| Over::because(Closed::BadFrame, problem);
     match came {
         Incoming::Frame { text, memory } if text.len() <= limits.frame_bytes => Ok((text, memory)),

@@ -17,5 +17,5 @@ mod queue;
 mod room;
 
 pub use engine::{Closed, Incoming, Limits, Outgoing, PROTOCOL, run};
-pub use queue::{Gone, QUEUE_BYTES, Queued, Receiver, Sender, Weighed, queue};
-pub use room::{Crowded, READ_BUFFER_BYTES, Room, SMALL_FRAME_BYTES, WRITE_BUFFER_BYTES};
+pub use queue::{Gone, QUEUE_BYTES, Queued, Receiver, Reserved, Sender, Weighed, queue};
+pub use room::{Crowded, NotAdmitted, READ_BUFFER_BYTES, Room, Rooms, SMALL_FRAME_BYTES, Taken, WRITE_BUFFER_BYTES};

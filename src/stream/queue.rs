@@ -55,9 +55,36 @@ impl<T: Weighed> Sender<T> {
     ///
     /// [`Gone`] if nobody receives any more.
     pub async fn send(&self, item: T) -> Result<(), Gone> {
-        let n_bytes = u32::try_from(item.n_bytes().max(MIN_ITEM_BYTES)).unwrap_or(u32::MAX).min(self.max_bytes);
+        self.reserve(item.n_bytes()).await?.send(item)
+    }
+
+    /// Waits until there is room for something of `n_bytes`, and keeps it.
+    ///
+    /// # Errors
+    ///
+    /// [`Gone`] if nobody receives any more.
+    pub async fn reserve(&self, n_bytes: usize) -> Result<Reserved<'_, T>, Gone> {
+        let n_bytes = u32::try_from(n_bytes.max(MIN_ITEM_BYTES)).unwrap_or(u32::MAX).min(self.max_bytes);
         let room = Arc::clone(&self.room).acquire_many_owned(n_bytes).await.map_err(|_| Gone)?;
-        self.items.send(Queued { item, _room: room }).map_err(|_| Gone)
+        Ok(Reserved { items: &self.items, room })
+    }
+}
+
+/// Room in a queue that is kept for something, until this is dropped.
+#[derive(Debug)]
+pub struct Reserved<'q, T> {
+    items: &'q mpsc::UnboundedSender<Queued<T>>,
+    room: OwnedSemaphorePermit,
+}
+
+impl<T> Reserved<'_, T> {
+    /// Puts `item` in.
+    ///
+    /// # Errors
+    ///
+    /// [`Gone`] if nobody receives any more.
+    pub fn send(self, item: T) -> Result<(), Gone> {
+        self.items.send(Queued { item, _room: self.room }).map_err(|_| Gone)
     }
 }
 

@@ -77,6 +77,12 @@ attacks! {
     LongSessions,
     /// A large policy that is asked for on many connections at the same time.
     LargePolicy,
+    /// Streams that send one frame of almost 256 KiB each, and stay.
+    LargeFrames,
+    /// Streams that look far ahead on a large table, all at once.
+    ComputingStreams,
+    /// Large models, each of which drives another one out of memory, asked for again and again with deadlines of 1 ms.
+    ColdAgain,
 }
 
 /// How much of everything.
@@ -393,6 +399,41 @@ impl Target {
                 let path = self.make_policy(&vec![json!({}); 2 * size.n_observations]).await?;
                 (60, Read, vec![at_once(self.get(&path))])
             }
+            Attack::LargeFrames => {
+                let open = json!({"type": "open", "model": "figure-4", "lookahead": 1}).to_string();
+                let large = format!("{}{}", observing(0, 1), " ".repeat(250_000));
+                let frames = [open, large].map(|text| frame(0x81, text.as_bytes())).concat();
+                // Fewer than one client may have streams where there is little memory.
+                (190, Unread, vec![socket(&frames)])
+            }
+            Attack::ComputingStreams => {
+                let World { demonstration, .. } = self.put_table(size.n_states, size.n_observations).await?;
+                // About as far as a small memory allows.
+                let lookahead = 2_000_000 / size.n_states;
+                let open = json!({"type": "open", "model": "table", "lookahead": lookahead}).to_string();
+                let states = demonstration.as_array().ok_or("a demonstration is a list")?;
+                let observe = |(n, states): (usize, &[Value])| {
+                    json!({"type": "observe", "seq": n * STATES_PER_FRAME, "states": states}).to_string()
+                };
+                let observing = states.chunks(STATES_PER_FRAME).enumerate().map(observe);
+                let frames: Vec<u8> =
+                    std::iter::once(open).chain(observing).flat_map(|text| frame(0x81, text.as_bytes())).collect();
+                (64, Read, vec![socket(&frames)])
+            }
+            Attack::ColdAgain => {
+                let names: Vec<String> = (0..4).map(|n| format!("again-{n}")).collect();
+                for name in &names {
+                    self.put(name, &line(size.n_cold)).await?;
+                }
+                let demonstration = [json!({}), json!({"end": 1})];
+                let ask = |name: &String| {
+                    let request = json!({"model": name, "demonstration": demonstration, "deadline_ms": 1}).to_string();
+                    let head = head("POST", "/v1/policies", &self.host(), JSON, request.len());
+                    let then = (head.replace("connection: close\r\n", "") + &request).into_bytes();
+                    Message { then, n_times: 1000, ..Message::default() }
+                };
+                (64, Unread, names.iter().map(ask).collect())
+            }
         })
     }
 
@@ -450,6 +491,9 @@ impl Target {
         if status.is_success() { Ok(()) } else { Err(format!("{name}: {status}: {}", answer.text().await?).into()) }
     }
 }
+
+/// Observations in a frame.
+const STATES_PER_FRAME: usize = 1000;
 
 /// Between the bytes of a body that does not go on.
 const MOMENT: Duration = Duration::from_millis(50);

@@ -1,7 +1,6 @@
 //! The stream protocol over NDJSON: a line is a frame, in the body of the request and in that of the answer.
 
 use std::convert::Infallible;
-use std::ops::ControlFlow;
 use std::pin::Pin;
 
 use axum::body::{BodyDataStream, Bytes};
@@ -12,9 +11,12 @@ use futures_util::stream::Peekable;
 use tokio::sync::mpsc;
 use tokio_util::sync::CancellationToken;
 
+use super::pause::Pause;
 use super::{CLOSE_TIMEOUT, Inlet};
 use crate::service::{Client, Etude};
-use crate::stream::{self, Closed, Incoming, Limits, Outgoing, QUEUE_BYTES, Receiver, Room, queue};
+use crate::stream::{
+    self, Closed, Incoming, Limits, Outgoing, QUEUE_BYTES, Receiver, Room, SMALL_FRAME_BYTES, Taken, queue,
+};
 
 /// Lines of an answer, on their way into its body.
 pub(super) type Lines = mpsc::Sender<Result<Bytes, Infallible>>;
@@ -68,7 +70,7 @@ pub(super) async fn serve(
 
 /// Passes on lines as frames. Ends with the body, or with a line that ends the stream.
 pub(super) async fn read(mut body: Peekable<BodyDataStream>, frame_bytes: usize, inlet: Inlet<'_>) {
-    let mut line = Vec::new();
+    let (mut line, mut pause) = (Vec::new(), Pause::default());
     while let Some(Ok(chunk)) = body.next().await {
         for part in chunk.split_inclusive(|byte| *byte == b'\n') {
             // A line of which no end comes takes no more than one that is complete.
@@ -77,23 +79,48 @@ pub(super) async fn read(mut body: Peekable<BodyDataStream>, frame_bytes: usize,
                 let _ = inlet.tell(Incoming::TooLarge).await;
                 return;
             }
-            if inlet.room.take_for_buffers(n_bytes).await.is_err() {
-                let _ = inlet.tell(Incoming::Crowded).await;
-                return;
+            if n_bytes > SMALL_FRAME_BYTES {
+                // With the part that makes it large comes what was small.
+                let n_more = if line.len() > SMALL_FRAME_BYTES { part.len() } else { n_bytes };
+                if inlet.room.take_to_read(n_more as u64).await.is_err() {
+                    let _ = inlet.tell(Incoming::Crowded).await;
+                    return;
+                }
             }
             line.extend_from_slice(part);
-            if line.ends_with(b"\n") && pass_on(&mut line, &inlet).await.is_break() {
+            if !line.ends_with(b"\n") {
+                continue;
+            }
+            if line.trim_ascii().is_empty() {
+                line = Vec::new();
+                inlet.room.has_read();
+                pause.count();
+                if let Some(pause) = pause.due() {
+                    pause.await;
+                }
+                continue;
+            }
+            pause.reset();
+            if inlet.pass_on(std::mem::take(&mut line).into()).await.is_break() {
                 return;
             }
         }
     }
-    let _ = pass_on(&mut line, &inlet).await;
+    if !line.trim_ascii().is_empty() {
+        let _ = inlet.pass_on(line.into()).await;
+    }
 }
 
-/// Passes on a line, unless it is blank.
-async fn pass_on(line: &mut Vec<u8>, inlet: &Inlet<'_>) -> ControlFlow<()> {
-    let line = std::mem::take(line);
-    if line.trim_ascii().is_empty() { ControlFlow::Continue(()) } else { inlet.pass_on(line.into()).await }
+/// A line on its way to the client, with its memory.
+struct Line {
+    text: String,
+    _memory: Option<Taken>,
+}
+
+impl AsRef<[u8]> for Line {
+    fn as_ref(&self) -> &[u8] {
+        self.text.as_bytes()
+    }
 }
 
 async fn write(lines: &Lines, mut goes: Receiver<Outgoing>, room: &Room) {
@@ -101,7 +128,10 @@ async fn write(lines: &Lines, mut goes: Receiver<Outgoing>, room: &Room) {
         match outgoing.item {
             Outgoing::Frame(mut text) => {
                 text.push('\n');
-                if room.take_for_buffers(text.len()).await.is_err() || lines.send(Ok(text.into())).await.is_err() {
+                let Ok(memory) = room.take_to_write(text.len()).await else { return };
+                let is_small = memory.is_none();
+                let line = if is_small { text.into() } else { Bytes::from_owner(Line { text, _memory: memory }) };
+                if lines.send(Ok(line)).await.is_err() {
                     return;
                 }
             }

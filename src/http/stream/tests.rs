@@ -1,19 +1,16 @@
 //! Streams over transports without a network.
 
-use std::future::ready;
 use std::time::Duration;
 
-use axum::extract::ws;
 use clap::Parser;
-use futures_util::{Sink, SinkExt, Stream, StreamExt, stream};
+use futures_util::{StreamExt, stream};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream};
 use tokio::time::Instant;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
-use tokio_tungstenite::tungstenite::protocol::frame::coding::CloseCode;
-use tokio_tungstenite::tungstenite::protocol::{self, Role, WebSocketConfig};
+use tokio_tungstenite::tungstenite::protocol::Role;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -21,6 +18,7 @@ use super::*;
 use crate::config::ServeConfig;
 use crate::model::Format;
 use crate::service::{Client, Etude, ModelText, Name};
+use crate::stream::{Limits, Rooms};
 
 /// Longer than anything here takes; a test that waits for this fails.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -41,40 +39,6 @@ async fn application(flags: &[&str]) -> (Etude, Limits, TempDir) {
     (etude, config.stream_limits(), directory)
 }
 
-/// The server's end of a websocket, as axum gives it.
-async fn server_end(
-    io: DuplexStream,
-    limits: Limits,
-) -> impl Stream<Item = Result<ws::Message, axum::Error>> + Sink<ws::Message, Error = axum::Error> {
-    let config = WebSocketConfig::default()
-        .max_message_size(Some(limits.frame_bytes))
-        .max_frame_size(Some(limits.frame_bytes))
-        .read_buffer_size(READ_BUFFER_BYTES)
-        .write_buffer_size(WRITE_BUFFER_BYTES)
-        .max_write_buffer_size(max_write_buffer_bytes(limits));
-    let socket = WebSocketStream::from_raw_socket(io, Role::Server, Some(config)).await;
-    let socket = socket.map(|came| match came {
-        Ok(Message::Text(text)) => Ok(ws::Message::Text(text.as_str().into())),
-        Ok(Message::Binary(bytes)) => Ok(ws::Message::Binary(bytes)),
-        Ok(Message::Ping(bytes)) => Ok(ws::Message::Ping(bytes)),
-        Ok(Message::Pong(bytes)) => Ok(ws::Message::Pong(bytes)),
-        Ok(Message::Close(_) | Message::Frame(_)) => Ok(ws::Message::Close(None)),
-        Err(error) => Err(axum::Error::new(error)),
-    });
-    socket.sink_map_err(axum::Error::new).with(|goes: ws::Message| {
-        ready(Ok::<_, axum::Error>(match goes {
-            ws::Message::Text(text) => Message::text(text.as_str()),
-            ws::Message::Binary(bytes) => Message::Binary(bytes),
-            ws::Message::Ping(bytes) => Message::Ping(bytes),
-            ws::Message::Pong(bytes) => Message::Pong(bytes),
-            ws::Message::Close(close) => Message::Close(close.map(|close| protocol::CloseFrame {
-                code: CloseCode::from(close.code),
-                reason: close.reason.as_str().into(),
-            })),
-        }))
-    })
-}
-
 /// Speaks with a server over a websocket whose two ends hold so many bytes in between. The server is there for as long as `client` is, or
 /// less.
 async fn speak<T>(
@@ -83,10 +47,9 @@ async fn speak<T>(
     client: impl AsyncFnOnce(DuplexStream) -> T,
 ) -> T {
     let (ours, theirs) = tokio::io::duplex(max_bytes);
-    let room = Room::admit(etude.memory(), limits).unwrap();
+    let room = Rooms::new(etude.memory(), limits).admit(Client::LOCAL).unwrap();
     let stopping = CancellationToken::new();
-    let socket = server_end(theirs, limits).await;
-    let serving = Box::pin(websocket::serve(etude, Client::LOCAL, limits, socket, &room, &stopping));
+    let serving = Box::pin(websocket::serve(etude, Client::LOCAL, limits, theirs, &room, &stopping));
     tokio::join!(serving, client(ours)).1
 }
 
@@ -103,8 +66,9 @@ fn frame(first_byte: u8, payload: &[u8]) -> Vec<u8> {
 
 #[tokio::test]
 async fn pongs_that_are_not_read_do_not_pile_up() {
-    const N_PINGS: usize = 40_000;
+    const N_PINGS: usize = 4000;
     let (etude, limits, _directory) = application(&[]).await;
+    tokio::time::pause();
     let n_read = speak((&etude, limits), 1024, async |mut io| {
         let ping = frame(0x89, &[b'x'; 125]);
         for _ in 0..N_PINGS {
@@ -118,9 +82,156 @@ async fn pongs_that_are_not_read_do_not_pile_up() {
         all.len()
     });
     let n_read = tokio::time::timeout(PATIENCE, n_read).await.unwrap();
-    let most = max_write_buffer_bytes(limits) + 4096;
+    let most = websocket::MAX_WRITE_BUFFER_BYTES + 4096;
     assert!(n_read <= most, "{n_read} of the {} bytes of all pongs were kept", 127 * N_PINGS);
     etude.close().await;
+}
+
+/// A frame of any size.
+fn long_frame(first_byte: u8, payload: &[u8]) -> Vec<u8> {
+    [&[first_byte, 0xff], &(payload.len() as u64).to_be_bytes()[..], &[0; 4], payload].concat()
+}
+
+/// A frame of so many bytes that ends a session, of which there is none.
+fn long_end(n_bytes: usize) -> Vec<u8> {
+    let end = json!({"type": "end", "seq": 0}).to_string();
+    let padding = " ".repeat(n_bytes - end.len());
+    (end + &padding).into_bytes()
+}
+
+#[tokio::test]
+async fn a_large_frame_takes_its_memory_before_it_comes_and_leaves_nothing_of_it_behind() {
+    let (etude, limits, _directory) = application(&[]).await;
+    let before = etude.memory().free();
+    let taken = || before - etude.memory().free();
+    let spoken = speak((&etude, limits), 1 << 20, async |mut io| {
+        let frame = long_frame(0x81, &long_end(200_000));
+        let (some, rest) = frame.split_at(50_000);
+        io.write_all(some).await.unwrap();
+        // Until it has been read.
+        let mut hello = [0; 20];
+        io.read_exact(&mut hello).await.unwrap();
+        while taken() < 400_000 {
+            tokio::task::yield_now().await;
+        }
+        assert!(taken() < 500_000, "{}", taken());
+        io.write_all(rest).await.unwrap();
+        let mut all = Vec::new();
+        io.read_to_end(&mut all).await.unwrap();
+        assert!(String::from_utf8_lossy(&all).contains("not-allowed"), "{}", String::from_utf8_lossy(&all));
+    });
+    tokio::time::timeout(PATIENCE, spoken).await.unwrap();
+    assert_eq!(taken(), 0);
+    etude.close().await;
+}
+
+#[tokio::test]
+async fn a_frame_that_waits_for_the_one_before_it_takes_no_memory_to_be_handled() {
+    let memory = crate::memory::Memory::with_room(256 << 20);
+    let limits = Flags::parse_from(["etude"]).config.stream_limits();
+    let room = Rooms::new(&memory, limits).admit(Client::LOCAL).unwrap();
+    let (came, mut incoming) = crate::stream::queue(crate::stream::QUEUE_BYTES);
+    let inlet = Inlet { came, room: &room };
+    let large = || Bytes::from(vec![b' '; 100_000]);
+    assert!(inlet.pass_on(large()).await.is_continue());
+    let (free, first) = (memory.free(), incoming.recv().await.unwrap());
+    let mut second = Box::pin(inlet.pass_on(large()));
+    assert!(futures_util::poll!(&mut second).is_pending());
+    assert_eq!(memory.free(), free);
+    drop(first);
+    assert!(second.await.is_continue());
+    assert_eq!(memory.free(), free);
+}
+
+#[tokio::test]
+async fn a_websocket_hears_of_large_frames_in_pieces_and_of_all_else_as_it_came() {
+    let (etude, limits, _directory) = application(&[]).await;
+    let rooms = Rooms::new(etude.memory(), limits);
+    let large: Vec<u8> = (0..100_001_u32).map(|n| b'a' + u8::try_from(n % 23).unwrap()).collect();
+    let masked = |first_byte, payload: &[u8]| {
+        let mask = [1, 2, 3, 4];
+        let bytes = payload.iter().enumerate().map(|(n, byte)| byte ^ mask[n % 4]);
+        let head = [&[first_byte, 0xff], &(payload.len() as u64).to_be_bytes()[..], &mask].concat();
+        [head, bytes.collect()].concat()
+    };
+    let sent = [
+        frame(0x81, b"small"),
+        masked(0x81, &large),
+        frame(0x89, b"ping"),
+        masked(0x01, &large[..50_000]),
+        frame(0x8a, b"pong"),
+        masked(0x80, &large[50_000..]),
+        frame(0x81, b""),
+    ];
+    for n_at_a_time in [1, 13, 1 << 20] {
+        let room = rooms.admit(Client::LOCAL).unwrap();
+        let (mut ours, theirs) = tokio::io::duplex(n_at_a_time);
+        let mut server =
+            WebSocketStream::from_raw_socket(metered::Metered::new(theirs, &room, 262_144), Role::Server, None).await;
+        let reading = async {
+            let mut came = Vec::new();
+            while let Some(Ok(message)) = server.next().await {
+                came.push(message);
+            }
+            came
+        };
+        let sent = sent.concat();
+        let sending = async {
+            let (mut answers, mut ours) = tokio::io::split(&mut ours);
+            ours.write_all(&sent).await.unwrap();
+            ours.shutdown().await.unwrap();
+            let mut all = Vec::new();
+            answers.read_to_end(&mut all).await.unwrap();
+        };
+        let sending = async { tokio::time::timeout(PATIENCE, sending).await };
+        let came = tokio::select! { came = reading => came, _ = sending => panic!("it reads to the end") };
+        let text = str::from_utf8(&large).unwrap();
+        let ping = |text: &'static str| Message::Ping(text.into());
+        let expected = [
+            Message::text("small"),
+            Message::text(text),
+            ping("ping"),
+            Message::Pong("pong".into()),
+            Message::text(text),
+            Message::text(""),
+        ];
+        assert!(came == expected, "{n_at_a_time} bytes at a time: {} messages", came.len());
+    }
+    etude.close().await;
+}
+
+/// How long it takes until `then` is answered, which ends the stream, after so many messages that say nothing.
+async fn time_to_answer(quiet: &[u8], n_times: usize, then: &[u8]) -> Duration {
+    let (etude, limits, _directory) = application(&[]).await;
+    tokio::time::pause();
+    let started = Instant::now();
+    let took = speak((&etude, limits), 1 << 20, async |mut io| {
+        io.write_all(&[&quiet.repeat(n_times), then].concat()).await.unwrap();
+        let mut all = Vec::new();
+        while !String::from_utf8_lossy(&all).contains("malformed-json") {
+            io.read_buf(&mut all).await.unwrap();
+        }
+        started.elapsed()
+    })
+    .await;
+    tokio::time::resume();
+    etude.close().await;
+    took
+}
+
+#[tokio::test]
+async fn pings_and_parts_that_say_nothing_are_read_slowly_where_there_are_many() {
+    let malformed = frame(0x81, b"{");
+    let [few, many] = [16, 1600].map(|n| (n, frame(0x89, b"there?")));
+    assert_eq!(time_to_answer(&few.1, few.0 - 1, &malformed).await, Duration::ZERO);
+    assert!(time_to_answer(&many.1, many.0, &malformed).await >= Duration::from_secs(1));
+    assert!(time_to_answer(&frame(0x8a, b""), 1600, &malformed).await >= Duration::from_secs(1));
+    // Parts of a message.
+    let parts = [frame(0x01, b"{"), frame(0x00, b"").repeat(1600), frame(0x80, b"")].concat();
+    assert!(time_to_answer(&parts, 1, &[]).await >= Duration::from_secs(1));
+    // Between frames they are none too many.
+    let between = [frame(0x89, b"").repeat(15), frame(0x81, b"{")].concat();
+    assert_eq!(time_to_answer(&between, 1, &[]).await, Duration::ZERO);
 }
 
 #[tokio::test]
@@ -239,7 +350,7 @@ async fn who_sends_lines_without_end_and_reads_none_is_let_go_and_gives_its_memo
     let caller = Caller { client: Client::LOCAL, arrived: std::time::Instant::now(), now: Timestamp::now() };
     etude.put_model(&Name::new("m").unwrap(), text, format, caller).await.unwrap();
     let free = etude.memory().free();
-    let room = Room::admit(etude.memory(), limits).unwrap();
+    let room = Rooms::new(etude.memory(), limits).admit(Client::LOCAL).unwrap();
     let open = json!({"type": "open", "model": "m", "lookahead": 1}).to_string();
     let observe = |seq: u32| json!({"type": "observe", "seq": seq, "states": [{"x": seq % 2}]}).to_string();
     let lines = std::iter::once(open).chain((0..).map(observe)).map(|line| Ok::<_, axum::Error>(line + "\n"));
@@ -256,10 +367,26 @@ async fn who_sends_lines_without_end_and_reads_none_is_let_go_and_gives_its_memo
 }
 
 #[tokio::test(start_paused = true)]
+async fn blank_lines_are_read_slowly_where_there_are_many() {
+    let memory = crate::memory::Memory::with_room(8 << 20);
+    let limits = Flags::parse_from(["etude"]).config.stream_limits();
+    let room = Rooms::new(&memory, limits).admit(Client::LOCAL).unwrap();
+    for (n_blank, expected) in [(15, Duration::ZERO), (1600, Duration::from_secs(1))] {
+        let (came, mut incoming) = crate::stream::queue(crate::stream::QUEUE_BYTES);
+        let lines = Body::from("\n".repeat(n_blank) + "{}\n");
+        let body = ndjson::begin_reading(Request::new(lines)).await;
+        let started = Instant::now();
+        ndjson::read(body, limits.frame_bytes, Inlet { came, room: &room }).await;
+        assert_eq!(started.elapsed(), expected);
+        assert!(matches!(incoming.recv().await.unwrap().item, Incoming::Frame { .. }));
+    }
+}
+
+#[tokio::test(start_paused = true)]
 async fn a_line_without_an_end_takes_its_memory_before_it_is_complete_and_no_more_than_a_frame() {
     let memory = crate::memory::Memory::with_room(8 << 20);
     let limits = Flags::parse_from(["etude"]).config.stream_limits();
-    let room = Room::admit(&memory, limits).unwrap();
+    let room = Rooms::new(&memory, limits).admit(Client::LOCAL).unwrap();
     let before = memory.free();
     let (came, mut incoming) = crate::stream::queue(crate::stream::QUEUE_BYTES);
     let (begins, body) = mpsc::channel::<Result<Vec<u8>, axum::Error>>(1);
@@ -270,7 +397,7 @@ async fn a_line_without_an_end_takes_its_memory_before_it_is_complete_and_no_mor
         // Taken before more is read.
         begins.send(Ok(Vec::new())).await.unwrap();
         begins.reserve().await.unwrap();
-        assert_eq!(before - memory.free(), 3 * limits.frame_bytes as u64);
+        assert_eq!(before - memory.free(), (2 * 100_000_u64).next_multiple_of(4096));
         begins.send(Ok(vec![b'x'; 200_000])).await.unwrap();
         assert!(matches!(incoming.recv().await.unwrap().item, Incoming::TooLarge));
     };

@@ -1,18 +1,31 @@
 //! The stream protocol over a websocket: a message is a frame.
 
 use axum::body::Bytes;
-use axum::extract::ws::{CloseFrame, Message};
 use futures_util::stream::{SplitSink, SplitStream};
-use futures_util::{Sink, SinkExt, Stream, StreamExt};
+use futures_util::{SinkExt, StreamExt};
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::{SetOnce, mpsc};
 use tokio::time::{Instant, MissedTickBehavior};
-use tokio_tungstenite::tungstenite;
+use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::error::ProtocolError;
+use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
+use tokio_tungstenite::tungstenite::protocol::frame::{CloseFrame, Frame};
+use tokio_tungstenite::tungstenite::protocol::{Role, WebSocketConfig};
+use tokio_tungstenite::tungstenite::{Error, Message};
 use tokio_util::sync::CancellationToken;
 
+use super::metered::Metered;
 use super::{CLOSE_TIMEOUT, Inlet};
 use crate::service::{Client, Etude};
-use crate::stream::{self, Closed, Incoming, Limits, Outgoing, QUEUE_BYTES, Receiver, Room, SMALL_FRAME_BYTES, queue};
+use crate::stream::{
+    self, Closed, Crowded, Incoming, Limits, Outgoing, QUEUE_BYTES, READ_BUFFER_BYTES, Receiver, Room,
+    SMALL_FRAME_BYTES, WRITE_BUFFER_BYTES, queue,
+};
+
+/// How much may wait in a websocket to be written: what is gathered, a frame, and the head of that. There is no more of ours, as
+/// the next frame waits for the one before. The rest is for pongs: while the client reads nothing, those that find no room are left out,
+/// but for the last one.
+pub(super) const MAX_WRITE_BUFFER_BYTES: usize = WRITE_BUFFER_BYTES + SMALL_FRAME_BYTES + 1024;
 
 /// A client is gone of which nothing came for so many intervals, after all but the first of which it was asked for a sign of life.
 const MAX_SILENT_INTERVALS: u32 = 3;
@@ -29,8 +42,17 @@ pub(super) async fn serve<S>(
     room: &Room,
     stopping: &CancellationToken,
 ) where
-    S: Stream<Item = Result<Message, axum::Error>> + Sink<Message, Error = axum::Error>,
+    S: AsyncRead + AsyncWrite + Unpin,
 {
+    let config = WebSocketConfig::default()
+        // What is larger is answered without being read.
+        .max_message_size(Some(limits.frame_bytes))
+        .max_frame_size(Some(limits.frame_bytes))
+        .read_buffer_size(READ_BUFFER_BYTES)
+        .write_buffer_size(WRITE_BUFFER_BYTES)
+        .max_write_buffer_size(MAX_WRITE_BUFFER_BYTES);
+    let socket = Metered::new(socket, room, limits.frame_bytes);
+    let socket = WebSocketStream::from_raw_socket(socket, Role::Server, Some(config)).await;
     let (sink, source) = socket.split();
     let (came, mut incoming) = queue(QUEUE_BYTES);
     let (outgoing, goes) = queue(QUEUE_BYTES);
@@ -86,13 +108,13 @@ pub(super) async fn serve<S>(
 /// Passes on what comes, until nobody wants it; then reads on for the client's goodbye. Pings are answered by reading. Gives why the
 /// client is lost, if it is.
 async fn read<S>(
-    mut source: SplitStream<S>,
+    mut source: SplitStream<WebSocketStream<S>>,
     inlet: Inlet<'_>,
     pinger: mpsc::Sender<Ping>,
     limits: Limits,
 ) -> Option<Closed>
 where
-    S: Stream<Item = Result<Message, axum::Error>>,
+    S: AsyncRead + AsyncWrite + Unpin,
 {
     let mut ticks = tokio::time::interval_at(Instant::now() + limits.ping_every, limits.ping_every);
     // While the client's frames wait for us, its silence is not counted.
@@ -115,15 +137,15 @@ where
             }
         };
         has_come = true;
-        // Nobody wants it once the connection is closing.
-        let _ = match message {
+        let passed_on = match message {
             // A small one is copied, so that it does not keep what was read with it.
             Some(Ok(Message::Text(text))) if text.len() <= SMALL_FRAME_BYTES => {
                 inlet.pass_on(Bytes::copy_from_slice(text.as_bytes())).await
             }
             Some(Ok(Message::Text(text))) => inlet.pass_on(text.into()).await,
             Some(Ok(Message::Binary(_))) => inlet.tell(Incoming::Binary).await,
-            Some(Ok(Message::Ping(_) | Message::Pong(_))) => continue,
+            // A frame of its own is not given.
+            Some(Ok(Message::Ping(_) | Message::Pong(_) | Message::Frame(_))) => continue,
             Some(Ok(Message::Close(_))) | None => return Some(Closed::ByClient),
             Some(Err(error)) => match what_is_wrong(error) {
                 Ok(incoming) => {
@@ -133,34 +155,38 @@ where
                 Err(closed) => return Some(closed),
             },
         };
+        if passed_on.is_break() {
+            // Nobody wants it once the connection is closing. There may be much of it.
+            tokio::task::yield_now().await;
+        }
     }
 }
 
 /// What an error of reading tells of the client, or why that is lost.
-fn what_is_wrong(error: axum::Error) -> Result<Incoming, Closed> {
-    let error = error.into_inner().downcast::<tungstenite::Error>().map_err(|_| Closed::ByClient)?;
-    match *error {
-        tungstenite::Error::Capacity(_) => Ok(Incoming::TooLarge),
-        tungstenite::Error::Utf8(_) => Ok(Incoming::NotText),
-        tungstenite::Error::Protocol(ProtocolError::ResetWithoutClosingHandshake) => Err(Closed::ByClient),
-        tungstenite::Error::Protocol(error) => Ok(Incoming::Violation(error.to_string())),
-        tungstenite::Error::Io(error) if error.kind() == std::io::ErrorKind::TimedOut => Err(Closed::Overloaded),
+fn what_is_wrong(error: Error) -> Result<Incoming, Closed> {
+    match error {
+        Error::Capacity(_) => Ok(Incoming::TooLarge),
+        Error::Utf8(_) => Ok(Incoming::NotText),
+        Error::Protocol(ProtocolError::ResetWithoutClosingHandshake) => Err(Closed::ByClient),
+        Error::Protocol(error) => Ok(Incoming::Violation(error.to_string())),
+        Error::Io(error) if error.kind() == std::io::ErrorKind::TimedOut => Err(Closed::Overloaded),
+        Error::Io(error) => error.downcast::<Crowded>().map(|Crowded| Incoming::Crowded).map_err(|_| Closed::ByClient),
         _ => Err(Closed::ByClient),
     }
 }
 
 async fn write<S>(
-    mut sink: SplitSink<S, Message>,
+    mut sink: SplitSink<WebSocketStream<S>, Message>,
     mut goes: Receiver<Outgoing>,
     mut pings: mpsc::Receiver<Ping>,
     room: &Room,
 ) where
-    S: Sink<Message, Error = axum::Error>,
+    S: AsyncRead + AsyncWrite + Unpin,
 {
     let closed = write_frames(&mut sink, &mut goes, &mut pings, room).await;
     if let Some(closed) = closed {
         let (code, reason) = closed.code();
-        let close = Message::Close(Some(CloseFrame { code, reason: reason.into() }));
+        let close = Message::Close(Some(CloseFrame { code: code.into(), reason: reason.into() }));
         // A client that does not read does not hear this either.
         let _ = tokio::time::timeout(CLOSE_TIMEOUT, sink.send(close)).await;
     }
@@ -168,13 +194,13 @@ async fn write<S>(
 
 /// Writes what goes to the client, until nothing more will. Gives how to close, if there is still something to be closed.
 async fn write_frames<S>(
-    sink: &mut SplitSink<S, Message>,
+    sink: &mut SplitSink<WebSocketStream<S>, Message>,
     goes: &mut Receiver<Outgoing>,
     pings: &mut mpsc::Receiver<Ping>,
     room: &Room,
 ) -> Option<Closed>
 where
-    S: Sink<Message, Error = axum::Error>,
+    S: AsyncRead + AsyncWrite + Unpin,
 {
     loop {
         let first = tokio::select! {
@@ -193,13 +219,11 @@ where
         while let Some(outgoing) = next {
             match outgoing.item {
                 Outgoing::Frame(text) => {
-                    if text.len() > SMALL_FRAME_BYTES {
-                        if room.take_for_buffers(text.len()).await.is_err() {
-                            return Some(Closed::Overloaded);
-                        }
-                        sink.flush().await.ok()?;
-                    }
-                    if let Err(error) = sink.feed(Message::Text(text.into())).await {
+                    let Ok(memory) = room.take_to_write(text.len()).await else { return Some(Closed::Overloaded) };
+                    let is_small = memory.is_none();
+                    let fed =
+                        if is_small { sink.feed(Message::text(text)).await } else { write_pieces(sink, text).await };
+                    if let Err(error) = fed {
                         tracing::debug!(error = &error as &dyn std::error::Error, "a frame could not be written");
                         // Where the client is gone, it does not hear this; a frame must not vanish without a word.
                         return Some(Closed::Failed);
@@ -211,4 +235,19 @@ where
         }
         sink.flush().await.ok()?;
     }
+}
+
+/// Writes a message in pieces, so that what they are gathered in does not grow to its size.
+async fn write_pieces<S>(sink: &mut SplitSink<WebSocketStream<S>, Message>, text: String) -> Result<(), Error>
+where
+    S: AsyncRead + AsyncWrite + Unpin,
+{
+    let mut left = Bytes::from(text);
+    let mut kind = Data::Text;
+    while !left.is_empty() {
+        let piece = left.split_to(left.len().min(SMALL_FRAME_BYTES));
+        sink.send(Message::Frame(Frame::message(piece, OpCode::Data(kind), left.is_empty()))).await?;
+        kind = Data::Continue;
+    }
+    Ok(())
 }

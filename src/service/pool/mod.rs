@@ -31,7 +31,7 @@ use tokio_util::task::TaskTracker;
 
 use super::Client;
 use crate::interrupt::{Cancelled, Interrupt, Signal};
-pub(super) use turns::Places;
+pub(crate) use turns::Places;
 use turns::{Class, LENT_AFTER, Level, Ticket, Turns};
 
 /// How long a job, or all jobs of a request together, may run before it is long. Most are over by then.
@@ -457,6 +457,15 @@ impl Admission {
     #[must_use]
     pub fn with_patience(self, patience: Option<Instant>) -> Self {
         Self { patience, ..self }
+    }
+
+    /// Takes the place, if it was not taken before.
+    ///
+    /// # Errors
+    ///
+    /// [`PoolError::Busy`] if there is none.
+    pub(super) fn take(&self) -> Result<(), PoolError> {
+        self.place().map(|_| ())
     }
 
     /// The place, which is taken if it was not before.

@@ -221,19 +221,19 @@ impl Turns {
 
 /// Places, and how many of them each client has.
 #[derive(Debug)]
-pub(in crate::service) struct Places {
+pub(crate) struct Places {
     n_all: usize,
     n_taken: usize,
     by_client: FxHashMap<Client, usize>,
 }
 
 impl Places {
-    pub(in crate::service) fn new(n_all: usize) -> Self {
+    pub(crate) fn new(n_all: usize) -> Self {
         Self { n_all, n_taken: 0, by_client: FxHashMap::default() }
     }
 
     /// Gives `client` a place, if there is one for it.
-    pub(in crate::service) fn take(&mut self, client: Client) -> bool {
+    pub(crate) fn take(&mut self, client: Client) -> bool {
         let n_free = self.n_all - self.n_taken;
         let own = self.by_client.entry(client).or_default();
         let is_admitted = n_free > 0 && *own <= n_free;
@@ -247,7 +247,7 @@ impl Places {
     }
 
     /// Takes a place back.
-    pub(in crate::service) fn give_back(&mut self, client: Client) {
+    pub(crate) fn give_back(&mut self, client: Client) {
         self.n_taken -= 1;
         if let Some(own) = self.by_client.get_mut(&client) {
             *own -= 1;
