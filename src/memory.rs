@@ -141,6 +141,15 @@ impl Memory {
         self.try_take_for(n_bytes, n_bytes)
     }
 
+    /// Takes `n_bytes` if they are free, however few, and something is left then for what is small.
+    ///
+    /// # Errors
+    ///
+    /// [`NoRoom`] if not.
+    pub fn try_take_as_large(&self, n_bytes: u64) -> Result<Held, NoRoom> {
+        self.try_take_for(u64::MAX, n_bytes)
+    }
+
     /// Takes what `held` lacks to hold `n_bytes`, unless they are so few that they need not be counted.
     ///
     /// # Errors
@@ -166,25 +175,24 @@ impl Memory {
         Ok(Held { memory: self.clone(), permit })
     }
 
-    /// Takes `n_bytes` once they are free. Whoever waits holds nothing back: others may take meanwhile what would not be enough for it,
-    /// so that it may wait for as long as it likes to.
+    /// Takes `n_bytes` as large once they are free. Whoever waits holds nothing back: others may take meanwhile what would not be enough
+    /// for it, so that it may wait for as long as it likes to.
     ///
     /// # Errors
     ///
     /// [`NoRoom`] if there is never so much.
     pub async fn take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
-        let most = if n_bytes > SMALL_BYTES { self.0.room - self.0.room / 8 } else { self.0.room };
-        if n_bytes > most {
+        if n_bytes > self.0.room - self.0.room / 8 {
             return Err(self.no_room(n_bytes));
         }
         loop {
             let mut given_back = pin!(self.0.given_back.notified());
             given_back.as_mut().enable();
-            if let Ok(held) = self.try_take(n_bytes) {
+            if let Ok(held) = self.try_take_as_large(n_bytes) {
                 return Ok(held);
             }
             given_back.await;
-            if let Ok(held) = self.try_take(n_bytes) {
+            if let Ok(held) = self.try_take_as_large(n_bytes) {
                 return Ok(held);
             }
             tokio::time::sleep(WAITING_PAUSE).await;
@@ -382,7 +390,7 @@ mod tests {
         let mut much = Box::pin(memory.take(12 * MIB));
         assert!(poll!(&mut much).is_pending());
         let little = memory.try_take(2 * MIB).unwrap();
-        assert_eq!(memory.take(1).await.unwrap().n_bytes(), UNIT_BYTES);
+        assert!(poll!(Box::pin(memory.take(1))).is_pending(), "the rest is for what is small");
         drop(half);
         assert!(poll!(&mut much).is_pending(), "it is not enough");
         drop(memory.try_take(8 * MIB).unwrap());
@@ -395,10 +403,10 @@ mod tests {
     #[tokio::test]
     async fn who_waits_is_told_of_what_is_no_longer_needed() {
         let memory = Memory::with_room(MIB);
-        let mut held = memory.try_take(MIB).unwrap();
+        let mut held = memory.try_take(MIB / 2).unwrap();
         let mut waiting = Box::pin(memory.take(MIB / 2));
-        assert!(poll!(&mut waiting).is_pending());
-        held.shrink_to(MIB / 2);
+        assert!(poll!(&mut waiting).is_pending(), "an eighth is left to what is small");
+        held.shrink_to(MIB / 4);
         assert!(waiting.await.is_ok());
         let memory = Memory::new(320 * MIB);
         memory.note_resident(300 * MIB);

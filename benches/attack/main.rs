@@ -128,6 +128,10 @@ async fn run(service: Arc<Service>, attacks: &[Attack], length: Duration) -> Res
     let after = Phase::watch(&service, &honest, alone).await;
     after.print("after");
 
+    println!("\nwhat honest clients were told to come again for");
+    for ((kind, why), n) in honest.told().iter() {
+        println!("  {:<8} {n:>5}  {why}", format!("{kind:?}"));
+    }
     println!("\nattacks: connections by how they ended");
     for attacker in attackers {
         let outcomes = attacker.outcomes().into_iter().map(|(outcome, n)| format!("{outcome} {n}"));

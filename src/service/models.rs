@@ -111,16 +111,20 @@ impl ModelText {
     }
 
     /// The same text, of which what is kept is held against `memory` as it is read.
-    fn counted(self, memory: &Memory) -> Result<Self, NoRoom> {
+    fn counted(self, memory: &Memory) -> Self {
         let open = match self {
-            Self::Whole(text) if text.len() as u64 <= SMALL_BYTES => return Ok(Self::Whole(text)),
+            Self::Whole(text) if text.len() as u64 <= SMALL_BYTES => return Self::Whole(text),
             Self::Whole(text) => {
                 Box::new(move || -> io::Result<Box<dyn BufRead + Send>> { Ok(Box::new(io::Cursor::new(text))) })
             }
             Self::Packed(open) | Self::Arriving(open) => open,
         };
-        let held = memory.try_take(SMALL_BYTES)?;
-        Ok(Self::Packed(Box::new(move || Ok(Box::new(Counted { inner: open()?, held, n_bytes: 0 })))))
+        let memory = memory.clone();
+        // Once its turn has come.
+        Self::Packed(Box::new(move || {
+            let held = memory.try_take(SMALL_BYTES).map_err(io::Error::other)?;
+            Ok(Box::new(Counted { inner: open()?, held, n_bytes: 0 }))
+        }))
     }
 }
 
@@ -227,7 +231,7 @@ impl Etude {
             prepare(read?, writer, is_new.then_some(&compiler), limits, interrupt)
         };
         let is_arriving = matches!(text, ModelText::Arriving(_));
-        let text = text.counted(&self.memory)?;
+        let text = text.counted(&self.memory);
         let (prepared, stored) = if is_arriving {
             let _place = self.uploads.admit(caller.client)?;
             let read = self.pool.run_aside(move |interrupt| Ok(text.read(format, limits, interrupt))).await?;

@@ -399,10 +399,7 @@ pub(super) fn follow(
     const N_COPIES: usize = 2;
     let started = Instant::now();
     let is_counted = extent == Extent::Any;
-    let searching = match is_counted.then(|| take_for_search(mapper, &mut request, memory)).transpose() {
-        Ok(held) => held,
-        Err(no_room) => return Ok(Err(no_room.into())),
-    };
+    let searching = is_counted.then(|| take_for_search(mapper, &mut request, memory));
     let mapping = request.solve(mapper, interrupt)?;
     drop(searching);
     let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
@@ -502,18 +499,22 @@ impl io::Write for CountedText<'_> {
     }
 }
 
-/// Takes the memory that a search may need, and lets the search use no more than that: a quarter of what is left at most, so that others
-/// find something too.
-///
-/// # Errors
-///
-/// [`NoRoom`] if hardly anything is left.
-pub(super) fn take_for_search(mapper: &Mapper, request: &mut Request<'_>, memory: &Memory) -> Result<Held, NoRoom> {
+/// Takes the memory that a search may need beyond [`SMALL_BYTES`], which every search has: no more of them are under way than there is
+/// memory for that beside the budget. Lets the search use no more. Of what is left it takes a quarter at most, so that others find something
+/// too.
+pub(super) fn take_for_search(mapper: &Mapper, request: &mut Request<'_>, memory: &Memory) -> Option<Held> {
     let wanted = request.search_bytes(mapper) as u64;
-    // With less than what is small, a search would hardly begin. No more of them run than that leaves room for other small requests.
-    let held = memory.try_take(wanted.min((memory.free_for_large() / 4).max(SMALL_BYTES)))?;
-    request.settings.budget.max_bytes = usize::try_from(held.n_bytes()).unwrap_or(usize::MAX);
-    Ok(held)
+    let held = take_beyond_small(wanted, memory);
+    let n_bytes = SMALL_BYTES + held.as_ref().map_or(0, Held::n_bytes);
+    request.settings.budget.max_bytes = usize::try_from(n_bytes).unwrap_or(usize::MAX);
+    held
+}
+
+/// Of `wanted` bytes, takes those beyond [`SMALL_BYTES`], or a quarter of what is left if that is less.
+pub(super) fn take_beyond_small(wanted: u64, memory: &Memory) -> Option<Held> {
+    let n_bytes = wanted.saturating_sub(SMALL_BYTES).min(memory.free_for_large() / 4);
+    // Nothing if others have just taken it.
+    memory.try_take_as_large(n_bytes).ok()
 }
 
 /// The weights from which a request starts: the means of its learner, or the model's own.

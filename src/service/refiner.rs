@@ -233,10 +233,7 @@ fn optimum(
         Ok(request) => request,
         Err(faults) => return Ok(Err(faults.into())),
     };
-    let _held = match take_for_search(mapper, &mut request, memory) {
-        Ok(held) => held,
-        Err(no_room) => return Ok(Err(no_room.into())),
-    };
+    let _held = take_for_search(mapper, &mut request, memory);
     let started = Instant::now();
     let settings = Settings { upper_bound: Some(local_cost), ..request.settings };
     let mapping = mapper.map(&request.problem, settings, interrupt)?;

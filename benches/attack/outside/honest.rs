@@ -1,7 +1,9 @@
 //! Clients who want something small, and wait for it.
 
+use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use futures_util::{SinkExt, StreamExt};
@@ -80,6 +82,8 @@ pub(crate) struct Honest {
     cave: Value,
     /// How often a connection was refused or broke off.
     pub(crate) n_broken: AtomicU64,
+    /// What they were told to come again for, and how often.
+    pub(crate) told: Mutex<BTreeMap<(Kind, String), u64>>,
 }
 
 impl Honest {
@@ -89,7 +93,15 @@ impl Honest {
         let demonstration = serde_json::from_str(include_str!("../../../examples/figure-4/demonstration.json"))?;
         let figure: Value = serde_json::from_str(include_str!("../../../examples/figure-4/model.json"))?;
         let request = json!({"model": "cave", "demonstration": cave.demonstration});
-        let honest = Self { client, address, from, demonstration, cave: request, n_broken: AtomicU64::new(0) };
+        let honest = Self {
+            client,
+            address,
+            from,
+            demonstration,
+            cave: request,
+            n_broken: AtomicU64::new(0),
+            told: Mutex::default(),
+        };
         let learner = json!({"attributes": ["x", "y", "heading", "gold", "arrows"], "sd": 3, "seed": 1});
         for (path, body) in [
             ("/v1/models/figure-4", &figure),
@@ -117,6 +129,7 @@ impl Honest {
                     Ok(()) => return Ok(n_retries),
                     Err(Missed::Wrong(why)) => return Err(why),
                     Err(Missed::Busy(after, why)) => {
+                        *self.told().entry((kind, shortened(&why))).or_default() += 1;
                         last = why;
                         sleep(after.unwrap_or(PAUSE)).await;
                         n_retries += 1;
@@ -126,6 +139,10 @@ impl Honest {
         };
         let asked = timeout(PATIENCE, asking).await;
         asked.unwrap_or_else(|_| Err(format!("in {} s, last: {last}", PATIENCE.as_secs())))
+    }
+
+    pub(crate) fn told(&self) -> MutexGuard<'_, BTreeMap<(Kind, String), u64>> {
+        self.told.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     async fn attempt(&self, kind: Kind, n: usize) -> Result<(), Missed> {
@@ -219,6 +236,13 @@ impl Honest {
         let chain = std::iter::successors(Some(error), |error| error.source());
         Missed::Busy(None, chain.map(ToString::to_string).collect::<Vec<_>>().join(": "))
     }
+}
+
+/// What a problem says, without its numbers.
+fn shortened(why: &str) -> String {
+    let problem: Value = serde_json::from_str(why).unwrap_or_default();
+    let detail = problem["detail"].as_str().or(problem["problem"]["detail"].as_str()).unwrap_or(why);
+    detail.chars().filter(|character| !character.is_ascii_digit()).take(120).collect()
 }
 
 /// A corridor of four states, of whose kind there are many.

@@ -17,7 +17,7 @@ use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::model::{Model, Origin};
 use crate::service::owners::Ownership;
-use crate::service::policies::{PolicyText, as_micros, report, write_policy};
+use crate::service::policies::{PolicyText, as_micros, report, take_beyond_small, write_policy};
 use crate::service::{Client, Etude, PoolError, ServiceError};
 use crate::store::{AcceptedReward, NewObservations, NewRefinement, SessionEnd, TrialRow};
 
@@ -281,36 +281,36 @@ impl Session {
     ) -> Result<CommittedSteps, SessionError> {
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let is_inline = self.is_inline(observations.len());
-        // Others find something too. What it really took is kept afterwards.
-        let free = if is_inline { 0 } else { etude.memory.free_for_large() / 4 };
-        let spare = etude.memory.try_take(free.max(SMALL_BYTES)).map_err(ServiceError::from)?;
-        let most_bytes = usize::try_from(self.held.n_bytes() + spare.n_bytes()).unwrap_or(usize::MAX);
-        let mut online = online.within(most_bytes);
+        let held_bytes = self.held.n_bytes();
         let (mapper, memory) = (Arc::clone(&self.mapper), etude.memory.clone());
         let job = move |interrupt: &mut dyn Interrupt| {
+            // Others find something too. What it really took is kept afterwards.
+            let wanted = if is_inline { 0 } else { u64::MAX };
+            let spare = take_beyond_small(wanted, &memory);
+            let most_bytes = held_bytes + SMALL_BYTES + spare.as_ref().map_or(0, Held::n_bytes);
+            let no_room = NoRoom { wanted: most_bytes, room: memory.room() };
+            let mut online = online.within(usize::try_from(most_bytes).unwrap_or(usize::MAX));
             let mut steps = CommittedSteps::default();
             for observation in &observations {
                 match online.observe(observation, interrupt) {
                     Ok(committed) => {
                         if steps.take_for(committed.len(), mapper.model(), &memory).is_err() {
-                            return Ok(None);
+                            return Ok(Err(no_room));
                         }
                         steps.extend(committed);
                     }
                     Err(Stopped::Cancelled(cancelled)) => return Err(cancelled),
-                    Err(Stopped::Memory) => return Ok(None),
+                    Err(Stopped::Memory) => return Ok(Err(no_room)),
                 }
             }
-            Ok(Some((online, steps)))
+            Ok(Ok((online, steps)))
         };
         let advanced = if is_inline {
             job(&mut Uninterrupted).map_err(|_| PoolError::Stopped)?
         } else {
             etude.pool.run_patiently(self.client, job).await?
         };
-        let no_room = || NoRoom { wanted: most_bytes as u64, room: etude.memory.room() };
-        let (online, steps) = advanced.ok_or_else(no_room).map_err(ServiceError::from)?;
-        drop(spare);
+        let (online, steps) = advanced.map_err(ServiceError::from)?;
         self.hold(online.size_bytes() as u64)?;
         self.online = Some(online);
         self.n_steps += steps.len();
