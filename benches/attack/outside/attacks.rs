@@ -382,8 +382,9 @@ impl Target {
                 let n_frames = size.n_observations / N_STATES;
                 let states = vec![json!({}); N_STATES];
                 let frames = (0..n_frames).map(|n| json!({"type": "observe", "seq": n * N_STATES, "states": states}));
-                let frames = frames.map(|frame| format!("{frame}\n")).collect::<String>();
-                let lines = format!("{}\n{frames}", json!({"type": "open", "model": "wide"}));
+                let open = json!({"type": "open", "model": "wide"});
+                let lines = std::iter::once(open).chain(frames).flat_map(|frame| [frame.to_string(), "\n".to_owned()]);
+                let lines: String = lines.collect();
                 let mut messages = Vec::new();
                 for _ in 0..N_SESSIONS {
                     let session = self.begin(lines.clone()).await?;
