@@ -18,6 +18,7 @@ use tokio_util::task::TaskTracker;
 
 use crate::config::ServeConfig;
 use crate::http::{self, Access, ConnectionLimits, Context};
+use crate::memory::Memory;
 use crate::service::Etude;
 use crate::store::StoreError;
 use crate::stream::Rooms;
@@ -87,7 +88,6 @@ impl Server {
         let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
         tasks.spawn(upkeep(metrics.clone(), stopping.clone()));
-        tasks.spawn(stopping.clone().run_until_cancelled_owned(etude.memory().clone().watch()));
         let etude = Arc::new(etude);
         tasks.spawn(Arc::clone(&etude).refine_until(stopping.clone()));
         tasks.spawn(Arc::clone(&etude).expire_until(stopping.clone()));
@@ -125,6 +125,12 @@ impl Server {
     #[must_use]
     pub fn address(&self) -> SocketAddr {
         self.address
+    }
+
+    /// Its budget of memory.
+    #[must_use]
+    pub fn memory(&self) -> &Memory {
+        self.etude.memory()
     }
 
     /// Serves until `stop` completes, then lets requests end within the drain time, aborts what is left, and closes the

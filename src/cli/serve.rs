@@ -24,8 +24,16 @@ impl Serve {
             let stop = CancellationToken::new();
             let serving = async {
                 let server = Server::start(&self.config).await?;
-                server.run(stop.clone().cancelled_owned()).await;
-                Ok(())
+                let memory = server.memory().clone();
+                // What is resident is the process's, which is this service's alone.
+                let watching = async {
+                    memory.watch().await;
+                    std::future::pending().await
+                };
+                tokio::select! {
+                    () = server.run(stop.clone().cancelled_owned()) => Ok(()),
+                    ended = watching => ended,
+                }
             };
             tokio::select! {
                 served = serving => served,
