@@ -8,6 +8,7 @@ use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 
 use super::compiler::{Compiler, LimitedTime};
+use super::policies::MAX_INLINE_BYTES;
 use super::pool::Places;
 use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::attribute::AttributeDocument;
@@ -108,6 +109,11 @@ impl ModelText {
             Self::Whole(text) => Definition::parse(&text, format, limits, interrupt),
             Self::Packed(open) | Self::Arriving(open) => Definition::parse_from(open()?, format, limits, interrupt),
         }
+    }
+
+    /// Whether it is read in less than a millisecond.
+    fn is_small(&self) -> bool {
+        matches!(self, Self::Whole(text) if text.len() <= MAX_INLINE_BYTES)
     }
 
     /// The same text, of which what is kept is held against `memory` as it is read.
@@ -237,6 +243,10 @@ impl Etude {
             let read = self.pool.run_aside(move |interrupt| Ok(text.read(format, limits, interrupt))).await?;
             let job = move |interrupt: &mut dyn Interrupt| Ok(prepare(read, interrupt));
             tokio::join!(self.pool.run_patiently(caller.client, job), self.store_pieces(pieces))
+        } else if !is_new && text.is_small() {
+            // There is nothing to be compiled or stored.
+            let job = |interrupt: &mut dyn Interrupt| Ok(prepare(text.read(format, limits, interrupt), interrupt));
+            (self.pool.run_here(None, job), Ok(None))
         } else {
             let place = self.pool.admit(caller.client)?;
             let max_time = self.time_limits.compile;
