@@ -14,9 +14,9 @@ use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use etude::interrupt::Uninterrupted;
-use etude::mapping::Mapper;
-use etude::model::{Definition, Format, Limits, Model};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::Mapper;
+use etude_core::model::{Definition, Format, Limits, Model};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use reqwest::{Body, Client};

@@ -16,10 +16,10 @@ use std::time::{Duration, Instant};
 
 use axum::extract::WebSocketUpgrade;
 use axum::routing::get;
-use etude::document::{Faults, Place};
-use etude::interrupt::Uninterrupted;
-use etude::mapping::{Mapper, OnlineMapping};
-use etude::model::{Definition, Limits, Model};
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::{Mapper, OnlineMapping};
+use etude_core::model::{Definition, Limits, Model};
 use futures_util::{SinkExt, StreamExt};
 use serde_json::{Value, json};
 use sqlx::Connection;

@@ -10,9 +10,9 @@ use clap::Args;
 
 use crate::http::{self, ConnectionLimits};
 use crate::memory::{self, Memory};
-use crate::model;
 use crate::service::{PoolSettings, Settings, TimeLimits};
 use crate::stream::{Limits, Rooms};
+use etude_core::model;
 
 /// Settings of the service.
 #[derive(Args, Clone, Debug)]

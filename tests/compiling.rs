@@ -2,9 +2,9 @@
 
 #![expect(clippy::unwrap_used, reason = "tests may panic")]
 
-use etude::interrupt::{Cancelled, Interrupt, Interrupted, Signal, Uninterrupted};
-use etude::mapping::Mapper;
-use etude::model::{Definition, Limits, Model};
+use etude_core::interrupt::{Cancelled, Interrupt, Interrupted, Signal, Uninterrupted};
+use etude_core::mapping::Mapper;
+use etude_core::model::{Definition, Limits, Model};
 use serde_json::{Value, json};
 
 /// A line of states, of which each leads on to the next two; the attribute tells all of them apart.
@@ -77,10 +77,10 @@ fn what_does_not_fit_is_not_projected_and_changes_no_optimum() {
     let total = |mapper: &Mapper| {
         let seen: Value = (0..100).map(|i| json!({"x": i * 3})).collect();
         let request = json!({"model": "line", "demonstration": seen});
-        let mut faults = etude::document::Faults::default();
-        let place = etude::document::Place::root(&request);
-        let object = place.object(&etude::mapping::Request::FIELDS, &mut faults).unwrap();
-        let request = etude::mapping::Request::read(mapper.model(), &object, &mut faults).unwrap();
+        let mut faults = etude_core::document::Faults::default();
+        let place = etude_core::document::Place::root(&request);
+        let object = place.object(&etude_core::mapping::Request::FIELDS, &mut faults).unwrap();
+        let request = etude_core::mapping::Request::read(mapper.model(), &object, &mut faults).unwrap();
         let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();
         (mapping.cost, mapping.status)
     };

@@ -66,7 +66,8 @@ fn plain(path: &Path) -> PathBuf {
 /// What the sources of the program include, relative to the root.
 fn included() -> BTreeSet<PathBuf> {
     let mut included = BTreeSet::new();
-    for source in files(&root().join("src")) {
+    let sources = ["src", "core/src"].map(|directory| files(&root().join(directory)));
+    for source in sources.into_iter().flatten() {
         let text = fs::read_to_string(&source).unwrap();
         for (position, _) in text.match_indices("include_") {
             let call =
@@ -92,7 +93,9 @@ fn the_builder_is_sent_and_copies_whatever_the_program_includes() {
         assert!(root().join(copy).exists(), "{}", copy.display());
         assert!(is_sent(copy), "{}", copy.display());
     }
-    for path in [".cargo/config.toml", "src/lib.rs", "Cargo.toml", "Cargo.lock"].map(Path::new) {
+    for path in [".cargo/config.toml", "src/lib.rs", "core/src/lib.rs", "core/Cargo.toml", "Cargo.toml", "Cargo.lock"]
+        .map(Path::new)
+    {
         assert!(is_copied(path) && is_sent(path), "{}", path.display());
     }
 }

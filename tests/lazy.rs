@@ -12,11 +12,11 @@ mod problems;
 
 use std::collections::HashMap;
 
-use etude::attribute::{ByAttribute, Scalar};
-use etude::document::{Faults, Place};
-use etude::interrupt::Uninterrupted;
-use etude::mapping::{Budget, Policy, Request, Settings, Status};
-use etude::model::{Act, Cave, CaveState, Definition, Limits};
+use etude_core::attribute::{ByAttribute, Scalar};
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::{Budget, Policy, Request, Settings, Status};
+use etude_core::model::{Act, Cave, CaveState, Definition, Limits};
 use problems::{cave, close, mapper, mapper_within, solve, walked};
 use proptest::prelude::*;
 use serde_json::{Value, json};

@@ -8,7 +8,7 @@ use std::path::Path;
 use std::process::Command;
 
 use etude::experiment::{CurvePlan, Laboratory, Local, Scene, figure_4, figure_7, figure_8};
-use etude::learning::PerAttributeDocument;
+use etude_core::learning::PerAttributeDocument;
 use serde_json::{Value, json};
 use service::{Service, example};
 

@@ -7,8 +7,8 @@ mod service;
 use std::time::Instant;
 
 use etude::memory::SMALL_BYTES;
-use etude::model::Format;
 use etude::service::{Caller, Client, Etude, ModelText, Name, Registered, ServiceError};
+use etude_core::model::Format;
 use jiff::Timestamp;
 use reqwest::Method;
 use serde_json::{Value, json};

@@ -12,13 +12,13 @@ mod problems;
 
 use std::collections::HashMap;
 
-use etude::attribute::Scalar;
-use etude::document::{Faults, Place};
-use etude::interrupt::{Cancelled, Signal, Uninterrupted};
-use etude::mapping::{
+use etude_core::attribute::Scalar;
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
+use etude_core::mapping::{
     Budget, Grouping, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status, StoppedBy,
 };
-use etude::model::Limits;
+use etude_core::model::Limits;
 use problems::{cave, close, example, mapper, problem, solve, walked};
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -223,7 +223,7 @@ fn figure_4_goes_around_the_wumpus_and_takes_the_gold() {
     assert_eq!((policy.coverage.observed, policy.coverage.exact), (16, 1));
     assert!(policy.actions.iter().any(|action| &**action == "grab"));
     let at = |x: i64, y: i64| {
-        let is_at = move |step: &&etude::mapping::Step| {
+        let is_at = move |step: &&etude_core::mapping::Step| {
             step.state.get("x") == Some(&Scalar::Integer(x)) && step.state.get("y") == Some(&Scalar::Integer(y))
         };
         policy.steps.iter().filter(is_at).count()

@@ -15,10 +15,10 @@ use std::fs;
 use std::process::Command;
 use std::sync::Arc;
 
-use etude::document::{Faults, Place};
-use etude::interrupt::Uninterrupted;
-use etude::mapping::{Budget, Grouping, HeuristicName, Mapper, Request, StoppedBy};
-use etude::model::Limits;
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::{Budget, Grouping, HeuristicName, Mapper, Request, StoppedBy};
+use etude_core::model::Limits;
 use problems::{mapper, mapper_within};
 use serde_json::{Value, json};
 

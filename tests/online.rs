@@ -8,9 +8,9 @@ mod problems;
 use std::num::NonZeroU32;
 use std::sync::Arc;
 
-use etude::document::{Faults, Place};
-use etude::interrupt::{Cancelled, Signal, Uninterrupted};
-use etude::mapping::{CommittedStep, Mapper, Mapping, OnlineMapping, Policy, Request, Stamp, Status, StoppedBy};
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
+use etude_core::mapping::{CommittedStep, Mapper, Mapping, OnlineMapping, Policy, Request, Stamp, Status, StoppedBy};
 use problems::{close, example, mapper, problem};
 use proptest::prelude::*;
 use serde_json::{Value, json};

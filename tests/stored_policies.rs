@@ -12,10 +12,10 @@ mod problems;
 
 use std::path::Path;
 
-use etude::document::{Faults, Place};
-use etude::interrupt::Uninterrupted;
-use etude::mapping::{Mapper, Policy, PolicySummary, Request, Stamp, WrittenPolicy};
-use etude::store::{NewPolicy, NewRefinement, RefinementEnd, Store};
+use etude::store::{NewPolicy, NewRefinement, RefinementEnd, Store, pack_steps};
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::{Mapper, Policy, PolicySummary, Request, Stamp, WrittenPolicy};
 use jiff::Timestamp;
 use problems::{example, mapper, problem};
 use proptest::prelude::*;
@@ -23,14 +23,23 @@ use serde_json::{Value, json};
 use sqlx::{ConnectOptions, Connection};
 use tokio_util::task::TaskTracker;
 
+/// A policy as it is answered, and as it is stored.
+#[derive(Clone)]
+struct Written {
+    answer: String,
+    summary: String,
+    steps: Vec<u8>,
+}
+
 /// The policy that `request` gives, and what it is written as.
-fn follow(mapper: &Mapper, request: &Value, stamp: &Stamp) -> (Policy, WrittenPolicy) {
+fn follow(mapper: &Mapper, request: &Value, stamp: &Stamp) -> (Policy, Written) {
     let mut faults = Faults::default();
     let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
     let read = Request::read(mapper.model(), &object, &mut faults);
     let request = faults.check(read).unwrap();
     let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();
-    let written = WrittenPolicy::new(stamp, &request.problem, &mapping).unwrap();
+    let WrittenPolicy { answer, summary, steps } = WrittenPolicy::new(stamp, &request.problem, &mapping).unwrap();
+    let written = Written { answer, summary, steps: pack_steps(&steps).unwrap() };
     (Policy::new(stamp.clone(), &request.problem, &mapping), written)
 }
 
@@ -38,11 +47,11 @@ fn stamp(id: &str) -> Stamp {
     Stamp { id: Some(id.to_owned()), model: r#""coverage":{"#.to_owned(), ..Stamp::default() }
 }
 
-fn figure_4(stamp: &Stamp) -> (Policy, WrittenPolicy) {
+fn figure_4(stamp: &Stamp) -> (Policy, Written) {
     follow(&mapper(&example("figure-4/model.json")), &example("figure-4/request.json"), stamp)
 }
 
-fn new(id: &str, WrittenPolicy { summary, steps, .. }: WrittenPolicy) -> NewPolicy {
+fn new(id: &str, Written { summary, steps, .. }: Written) -> NewPolicy {
     NewPolicy { id: id.to_owned(), summary, steps, created_at: Timestamp::UNIX_EPOCH }
 }
 
@@ -82,7 +91,7 @@ proptest! {
 
 #[test]
 fn a_policy_takes_a_fifth_of_what_is_answered_at_most() {
-    let (_, WrittenPolicy { answer, summary, steps }) = figure_4(&stamp("p"));
+    let (_, Written { answer, summary, steps }) = figure_4(&stamp("p"));
     assert!(
         5 * (summary.len() + steps.len()) < answer.len(),
         "{} + {} of {}",

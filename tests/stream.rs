@@ -8,9 +8,9 @@ mod service;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use etude::document::Place;
 use etude::service::{Caller, Etude};
 use etude::stream::{Closed, Incoming, Outgoing, Receiver, Sender, queue};
+use etude_core::document::Place;
 use futures_util::{SinkExt, StreamExt};
 use jiff::Timestamp;
 use process::Process;

@@ -4,7 +4,7 @@
 
 mod service;
 
-use etude::learning::{Distribution, Learner};
+use etude_core::learning::{Distribution, Learner};
 use reqwest::Method;
 use reqwest::header::{ETAG, IF_NONE_MATCH, LOCATION};
 use serde_json::{Value, json};

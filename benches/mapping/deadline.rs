@@ -2,8 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use etude::interrupt::{Signal, time_until_finish};
-use etude::mapping::Settings;
+use etude_core::interrupt::{Signal, time_until_finish};
+use etude_core::mapping::Settings;
 
 use crate::worlds::World;
 use crate::{Spread, prepare, problem, shown, table, worlds};

@@ -3,10 +3,10 @@
 use std::io::{self, BufReader, Read};
 use std::time::{Duration, Instant};
 
-use etude::document::{Faults, Place};
-use etude::interrupt::Uninterrupted;
-use etude::mapping::{Demonstration, Mapper, Problem, Settings};
-use etude::model::{Definition, Format, Limits, Model, Origin};
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::{Demonstration, Mapper, Problem, Settings};
+use etude_core::model::{Definition, Format, Limits, Model, Origin};
 use serde_json::{Value, json};
 
 use crate::{Spread, shown, time_often};

@@ -2,8 +2,8 @@
 
 use std::process::Command;
 
-use etude::interrupt::Uninterrupted;
-use etude::mapping::Settings;
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::Settings;
 
 use crate::worlds::{self, World};
 

@@ -8,8 +8,8 @@
 use std::hint::black_box;
 use std::time::Duration;
 
-use etude::interrupt::Uninterrupted;
-use etude::mapping::Settings;
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::Settings;
 
 use crate::worlds::{self, SplitMix, World};
 use crate::{Spread, prepare, problem, shown, table, time_often};

@@ -21,10 +21,10 @@ mod worlds;
 
 use std::time::{Duration, Instant};
 
-use etude::document::{Faults, Place};
-use etude::interrupt::Uninterrupted;
-use etude::mapping::{Grouping, HeuristicName, Mapper, Problem, Request, Settings};
-use etude::model::{Definition, Limits, Model};
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::{Grouping, HeuristicName, Mapper, Problem, Request, Settings};
+use etude_core::model::{Definition, Limits, Model};
 use peers::{Peer, Solved};
 use serde_json::json;
 use worlds::World;

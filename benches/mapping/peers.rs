@@ -4,8 +4,8 @@ use std::cell::Cell;
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashSet};
 
-use etude::mapping::Problem;
-use etude::model::Model;
+use etude_core::mapping::Problem;
+use etude_core::model::Model;
 use pathfinding::prelude::astar;
 use petgraph::visit::{EdgeRef, GraphBase, GraphRef, IntoEdgeReferences, IntoEdges, IntoNeighbors, Visitable};
 

@@ -13,8 +13,8 @@ use super::client::{answer, client};
 use super::{CliError, render, runtime, side_by_side};
 use crate::config::ServeConfig;
 use crate::experiment::{CurvePlan, Scene};
-use crate::mapping::Policy;
 use crate::server::Server;
+use etude_core::mapping::Policy;
 
 const MODEL: &str = include_str!("../../examples/figure-4/model.json");
 const DEMONSTRATION: &str = include_str!("../../examples/figure-4/demonstration.json");

@@ -14,7 +14,7 @@ use uuid::Uuid;
 use super::client::Client;
 use super::{CliError, runtime};
 use crate::experiment::{self, Attempt, CurvePlan, Followed, Laboratory, LearnerId, Local, LocalError, Scene, plot};
-use crate::learning::LearnerDocument;
+use etude_core::learning::LearnerDocument;
 
 #[derive(Args, Debug)]
 pub(super) struct Experiment {

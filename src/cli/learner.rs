@@ -15,11 +15,11 @@ use tokio_util::task::TaskTracker;
 use super::client::Client;
 use super::map::read_json;
 use super::{CliError, runtime};
-use crate::document::{Faults, Place};
-use crate::learning::{Distribution, Learner, LearnerDocument};
 use crate::memory::{self, Memory};
-use crate::model::Limits;
 use crate::service::{Etude, Name, PoolSettings, Replay, Settings, TimeLimits};
+use etude_core::document::{Faults, Place};
+use etude_core::learning::{Distribution, Learner, LearnerDocument};
+use etude_core::model::Limits;
 
 /// What an exported learner says it is.
 const FORMAT: &str = "etude.learner.v1";

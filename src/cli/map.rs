@@ -11,10 +11,11 @@ use clap::{Args, ValueEnum};
 use serde_json::{Map as Members, Value, json};
 
 use super::{CliError, render};
-use crate::document::{self, Faults, Place};
-use crate::interrupt::{Interrupted, Signal, Uninterrupted, time_until_finish};
-use crate::mapping::{Mapper, Policy, Request, Stamp};
-use crate::model::{CompileError, Definition, Limits, Model, hash_of};
+use crate::service::hash_of;
+use etude_core::document::{self, Faults, Place};
+use etude_core::interrupt::{Interrupted, Signal, Uninterrupted, time_until_finish};
+use etude_core::mapping::{Mapper, Policy, Request, Stamp};
+use etude_core::model::{CompileError, Definition, Limits, Model};
 
 #[derive(Args, Debug)]
 pub(super) struct Map {

@@ -21,9 +21,9 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use crate::document::{Faults, ParseError};
 use crate::server::ServerError;
 use crate::telemetry::{LogConfig, start_logging};
+use etude_core::document::{Faults, ParseError};
 
 /// Learns a task by watching it done: finds the policy, in an agent's own actions, whose effects follow a demonstration
 /// most closely.
@@ -78,13 +78,13 @@ enum CliError {
     Option(String),
     /// The search has no answer.
     #[error(transparent)]
-    Cancelled(#[from] crate::interrupt::Cancelled),
+    Cancelled(#[from] etude_core::interrupt::Cancelled),
     /// An observation could not be mapped.
     #[error(transparent)]
-    Stopped(#[from] crate::mapping::Stopped),
+    Stopped(#[from] etude_core::mapping::Stopped),
     /// A model could not be prepared.
     #[error(transparent)]
-    Interrupted(#[from] crate::interrupt::Interrupted),
+    Interrupted(#[from] etude_core::interrupt::Interrupted),
     /// The service did not start or run.
     #[error(transparent)]
     Server(#[from] ServerError),

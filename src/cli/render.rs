@@ -5,8 +5,8 @@ use std::fmt::Write;
 use comfy_table::{CellAlignment, ContentArrangement, Table, TableComponent, presets};
 use serde_json::Value;
 
-use crate::attribute::{ByAttribute, Scalar};
-use crate::mapping::{Cost, MoveKind, Policy, Step};
+use etude_core::attribute::{ByAttribute, Scalar};
+use etude_core::mapping::{Cost, MoveKind, Policy, Step};
 
 /// The steps of a policy as a table: observation, move, action, state, distance, cost. Of a state, the attributes that
 /// have weight.

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::stream::{Frame, Step, refused};
 use super::{CliError, render, stream_client};
-use crate::attribute::{ByAttribute, Scalar};
+use etude_core::attribute::{ByAttribute, Scalar};
 
 /// Streams `demonstration` to `model` at the service, an observation at a time, and shows what comes back as it comes.
 pub(super) async fn stream(

@@ -20,12 +20,12 @@ use tokio::sync::mpsc;
 use super::map::{parse_json, parse_weight, read_json, read_model};
 use super::stream_session::StreamSession;
 use super::{CliError, client, render, runtime};
-use crate::attribute::{ByAttribute, Scalar};
-use crate::document::{self, Faults, ParseError, Place};
-use crate::interrupt::Uninterrupted;
-use crate::mapping::{Cost, Demonstration, Mapper, MoveKind, OnlineMapping, Status};
-use crate::model::Limits;
 use crate::stream::frames::ServerFrame;
+use etude_core::attribute::{ByAttribute, Scalar};
+use etude_core::document::{self, Faults, ParseError, Place};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::{Cost, Demonstration, Mapper, MoveKind, OnlineMapping, Status};
+use etude_core::model::Limits;
 
 /// Lines that were read ahead.
 pub(super) const MAX_READ_AHEAD: usize = 64;
@@ -89,7 +89,7 @@ impl Stream {
         printer.weights = Some(schema.by_attribute(weights.as_slice().iter().copied()));
         let mut online = OnlineMapping::new(&mapper, weights, start, self.lookahead.0);
         let mut actions = Vec::new();
-        let mut print = |printer: &mut Printer<'_, _>, steps: &[crate::mapping::CommittedStep]| {
+        let mut print = |printer: &mut Printer<'_, _>, steps: &[etude_core::mapping::CommittedStep]| {
             for step in steps {
                 actions.extend(step.step.action.clone());
                 printer.frame(&text_of(&ServerFrame::Step(step.into()))?)?;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use super::{Laboratory, LearnerId, Scene};
-use crate::learning::{AlgorithmDocument, LearnerDocument, PerAttributeDocument};
+use etude_core::learning::{AlgorithmDocument, LearnerDocument, PerAttributeDocument};
 
 /// How the experiment is done.
 #[derive(Clone, Debug, PartialEq)]

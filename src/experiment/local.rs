@@ -3,12 +3,12 @@
 use std::collections::BTreeMap;
 
 use super::{Attempt, Followed, Laboratory, LearnerId, Scene};
-use crate::attribute::Weights;
-use crate::document::{Faults, Place};
-use crate::interrupt::{Cancelled, Interrupted, Uninterrupted};
-use crate::learning::{Distribution, Learner, LearnerDocument, MissingAttributes};
-use crate::mapping::{Demonstration, Mapper, Mapping, Problem, Settings};
-use crate::model::{CompileError, Definition, Limits, Model};
+use etude_core::attribute::Weights;
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::{Cancelled, Interrupted, Uninterrupted};
+use etude_core::learning::{Distribution, Learner, LearnerDocument, MissingAttributes};
+use etude_core::mapping::{Demonstration, Mapper, Mapping, Problem, Settings};
+use etude_core::model::{CompileError, Definition, Limits, Model};
 
 /// Why a laboratory in this process could not do as asked.
 #[derive(Debug, thiserror::Error)]

@@ -23,7 +23,7 @@ pub use locations::{LocationRow, Locations, figure_8};
 pub use paths::{Paths, figure_4};
 pub use scene::Scene;
 
-use crate::learning::LearnerDocument;
+use etude_core::learning::LearnerDocument;
 
 /// Where experiments run. Everything that learns and maps is behind it; worlds are not.
 pub trait Laboratory {

@@ -1,7 +1,7 @@
 //! Figure 4: the way of a demonstrator, and that of an imitator that cannot shoot.
 
 use super::{Followed, Laboratory, Scene};
-use crate::model::Cell;
+use etude_core::model::Cell;
 
 /// Two ways through the same cave.
 #[derive(Clone, Debug, PartialEq)]

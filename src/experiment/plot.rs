@@ -6,7 +6,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::{Curve, LocationRow, Locations, Paths, Scene};
-use crate::model::Cell;
+use etude_core::model::Cell;
 
 /// Why a picture could not be drawn: a defect.
 #[derive(Debug, thiserror::Error)]

@@ -2,9 +2,9 @@
 
 use serde_json::Value;
 
-use crate::interrupt::Uninterrupted;
-use crate::model::{Act, Cave, Cell, Definition, Limits};
-use crate::world::{Outcome, Rewards, WumpusWorld};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::model::{Act, Cave, Cell, Definition, Limits};
+use etude_core::world::{Outcome, Rewards, WumpusWorld};
 
 /// A world, the body that the imitator has in it, and what it was shown.
 #[derive(Clone, Debug)]

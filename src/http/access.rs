@@ -13,7 +13,7 @@ use tower_http::cors::{AllowHeaders, CorsLayer};
 
 use super::observe::REQUEST_ID;
 use super::problem::{Problem, ProblemKind};
-use crate::document::Quoted;
+use etude_core::document::Quoted;
 
 /// How long browsers may keep what a preflight was answered.
 const PREFLIGHT_MAX_AGE: Duration = Duration::from_hours(1);

@@ -21,10 +21,10 @@ use super::Context;
 use super::answer::{self, UNCOUNTED_BYTES};
 use super::encoding::{BodyError, DecodedLimit, Encoding};
 use super::problem::{Problem, ProblemKind};
-use crate::document::Quoted;
 use crate::memory::{Held, Memory, NoRoom};
-use crate::model::Format;
 use crate::service::{Client, ModelText, OpenText, PipeWriter, ServiceError, pipe};
+use etude_core::document::Quoted;
+use etude_core::model::Format;
 
 /// How long a client may take to send its body, however slowly it comes.
 const BODY_TIMEOUT: Duration = Duration::from_mins(1);

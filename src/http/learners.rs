@@ -14,9 +14,9 @@ use super::body::{NoForm, json, read_json};
 use super::paging::{List, Paging};
 use super::path::PathName;
 use super::problem::Problem;
-use crate::document::{Faults, Path};
-use crate::learning::LearnerDocument;
 use crate::service::{LearnerAnswer, Registered, WeightsAnswer};
+use etude_core::document::{Faults, Path};
+use etude_core::learning::LearnerDocument;
 
 /// A registered learner.
 #[derive(Debug, Serialize, ToSchema)]

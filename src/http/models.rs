@@ -21,10 +21,10 @@ use super::encoding::DecodedLimit;
 use super::paging::{List, Paging};
 use super::path::PathName;
 use super::problem::Problem;
-use crate::attribute::AttributeDocument;
-use crate::model::{ActionDocument, DefinitionDocument};
 use crate::service::{Caller, DefinitionReader, Etude, ModelDefinition, Registered, ServiceError};
 use crate::store::{ModelSummary, PIECE_BYTES};
+use etude_core::attribute::AttributeDocument;
+use etude_core::model::{ActionDocument, DefinitionDocument};
 
 /// A registered model.
 #[derive(Debug, Serialize, ToSchema)]

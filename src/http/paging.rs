@@ -6,8 +6,8 @@ use serde::Serialize;
 use utoipa::{IntoParams, ToSchema};
 
 use super::problem::Problem;
-use crate::document::{Faults, Path};
 use crate::store::Page;
+use etude_core::document::{Faults, Path};
 
 /// Which part of a list is wanted.
 #[derive(Clone, Debug, PartialEq, Eq, IntoParams)]

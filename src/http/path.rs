@@ -5,8 +5,8 @@ use axum::extract::{FromRequestParts, Path};
 use axum::http::request::Parts;
 
 use super::problem::{Problem, ProblemKind};
-use crate::document::Faults;
 use crate::service::Name;
+use etude_core::document::Faults;
 
 /// The name at the end of a path.
 pub(super) struct PathName(pub(super) Name);

@@ -14,8 +14,8 @@ use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::Problem;
 use super::{SharedContext, answer};
-use crate::mapping::{Policy, PolicySummary, RequestDocument};
 use crate::service::{BatchRequest, Caller, ServiceError};
+use etude_core::mapping::{Policy, PolicySummary, RequestDocument};
 
 /// Follow a demonstration: the policy whose effects come closest to it, stored.
 #[utoipa::path(

@@ -10,9 +10,9 @@ use utoipa::ToSchema;
 
 use super::encoding::Encoding;
 use super::observe::RequestId;
-use crate::document::{Fault, Faults, ParseError};
 use crate::service::{self, PoolError, ServiceError};
 use crate::store::{StoreError, Unavailable};
+use etude_core::document::{Fault, Faults, ParseError};
 
 /// What kind of problem it is: its `type`, title and status.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

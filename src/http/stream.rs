@@ -29,10 +29,10 @@ use super::encoding::Encoding;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{Problem, ProblemKind};
-use crate::attribute::ByAttribute;
 use crate::service::Caller;
 use crate::store::{SessionRow, SessionWeights};
 use crate::stream::{Gone, Incoming, PROTOCOL, Room, SMALL_FRAME_BYTES, Sender};
+use etude_core::attribute::ByAttribute;
 
 /// How long a closing handshake may take.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);

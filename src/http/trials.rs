@@ -15,9 +15,9 @@ use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
 use super::problem::Problem;
 use super::{SharedContext, answer};
-use crate::mapping::{ObservationDocument, Policy, StartReference};
 use crate::service::{Caller, TrialAnswer};
 use crate::store::{StoreError, TrialStatus};
+use etude_core::mapping::{ObservationDocument, Policy, StartReference};
 
 /// A request for a trial.
 #[derive(Debug, Serialize, Deserialize, ToSchema)]

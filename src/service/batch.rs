@@ -27,14 +27,14 @@ use super::policies::{
     Envelope, Extent, MAX_INLINE_BYTES, Named, Searched, base_weights, follow, parse, take_for_demonstration,
 };
 use super::{Admission, Caller, Etude, MadePolicy, ServiceError};
-use crate::attribute::Weights;
-use crate::document::{self, Faults, Object, Path, Place};
-use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::{
+use crate::memory::{Held, Memory};
+use etude_core::attribute::Weights;
+use etude_core::document::{self, Faults, Object, Path, Place};
+use etude_core::interrupt::{Cancelled, Interrupt};
+use etude_core::mapping::{
     Conditions, Demonstration, HeuristicName, Mapper, ObservationDocument, Policy, Request, Stamp, StartReference,
 };
-use crate::memory::{Held, Memory};
-use crate::model::{Model, Origin};
+use etude_core::model::{Model, Origin};
 
 /// Most items of a batch: as large a data set as most, while an answer full of short policies stays at some ten megabytes.
 pub const MAX_BATCH_ITEMS: usize = 10_000;
@@ -492,8 +492,8 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::interrupt::Uninterrupted;
-    use crate::model::{Definition, Limits};
+    use etude_core::interrupt::Uninterrupted;
+    use etude_core::model::{Definition, Limits};
 
     const MODEL: &str = include_str!("../../examples/figure-4/model.json");
     const DEMONSTRATION: &str = include_str!("../../examples/figure-4/demonstration.json");

@@ -8,9 +8,9 @@ use quick_cache::{DefaultHashBuilder, OptionsBuilder, Weighter};
 
 use super::pool::Admission;
 use super::{Etude, ServiceError};
-use crate::mapping::Mapper;
 use crate::memory::SMALL_BYTES;
 use crate::store::ModelKey;
+use etude_core::mapping::Mapper;
 
 /// Compiled models by the hash of their content, the least useful evicted.
 ///
@@ -120,10 +120,10 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::document::{Faults, Place};
-    use crate::interrupt::Uninterrupted;
-    use crate::mapping::{Grouping, Request, Settings};
-    use crate::model::{Definition, Limits, Model};
+    use etude_core::document::{Faults, Place};
+    use etude_core::interrupt::Uninterrupted;
+    use etude_core::mapping::{Grouping, Request, Settings};
+    use etude_core::model::{Definition, Limits, Model};
 
     fn mapper(side: u32) -> Arc<Mapper> {
         let model = json!({"dynamics": {"kind": "wumpus", "width": side, "height": side}});

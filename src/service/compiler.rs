@@ -19,15 +19,16 @@ use tokio_util::task::TaskTracker;
 use tracing::Instrument;
 
 use super::cache::MapperCache;
+use super::hash::hex;
 use super::models::{DefinitionReader, ModelText, check_hash, corrupt_definition, unknown};
 use super::pool::Admission;
 use super::{Client, Etude, PipeWriter, PoolError, SearchPool, ServiceError, Settings, pipe};
-use crate::document::Faults;
-use crate::interrupt::{Interrupt, Interrupted, Signal};
-use crate::mapping::Mapper;
 use crate::memory::{Held, Memory, NoRoom};
-use crate::model::{Definition, Format, Limits, Model, ReadError, hex};
 use crate::store::{ModelKey, ModelSize, ModelSummary, Store, StoreError, StoredDefinition};
+use etude_core::document::Faults;
+use etude_core::interrupt::{Interrupt, Interrupted, Signal};
+use etude_core::mapping::Mapper;
+use etude_core::model::{Definition, Format, Limits, Model, ReadError};
 
 /// Makes models ready, and keeps as many as fit.
 #[derive(Clone, Debug)]
@@ -181,7 +182,7 @@ impl Compiler {
         let job = move |interrupt: &mut dyn Interrupt| {
             // That of pieces is checked as they come.
             if let ModelText::Whole(text) = &text
-                && let Err(error) = check_hash(&model, &hex(&Sha256::digest(text)), &expected)
+                && let Err(error) = check_hash(&model, &hex(Sha256::digest(text)), &expected)
             {
                 return Ok(Err(error.into()));
             }

@@ -2,11 +2,11 @@
 
 use jiff::Timestamp;
 
+use super::hash::hash_of;
 use super::{Etude, Name, Registered, ServiceError, as_stored};
-use crate::document;
-use crate::learning::{Distribution, Learner, LearnerDocument};
-use crate::model::hash_of;
 use crate::store::{LearnerRow, NewLearner, Page, PutLearner, StoreError, WeightsRow};
+use etude_core::document;
+use etude_core::learning::{Distribution, Learner, LearnerDocument};
 
 /// A learner as it was registered.
 #[derive(Clone, Debug)]

@@ -8,18 +8,19 @@ use sha2::{Digest, Sha256};
 use tokio::sync::mpsc;
 
 use super::compiler::{Compiler, LimitedTime};
+use super::hash::{hash_of, hex};
 use super::policies::MAX_INLINE_BYTES;
 use super::pool::Places;
 use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
-use crate::attribute::AttributeDocument;
-use crate::interrupt::{Interrupt, Interrupted};
-use crate::mapping::Mapper;
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
-use crate::model::{ActionDocument, Definition, Format, Limits, ReadError, hash_of, hex};
 use crate::store::{
     ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, PutModel, Store,
     StoreError, StoredDefinition,
 };
+use etude_core::attribute::AttributeDocument;
+use etude_core::interrupt::{Interrupt, Interrupted};
+use etude_core::mapping::Mapper;
+use etude_core::model::{ActionDocument, Definition, Format, Limits, ReadError};
 
 /// A model and its definition, as registered.
 #[derive(Debug)]
@@ -68,7 +69,7 @@ impl DefinitionReader {
     pub(super) async fn next_in(&mut self, store: &Store) -> Result<Option<Vec<u8>>, ServiceError> {
         let Some(piece) = store.piece(self.id, self.seq).await? else {
             let hash = std::mem::take(&mut self.hash);
-            check_hash(&self.model, &hex(&hash.finalize()), &self.expected)?;
+            check_hash(&self.model, &hex(hash.finalize()), &self.expected)?;
             return Ok(None);
         };
         self.seq += 1;
@@ -462,12 +463,12 @@ impl DefinitionWriter {
             self.hash.update(&self.piece);
             let text = String::from_utf8(self.piece)
                 .map_err(|error| ServiceError::Write(serde_json::Error::io(io::Error::other(error))))?;
-            return Ok((hex(&self.hash.finalize()), Some(text)));
+            return Ok((hex(self.hash.finalize()), Some(text)));
         }
         if !self.piece.is_empty() {
             self.send_piece().map_err(|error| ServiceError::Write(serde_json::Error::io(error)))?;
         }
-        Ok((hex(&self.hash.finalize()), None))
+        Ok((hex(self.hash.finalize()), None))
     }
 }
 

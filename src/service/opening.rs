@@ -4,10 +4,10 @@ use std::num::NonZeroU32;
 
 use super::learners::Ready;
 use super::policies::{Envelope, base_weights};
-use crate::attribute::Weights;
-use crate::document::{Faults, Object, Path};
-use crate::mapping::{Conditions, Demonstration, Mapper, Request, read_lookahead};
-use crate::model::Origin;
+use etude_core::attribute::Weights;
+use etude_core::document::{Faults, Object, Path};
+use etude_core::mapping::{Conditions, Demonstration, Mapper, Request, read_lookahead};
+use etude_core::model::Origin;
 
 /// Lookahead of a session that names none.
 const DEFAULT_LOOKAHEAD: u32 = 8;

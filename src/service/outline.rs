@@ -12,10 +12,10 @@ use serde_json::{Map, Value};
 
 use super::batch::MAX_BATCH_ITEMS;
 use super::policies::max_quick_observations;
-use crate::document;
-use crate::mapping::{Demonstration, Mapper, Policy, WellFormed};
 use crate::memory::{Held, Memory, UNCOUNTED_BYTES};
-use crate::model::Model;
+use etude_core::document;
+use etude_core::mapping::{Demonstration, Mapper, Policy, WellFormed};
+use etude_core::model::Model;
 
 /// Gives the model with a name, if it is at hand.
 pub(super) type AtHand<'m> = &'m dyn Fn(&str) -> Option<Arc<Mapper>>;
@@ -293,8 +293,8 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::interrupt::Uninterrupted;
-    use crate::model::{Definition, Limits};
+    use etude_core::interrupt::Uninterrupted;
+    use etude_core::model::{Definition, Limits};
 
     fn mapper() -> Arc<Mapper> {
         mapper_of(&serde_json::from_str(include_str!("../../examples/figure-4/model.json")).unwrap())
@@ -404,7 +404,7 @@ mod tests {
         let batch = read(&memory).unwrap();
         let taken = (1 << 30) - memory.free();
         // 30 kB of text.
-        let values = (100 * 100 * 256 * size_of::<Option<crate::attribute::Value>>()) as u64;
+        let values = (100 * 100 * 256 * size_of::<Option<etude_core::attribute::Value>>()) as u64;
         assert!((values..values * 5 / 4).contains(&taken), "{taken} for {values}");
         drop(batch);
         assert_eq!(memory.free(), 1 << 30);

@@ -15,13 +15,13 @@ use uuid::Uuid;
 use super::learners::Ready;
 use super::outline::Outline;
 use super::{Admission, Caller, Etude, ServiceError};
-use crate::attribute::Weights;
-use crate::document::{self, Faults, Path, Place};
-use crate::interrupt::{Cancelled, Interrupt, time_until_finish};
-use crate::mapping::{Demonstration, Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
-use crate::model::Model;
-use crate::store::{NewPolicy, NewRefinement, Page, PolicySummaryRow, StoreError};
+use crate::store::{NewPolicy, NewRefinement, Page, PolicySummaryRow, StoreError, pack_steps};
+use etude_core::attribute::Weights;
+use etude_core::document::{self, Faults, Path, Place};
+use etude_core::interrupt::{Cancelled, Interrupt, time_until_finish};
+use etude_core::mapping::{Demonstration, Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
+use etude_core::model::Model;
 
 /// Bodies up to this size are parsed where they arrive, which takes less than a millisecond; larger ones in the pool. Likewise
 /// for the states of an answer.
@@ -362,6 +362,7 @@ pub(super) fn write_policy(
 ) -> Result<(String, PolicyText), ServiceError> {
     let written = WrittenPolicy::new(&stamp, problem, mapping)?;
     let WrittenPolicy { answer, summary, steps } = written;
+    let steps = pack_steps(&steps)?;
     Ok((answer, PolicyText { id: stamp.id.unwrap_or_default(), summary, steps }))
 }
 
@@ -574,9 +575,9 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::interrupt::Uninterrupted;
-    use crate::model::{Definition, Format, Limits};
     use crate::service::{Client, ModelText, Name, PoolSettings, Settings, TimeLimits};
+    use etude_core::interrupt::Uninterrupted;
+    use etude_core::model::{Definition, Format, Limits};
 
     fn caller() -> Caller {
         Caller { client: Client::LOCAL, arrived: Instant::now(), now: Timestamp::UNIX_EPOCH }

@@ -24,11 +24,11 @@ use super::policies::{
     PolicyText, as_micros, read_weighted_request, report, take_for_demonstration, take_for_search, write_policy,
 };
 use super::{Etude, PoolError, ServiceError};
-use crate::document;
-use crate::interrupt::{Cancelled, Interrupt, Signal};
-use crate::mapping::{Cost, Mapper, Policy, Settings, Stamp, Status};
 use crate::memory::Memory;
 use crate::store::{MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError};
+use etude_core::document;
+use etude_core::interrupt::{Cancelled, Interrupt, Signal};
+use etude_core::mapping::{Cost, Mapper, Policy, Settings, Stamp, Status};
 
 /// The first pause after a refinement that did not come to its end.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
@@ -251,10 +251,10 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::interrupt::Uninterrupted;
-    use crate::model::{Format, Limits};
     use crate::service::{Caller, Client, ModelText, Name, PoolSettings, TimeLimits};
     use crate::store::NewPolicy;
+    use etude_core::interrupt::Uninterrupted;
+    use etude_core::model::{Format, Limits};
 
     const NOW: Timestamp = Timestamp::UNIX_EPOCH;
 

@@ -12,12 +12,12 @@ use uuid::Uuid;
 use super::learners::{Ready, unknown};
 use super::policies::{self, Named, Searched};
 use super::{Caller, Etude, Name, ServiceError, as_stored};
-use crate::attribute::{Schema, Weights};
-use crate::document::{Faults, Path, Place, Range};
-use crate::interrupt::Interrupt;
-use crate::mapping::Stamp;
 use crate::memory::Held;
 use crate::store::{FailTrial, NewReward, NewTrial, Page, PutReward, Store, StoreError, TrialRow, TrialStatus};
+use etude_core::attribute::{Schema, Weights};
+use etude_core::document::{Faults, Path, Place, Range};
+use etude_core::interrupt::Interrupt;
+use etude_core::mapping::Stamp;
 
 /// Longest reason for a failure, in characters.
 const MAX_REASON_CHARS: usize = 1000;
@@ -153,7 +153,7 @@ impl Etude {
         let numbers = self.trial_numbers.of(*sequence, &self.store).await?;
         let number = numbers.fetch_add(1, Ordering::Relaxed) + 1;
         let drawn = learner.draw(&weights.distribution, number);
-        let missing = |missing: crate::learning::MissingAttributes| Faults::one("/learner", missing.to_string());
+        let missing = |missing: etude_core::learning::MissingAttributes| Faults::one("/learner", missing.to_string());
         let all = learner.weights_for(schema, &drawn).map_err(missing)?;
         let now = as_stored(now);
         let trial = NewTrial {
@@ -212,7 +212,7 @@ impl Etude {
     ///
     /// If the body is no reward, there is no such trial, or it has another reward or has failed.
     pub async fn reward_trial(&self, id: &str, body: &[u8], now: Timestamp) -> Result<TrialAnswer, ServiceError> {
-        let document = crate::document::parse(body)?;
+        let document = etude_core::document::parse(body)?;
         let mut faults = Faults::default();
         let object = Place::root(&document).object(&["reward"], &mut faults);
         let reward =
@@ -248,7 +248,7 @@ impl Etude {
     ///
     /// If the body gives no reason, there is no such trial, or it has a reward or has failed for another reason.
     pub async fn fail_trial(&self, id: &str, body: &[u8], now: Timestamp) -> Result<TrialAnswer, ServiceError> {
-        let document = crate::document::parse(body)?;
+        let document = etude_core::document::parse(body)?;
         let mut faults = Faults::default();
         let object = Place::root(&document).object(&["reason"], &mut faults);
         let reason = object.and_then(|object| match object.optional("reason") {

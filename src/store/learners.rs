@@ -8,8 +8,8 @@ use sqlx::{Row, SqliteConnection};
 use super::page::{Rest, Rows};
 use super::writer::{Write, Written};
 use super::{Page, Store, StoreError, as_integer, corrupt, count, page, timestamp};
-use crate::attribute::ByAttribute;
-use crate::learning::Distribution;
+use etude_core::attribute::ByAttribute;
+use etude_core::learning::Distribution;
 
 /// A learner to be registered.
 #[derive(Clone, Debug)]

@@ -39,7 +39,7 @@ use jiff::Timestamp;
 pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
 pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
 pub use page::Page;
-pub use policies::{NewPolicy, PolicySummaryRow};
+pub use policies::{NewPolicy, PolicySummaryRow, pack_steps};
 pub use refinements::{MAX_ATTEMPTS, NewRefinement, RefinementEnd};
 pub use sessions::{
     ExpiredSession, MAX_EXPIRED_AT_ONCE, NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus,

@@ -9,8 +9,8 @@ use super::definitions::{self, NewPieces};
 use super::page::Rows;
 use super::writer::{Write, Written};
 use super::{Page, Store, StoreError, as_integer, corrupt, count, page, timestamp};
-use crate::attribute::AttributeDocument;
-use crate::model::ActionDocument;
+use etude_core::attribute::AttributeDocument;
+use etude_core::model::ActionDocument;
 
 /// What is kept of a model besides its definition.
 #[derive(Clone, Debug, PartialEq)]

@@ -150,9 +150,9 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::attribute::AttributeDocument;
-    use crate::learning::Distribution;
     use crate::store::{ModelSummary, NewDefinition, NewLearner, NewModel, NewPolicy, Store};
+    use etude_core::attribute::AttributeDocument;
+    use etude_core::learning::Distribution;
 
     /// Half of what a page takes, so that it has two items.
     const HALF: usize = MAX_BYTES / 2;

@@ -13,8 +13,8 @@ use super::page::{Rest, Rows};
 use super::refinements::NewRefinement;
 use super::writer::Write;
 use super::{Page, Store, StoreError, as_integer};
-use crate::mapping::StoredPolicy;
 use crate::memory::{Held, Memory};
+use etude_core::mapping::{ShortSteps, StoredPolicy};
 
 /// A policy to be stored.
 #[derive(Clone, Debug)]
@@ -23,7 +23,7 @@ pub struct NewPolicy {
     pub id: String,
     /// JSON: the policy without its steps.
     pub summary: String,
-    /// Its steps in short, as [`WrittenPolicy`](crate::mapping::WrittenPolicy) has them.
+    /// Its steps in short, packed by [`pack_steps`].
     pub steps: Vec<u8>,
     /// When it was made.
     pub created_at: Timestamp,
@@ -192,6 +192,15 @@ fn read_summary(row: &SqliteRow) -> Result<PolicySummaryRow, StoreError> {
     Ok(PolicySummaryRow { sequence: row.try_get("sequence")?, id: row.try_get("id")?, summary: linked(summary, row)? })
 }
 
+/// Steps as they are stored: postcard.
+///
+/// # Errors
+///
+/// Never: all of them can be packed.
+pub fn pack_steps(steps: &ShortSteps<'_>) -> Result<Vec<u8>, StoreError> {
+    postcard::to_extend(steps, Vec::with_capacity(steps.n_bytes())).map_err(corrupt("steps"))
+}
+
 /// Writes a policy as it was answered, and takes what that needs of `memory`. Nothing if that may be more than `max_bytes`.
 fn write_answer(
     summary: &str,
@@ -199,6 +208,7 @@ fn write_answer(
     max_bytes: usize,
     memory: &Memory,
 ) -> Result<Option<(String, Option<Held>)>, StoreError> {
+    let steps = postcard::from_bytes(steps).map_err(corrupt("steps"))?;
     let stored = StoredPolicy::read(summary, steps).map_err(corrupt("steps"))?;
     let n_bytes = stored.answer_bytes().map_err(corrupt("steps"))?;
     if n_bytes > max_bytes {
@@ -318,12 +328,13 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::interrupt::Uninterrupted;
-    use crate::mapping::{Demonstration, Mapper, Problem, Stamp, WrittenPolicy};
-    use crate::model::{Definition, Limits, Model};
+    use etude_core::interrupt::Uninterrupted;
+    use etude_core::mapping::{Demonstration, Mapper, Problem, Stamp, WrittenPolicy};
+    use etude_core::model::{Definition, Limits, Model};
 
-    /// A policy of a line of so many states with long names, which goes all the way.
-    fn long(id: &str, n_states: usize) -> WrittenPolicy {
+    /// A policy of a line of so many states with long names, which goes all the way: its answer, its summary and its steps as they are
+    /// stored.
+    fn long(id: &str, n_states: usize) -> (String, String, Vec<u8>) {
         const N_ATTRIBUTES: usize = 32;
         let attribute = |n| serde_json::json!({"name": format!("{n:0>64}"), "kind": "number", "weight": 1e9});
         let states: Vec<_> = (0..n_states).map(|n| vec![u8::from(n + 1 == n_states); N_ATTRIBUTES]).collect();
@@ -342,8 +353,10 @@ mod tests {
         let demonstration = Demonstration::of([vec![None; N_ATTRIBUTES], vec![Some(end); N_ATTRIBUTES]]).unwrap();
         let weights = mapper.model().schema().weights();
         let problem = Problem::new(mapper.model(), demonstration, weights, None);
-        let mapping = mapper.map(&problem, crate::mapping::Settings::default(), &mut Uninterrupted).unwrap();
-        WrittenPolicy::new(&Stamp { id: Some(id.to_owned()), ..Stamp::default() }, &problem, &mapping).unwrap()
+        let mapping = mapper.map(&problem, etude_core::mapping::Settings::default(), &mut Uninterrupted).unwrap();
+        let stamp = Stamp { id: Some(id.to_owned()), ..Stamp::default() };
+        let WrittenPolicy { answer, summary, steps } = WrittenPolicy::new(&stamp, &problem, &mapping).unwrap();
+        (answer, summary, pack_steps(&steps).unwrap())
     }
 
     #[tokio::test]
@@ -353,7 +366,7 @@ mod tests {
         // Stored in little, in little that becomes more than is written in passing, and in much.
         for n_states in [3, 700, 7000] {
             let id = n_states.to_string();
-            let WrittenPolicy { answer, summary, steps } = long(&id, n_states);
+            let (answer, summary, steps) = long(&id, n_states);
             let created_at = Timestamp::UNIX_EPOCH;
             let is_small = summary.len() + steps.len() <= MAX_INLINE_BYTES;
             assert_eq!((is_small, answer.len() > MAX_INLINE_ANSWER_BYTES), (n_states < 7000, n_states > 3));

@@ -16,7 +16,7 @@ use super::refinements::NewRefinement;
 use super::trials::{self, NewTrial};
 use super::writer::{Line, Write, Written};
 use super::{Page, Store, StoreError, arrivals, as_integer, corrupt, count, policies, refinements, timestamp};
-use crate::attribute::ByAttribute;
+use etude_core::attribute::ByAttribute;
 
 /// How far a session has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

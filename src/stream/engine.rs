@@ -12,12 +12,12 @@ use tokio_util::sync::CancellationToken;
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem, WriteError};
 use super::queue::{Gone, Receiver, Sender, Weighed};
 use super::room::{Crowded, SMALL_FRAME_BYTES, Taken};
-use crate::document::{self, ParseError, Place};
-use crate::mapping::{CommittedStep, Demonstration};
 use crate::service::{
     Caller, Client, Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
 use crate::store::{AcceptedReward, StoreError, Unavailable};
+use etude_core::document::{self, ParseError, Place};
+use etude_core::mapping::{CommittedStep, Demonstration};
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";

@@ -5,9 +5,9 @@ use std::io;
 use serde::Serialize;
 use serde_json::Value;
 
-use crate::attribute::{ByAttribute, Scalar};
-use crate::document::{Fault, Faults, Place};
-use crate::mapping::{CommittedStep, Cost, MoveKind, Policy, Status, Step};
+use etude_core::attribute::{ByAttribute, Scalar};
+use etude_core::document::{Fault, Faults, Place};
+use etude_core::mapping::{CommittedStep, Cost, MoveKind, Policy, Status, Step};
 
 /// What a client sends.
 #[derive(Clone, Debug, PartialEq)]
@@ -90,7 +90,7 @@ impl ClientFrame {
             "reward" => {
                 root.object(&["type", "reward"], faults)?;
                 let reward = object.required("reward", faults)?;
-                Some(Self::Reward { reward: reward.number(crate::document::Range::Finite, faults)? })
+                Some(Self::Reward { reward: reward.number(etude_core::document::Range::Finite, faults)? })
             }
             _ => kind.mismatch("one of \"open\", \"observe\", \"end\", \"resume\", \"reward\"", faults),
         }

@@ -2,10 +2,10 @@
 
 #![allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its part of this module")]
 
-use etude::document::{Faults, Place};
-use etude::interrupt::Uninterrupted;
-use etude::mapping::{Mapper, Policy, Request, Stamp};
-use etude::model::{Act, Definition, Limits, Model};
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::mapping::{Mapper, Policy, Request, Stamp};
+use etude_core::model::{Act, Definition, Limits, Model};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 

@@ -16,9 +16,9 @@ use tokio_util::task::TaskTracker;
 
 use super::*;
 use crate::config::ServeConfig;
-use crate::model::Format;
 use crate::service::{Client, Etude, ModelText, Name};
 use crate::stream::{Limits, Rooms};
+use etude_core::model::Format;
 
 /// Longer than anything here takes; a test that waits for this fails.
 const PATIENCE: Duration = Duration::from_secs(30);

@@ -30,7 +30,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
 use super::Client;
-use crate::interrupt::{Cancelled, Interrupt, Signal};
+use etude_core::interrupt::{Cancelled, Interrupt, Signal};
 pub(crate) use turns::Places;
 use turns::{Class, LENT_AFTER, Level, Ticket, Turns};
 

@@ -21,12 +21,12 @@ use super::opening::{Names, Opening};
 use super::owners::{Ownership, TakenOver};
 use super::policies::{MAX_INLINE_BYTES, Named};
 use super::{Caller, Etude, PoolError, ServiceError};
-use crate::attribute::{Schema, Weights};
-use crate::document::{Faults, Place};
-use crate::interrupt::{Interrupt, time_until_finish};
-use crate::mapping::{Budget, CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, TooManySteps};
 use crate::memory::Held;
 use crate::store::{MAX_EXPIRED_AT_ONCE, NewSession, Page, SessionRow, SessionStatus, SessionWeights, StoreError};
+use etude_core::attribute::{Schema, Weights};
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::{Interrupt, time_until_finish};
+use etude_core::mapping::{Budget, CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, TooManySteps};
 
 /// Why a session could not do as told.
 #[derive(Debug, thiserror::Error)]
@@ -411,8 +411,8 @@ mod tests {
 
     use super::*;
     use crate::memory::Memory;
-    use crate::model::{Format, Limits};
     use crate::service::{Client, ModelText, Name, PoolSettings, Settings, TimeLimits};
+    use etude_core::model::{Format, Limits};
 
     const NOW: Timestamp = Timestamp::UNIX_EPOCH;
 

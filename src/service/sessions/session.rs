@@ -10,16 +10,18 @@ use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
 use super::{SessionError, read_stored};
-use crate::attribute::{ByAttribute, Weights};
-use crate::document::{Faults, Place};
-use crate::interrupt::{Interrupt, Uninterrupted};
-use crate::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, Stopped};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
-use crate::model::{Model, Origin};
 use crate::service::owners::Ownership;
 use crate::service::policies::{PolicyText, as_micros, report, take_beyond_small, write_policy};
 use crate::service::{Client, Etude, PoolError, ServiceError};
 use crate::store::{AcceptedReward, NewObservations, NewRefinement, SessionEnd, TrialRow};
+use etude_core::attribute::{ByAttribute, Weights};
+use etude_core::document::{Faults, Place};
+use etude_core::interrupt::{Interrupt, Uninterrupted};
+use etude_core::mapping::{
+    CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, Stopped,
+};
+use etude_core::model::{Model, Origin};
 
 /// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
 /// in the pool.
@@ -389,7 +391,7 @@ fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) 
 }
 
 /// An observation as it was read. Shape `[n_attributes]`; `None` where an attribute was not observed.
-pub type Observation = Vec<Option<crate::attribute::Value>>;
+pub type Observation = Vec<Option<etude_core::attribute::Value>>;
 
 /// How many bytes so many steps take as they are written: as they are answered, and as they are stored.
 fn written_bytes(n_steps: usize, model: &Model) -> usize {
@@ -467,7 +469,7 @@ mod tests {
     use serde_json::{Value, json};
 
     use super::*;
-    use crate::model::{Definition, Limits};
+    use etude_core::model::{Definition, Limits};
 
     #[test]
     fn what_is_mapped_where_it_arrives_is_measured_by_transitions_too() {

@@ -1,0 +1,480 @@
+//! A model prepared for mapping.
+
+mod escalation;
+mod foretold;
+
+use std::any::Any;
+use std::iter::repeat_n;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::{self, ThreadId};
+
+use rustc_hash::FxHashMap;
+use serde::{Deserialize, Serialize};
+
+use super::Problem;
+use super::completion::{Allowance, Extras, complete};
+use super::cost::{Cost, ROUNDING, SLACK, cost_of};
+use super::heuristic::paper::Paper;
+use super::heuristic::projected::{self, Projected, TableRoom};
+use super::heuristic::projection::Projections;
+use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
+use super::search::{Found, Move, astar, best_first, layered};
+use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
+use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
+use escalation::Patience;
+
+/// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Budget {
+    /// Most nodes expanded.
+    pub max_expansions: u64,
+    /// About the most memory that it takes, in bytes: for the nodes and states that it finds, for tables of estimates, half of it at most
+    /// before groups of attributes are projected together, and for what these take; for ways and for the mapping. What does not fit is
+    /// left out, and when nothing is left, the search ends.
+    ///
+    /// Not counted are the problem itself, the model, what its mapper [keeps](Mapper::size_bytes) of searches before, and about a
+    /// hundred bytes for each observation and step of mappings with many actions for an observation.
+    pub max_bytes: usize,
+}
+
+impl Budget {
+    /// Any number of expansions, within 1 GB.
+    pub const DEFAULT: Self = Self { max_expansions: u64::MAX, max_bytes: 1 << 30 };
+}
+
+impl Budget {
+    /// What is left of it if `n_bytes` are taken.
+    pub(in crate::mapping) fn beside(self, n_bytes: usize) -> Self {
+        Self { max_bytes: self.max_bytes.saturating_sub(n_bytes), ..self }
+    }
+
+    /// Whether there is no more memory: for `n_bytes`, and what was found in `space`.
+    #[inline]
+    pub(in crate::mapping) fn is_full(self, n_bytes: usize, space: &impl Space) -> bool {
+        n_bytes + space.found_bytes() >= self.max_bytes
+    }
+}
+
+impl Default for Budget {
+    fn default() -> Self {
+        Self::DEFAULT
+    }
+}
+
+/// How a mapping is searched for.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Settings {
+    /// What guides the search.
+    pub heuristic: HeuristicName,
+    /// What it may spend.
+    pub budget: Budget,
+    /// The cost of a mapping that is known already: nothing that costs more is looked at. If it is below the optimum, the mapping
+    /// is bounded by it, unless all nodes had to be looked at. Has no effect with the paper's heuristic.
+    pub upper_bound: Option<f64>,
+    /// When the default heuristic projects attributes together.
+    pub grouping: Grouping,
+}
+
+/// What was proven of a mapping.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(rename_all = "lowercase")]
+pub enum Status {
+    /// No mapping costs less.
+    Optimal,
+    /// No mapping costs less than `lower_bound`: a budget ran out, or the heuristic proves nothing.
+    Bounded,
+    /// Nothing: a finite lookahead decided.
+    Local,
+}
+
+impl Status {
+    /// The status, as in JSON.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Optimal => "optimal",
+            Self::Bounded => "bounded",
+            Self::Local => "local",
+        }
+    }
+}
+
+/// What a search ran out of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(rename_all = "snake_case")]
+pub enum StoppedBy {
+    /// The expansions that the request allows.
+    MaxExpansions,
+    /// Time.
+    #[serde(rename = "deadline_ms")]
+    Deadline,
+    /// The memory that a search may take.
+    Memory,
+}
+
+impl StoppedBy {
+    /// What it is called in JSON.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::MaxExpansions => "max_expansions",
+            Self::Deadline => "deadline_ms",
+            Self::Memory => "memory",
+        }
+    }
+}
+
+/// The best sequence of imitator states and actions that was found for a demonstration, with its alignment.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mapping {
+    /// The steps, from [`Start`](super::MoveKind::Start) to the last observation.
+    pub moves: Vec<Move>,
+    /// What they cost.
+    pub cost: Cost,
+    /// What was proven.
+    pub status: Status,
+    /// No mapping costs less. Equal to `cost.total` if optimal; `None` if local.
+    pub lower_bound: Option<f64>,
+    /// What the search ran out of, if that is why it is not optimal, or why the end of what a lookahead decided was followed greedily.
+    pub stopped_by: Option<StoppedBy>,
+    /// Nodes expanded.
+    pub n_expanded: u64,
+    /// Successors looked at.
+    pub n_generated: u64,
+    /// The states of the moves, in the order in which they are first passed, if the model is searched lazily; else they are those
+    /// of the model.
+    pub states: Option<States>,
+}
+
+/// A model, and what is computed once per model to search it.
+#[derive(Debug)]
+pub struct Mapper {
+    model: Arc<Model>,
+    projections: Projections,
+    /// Of searches that have ended, for those that come: at most as many as ran at the same time, each with the thread that used it
+    /// last, whose processor may still have it in its cache.
+    buffers: Mutex<Vec<(ThreadId, Box<Buffers>)>>,
+    patience: Patience,
+    /// See [`Self::keeping`].
+    #[expect(dead_code, reason = "it is kept to be dropped")]
+    kept: Option<Box<dyn Any + Send + Sync>>,
+}
+
+/// Buffers of a search, kept to be used again.
+#[derive(Debug, Default)]
+struct Buffers {
+    solving: projected::Buffers,
+    searching: best_first::Buffers,
+    layered: layered::Buffers,
+}
+
+impl Buffers {
+    /// Searches of which they are kept: as many as there are processors for, mostly.
+    const MAX_KEPT: usize = 4;
+
+    /// Most that are kept of a search.
+    const MAX_KEPT_BYTES: usize = 16 << 20;
+
+    /// And no more than this part of what it may take.
+    const PART_KEPT: usize = 8;
+
+    /// How much memory they take, in bytes.
+    fn size_bytes(&self) -> usize {
+        size_of::<Self>() + self.solving.kept_bytes() + self.searching.kept_bytes() + self.layered.kept_bytes()
+    }
+}
+
+impl Mapper {
+    /// Prepares `model`. Takes time and memory proportional to its states and transitions times attributes.
+    ///
+    /// # Errors
+    ///
+    /// What `interrupt` said, if that was not to continue.
+    pub fn new(model: Model, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
+        Self::within(model, usize::MAX, interrupt)
+    }
+
+    /// As [`Self::new`], in about `max_bytes` at most, those of the model included: attributes of which the projections do not fit are not
+    /// projected. Searches take longer without, and find the same.
+    ///
+    /// # Errors
+    ///
+    /// What `interrupt` said, if that was not to continue.
+    pub fn within(model: Model, max_bytes: usize, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
+        let left = max_bytes.saturating_sub(model.size_bytes());
+        let projections = Projections::new(&model, left, interrupt)?;
+        let (model, buffers) = (Arc::new(model), Mutex::default());
+        Ok(Self { model, projections, buffers, patience: Patience::DEFAULT, kept: None })
+    }
+
+    /// The same mapper, which keeps `token` for as long as it lives: what its memory is counted by, for whoever counts that.
+    #[must_use]
+    pub fn keeping(self, token: impl Any + Send + Sync) -> Self {
+        Self { kept: Some(Box::new(token)), ..self }
+    }
+
+    /// The model.
+    #[must_use]
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    pub(in crate::mapping) fn shared_model(&self) -> Arc<Model> {
+        Arc::clone(&self.model)
+    }
+
+    /// Approximate size in memory, in bytes: that of the model, and of what is kept for searches, which grows with these. Of as many
+    /// searches as ran at the same time, up to 16 MB each are kept; and the groups of attributes that long ones have made.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        let buffers: usize = self.buffers().iter().map(|(_, buffers)| buffers.size_bytes()).sum();
+        self.model.size_bytes() + self.projections.size_bytes() + buffers
+    }
+
+    /// Gives back what was kept of searches. The next ones take longer, and find the same.
+    pub fn release(&self) {
+        drop(std::mem::take(&mut *self.buffers()));
+        self.projections.release();
+    }
+
+    fn buffers(&self) -> MutexGuard<'_, Vec<(ThreadId, Box<Buffers>)>> {
+        self.buffers.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the
+    /// search by default. Consistent, for nodes that the start leads to; 0 at the last observation. For other searches, and to
+    /// look at.
+    ///
+    /// # Panics
+    ///
+    /// If `problem` is of another model; the function, if the observation is not of the problem, or the state has no number in the
+    /// model, as all but the start of one that is searched lazily.
+    pub fn lower_bounds<'p>(&'p self, problem: &'p Problem<'p>) -> impl Fn(u32, StateIdx) -> f64 + 'p {
+        self.check(problem);
+        let room = TableRoom::within(usize::MAX);
+        let solved = self.solve(problem, Grouping::WhenItPays, room, &mut Uninterrupted);
+        let projected = solved.ok().flatten();
+        let projected = projected.expect("nothing interrupts");
+        move |observation, state| projected.cost_to_go(observation as usize, self.model.states().row(state))
+    }
+
+    /// The cheapest mapping of `problem`, which must be of this mapper's model; the best one found if the budget runs out or
+    /// `interrupt` says to finish. Deterministic but for where `interrupt` cuts it off.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    ///
+    /// # Panics
+    ///
+    /// If `problem` is of another model.
+    pub fn map(
+        &self,
+        problem: &Problem<'_>,
+        settings: Settings,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        self.check(problem);
+        let Some(cave) = self.model.unexplored() else {
+            return self.map_in(&mut Whole::of(&self.model), problem, settings, interrupt);
+        };
+        let mut explored = Explored::new(cave, problem.cave_start.unwrap_or_else(|| cave.first_state()));
+        let mut mapping = self.map_in(&mut explored, problem, settings, interrupt)?;
+        mapping.states = Some(explored.keep(&renumber(&mut mapping.moves)));
+        Ok(mapping)
+    }
+
+    fn map_in<S: Space>(
+        &self,
+        space: &mut S,
+        problem: &Problem<'_>,
+        settings: Settings,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        let Settings { budget, upper_bound, .. } = settings;
+        let budget = budget.beside(way_bytes(problem));
+        let settings = Settings { budget, ..settings };
+        // Sums in another order may be a little larger; a little room costs nothing.
+        let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
+        match settings.heuristic {
+            HeuristicName::Default => match self.layered(space, problem, settings, most_f, interrupt)? {
+                Some(mapping) => Ok(mapping),
+                None => self.best_first(space, problem, settings, most_f, interrupt),
+            },
+            HeuristicName::None => {
+                let found = astar::search(problem, space, &Blind, budget, most_f, interrupt)?;
+                conclude(problem, space, &Blind, within(most_f, found, problem), interrupt)
+            }
+            HeuristicName::Paper => {
+                let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
+                // The paper's estimate proves nothing; the projections bound the optimum all the same.
+                let first = problem.distances.distance(0, space.row(problem.start));
+                let room = TableRoom::within(budget.max_bytes);
+                if let Some(projected) = self.solve(problem, settings.grouping, room, interrupt)? {
+                    let least_f = first + projected.cost_to_go(0, space.row(problem.start));
+                    conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
+                } else {
+                    let stopped_by = found.stopped_by.or(Some(StoppedBy::Deadline));
+                    let found = Found { least_f: first, stopped_by, ..found };
+                    conclude(problem, space, &Blind, found, interrupt)
+                }
+            }
+        }
+    }
+
+    /// What a search layer by layer finds; `None` if the problem is too large for it, or its budget too small.
+    fn layered<S: Space>(
+        &self,
+        space: &mut S,
+        problem: &Problem<'_>,
+        settings: Settings,
+        most_f: f64,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<Mapping>, Cancelled> {
+        let Settings { budget, grouping, .. } = settings;
+        let n_states = if grouping == Grouping::Widest { None } else { space.n_states() };
+        let n_nodes = n_states.map_or(usize::MAX, |n_states| n_states.saturating_mul(problem.demonstration.len()));
+        if n_nodes > self.patience.max_layered_nodes || !layered::is_within(budget, &self.model, n_nodes) {
+            return Ok(None);
+        }
+        let solved = self.solve(problem, grouping, TableRoom::within(budget.max_bytes), interrupt)?;
+        let Some(projected) = solved.filter(Projected::are_all_in_columns) else { return Ok(None) };
+        let found = self.with_buffers(budget.max_bytes, |Buffers { layered, .. }| {
+            layered::search(problem, &projected, budget, most_f, layered, interrupt)
+        })?;
+        conclude(problem, space, &projected, within(most_f, found, problem), interrupt).map(Some)
+    }
+
+    /// The tables of [`Projected::solve`].
+    fn solve<'p>(
+        &'p self,
+        problem: &'p Problem<'p>,
+        grouping: Grouping,
+        room: TableRoom,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<Projected<'p>>, Cancelled> {
+        self.with_buffers(room.max_bytes, |Buffers { solving, .. }| {
+            Projected::solve(&self.projections, problem, grouping, room, solving, interrupt)
+        })
+    }
+
+    /// Does `work`, which may take so much memory, with buffers of work that was done before, if there are any.
+    fn with_buffers<T>(
+        &self,
+        max_bytes: usize,
+        work: impl FnOnce(&mut Buffers) -> Result<T, Cancelled>,
+    ) -> Result<T, Cancelled> {
+        let thread = thread::current().id();
+        let take = |kept: &mut Vec<(ThreadId, Box<Buffers>)>| {
+            let own = kept.iter().position(|(user, _)| *user == thread);
+            own.or(kept.len().checked_sub(1)).map(|at| kept.swap_remove(at).1)
+        };
+        let mut buffers = take(&mut self.buffers()).unwrap_or_default();
+        let done = work(&mut buffers)?;
+        // What is kept is there beside what a search goes on to do.
+        if buffers.size_bytes() <= Buffers::MAX_KEPT_BYTES.min(max_bytes / Buffers::PART_KEPT) {
+            let mut kept = self.buffers();
+            if kept.len() < Buffers::MAX_KEPT {
+                kept.push((thread, buffers));
+            }
+        }
+        Ok(done)
+    }
+
+    fn check(&self, problem: &Problem<'_>) {
+        assert!(std::ptr::eq(problem.model, &raw const *self.model), "the problem must be of this mapper's model");
+    }
+
+    /// A mapping of `problem` that begins with `moves` and goes on greedily, as `stopped_by` ran out; of whole states, as for a
+    /// lookahead. Nothing is proven of it.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    pub(in crate::mapping) fn complete(
+        &self,
+        problem: &Problem<'_>,
+        moves: Vec<Move>,
+        stopped_by: StoppedBy,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        let found = Found {
+            paths: vec![moves],
+            is_complete: false,
+            stopped_by: Some(stopped_by),
+            least_f: 0.0,
+            n_expanded: 0,
+            n_generated: 0,
+        };
+        let mapping = conclude(problem, &mut Whole::of(&self.model), &Blind, found, interrupt)?;
+        Ok(Mapping { status: Status::Local, lower_bound: None, stopped_by: Some(stopped_by), ..mapping })
+    }
+}
+
+/// How much memory ways take that are found, and the mapping, in bytes: some copies of some steps for each observation.
+fn way_bytes(problem: &Problem<'_>) -> usize {
+    const N_STEPS: usize = 8;
+    problem.demonstration.len() * N_STEPS * size_of::<Move>()
+}
+
+/// Numbers the states of `moves` anew, in the order in which they are first passed. Gives their former numbers, by the new ones.
+fn renumber(moves: &mut [Move]) -> Vec<StateIdx> {
+    let mut former = Vec::new();
+    let mut numbers: FxHashMap<StateIdx, StateIdx> = FxHashMap::default();
+    for step in moves {
+        #[expect(clippy::cast_possible_truncation, reason = "no more than there were")]
+        let next = former.len() as StateIdx;
+        let number = *numbers.entry(step.state).or_insert(next);
+        if number == next {
+            former.push(step.state);
+        }
+        step.state = number;
+    }
+    former
+}
+
+/// What was found by a search among the mappings that cost at most `most_f`. If it came to its end without one, there is none, so
+/// that is a lower bound.
+fn within(most_f: f64, found: Found, problem: &Problem<'_>) -> Found {
+    let is_whole = |path: &Vec<Move>| path.last().is_some_and(|end| end.observation as usize == problem.last());
+    if found.is_complete && !found.paths.iter().any(is_whole) {
+        Found { is_complete: false, least_f: most_f, ..found }
+    } else {
+        found
+    }
+}
+
+/// Completes what was found, guided by `heuristic`, and says what is proven if no mapping costs less than its `least_f`.
+fn conclude<S: Space, H: Heuristic>(
+    problem: &Problem<'_>,
+    space: &mut S,
+    heuristic: &H,
+    found: Found,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Mapping, Cancelled> {
+    let Found { paths, is_complete, stopped_by, least_f: lower_bound, n_expanded, n_generated } = found;
+    let mut allowance = Allowance::new(interrupt);
+    let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };
+    let mut best: Option<(Cost, Vec<Move>)> = None;
+    for (path, extras) in paths.into_iter().flat_map(|path| repeat_n(path, ways.len()).zip(ways)) {
+        let moves = complete(problem, space, heuristic, *extras, path, &mut allowance)?;
+        let cost = cost_of(problem, space, &moves);
+        if best.as_ref().is_none_or(|(least, _)| cost.total < least.total) {
+            best = Some((cost, moves));
+        }
+    }
+    let (cost, moves) = best.expect("a search gives at least one path");
+    let is_optimal = cost.total * (1.0 - ROUNDING) <= lower_bound;
+    Ok(Mapping {
+        moves,
+        cost,
+        status: if is_optimal { Status::Optimal } else { Status::Bounded },
+        lower_bound: Some(if is_optimal { cost.total } else { lower_bound }),
+        stopped_by: stopped_by.filter(|_| !is_optimal),
+        n_expanded,
+        n_generated,
+        states: None,
+    })
+}

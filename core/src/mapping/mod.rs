@@ -1,0 +1,66 @@
+//! Mapping: the imitator's best way to follow a demonstration.
+//!
+//! A node is a pair `(i, s)` of an observation index and an imitator's state. A mapping starts at `(0, s_0)` at cost
+//! `D(o_0, s_0)`, ends at any `(n, s)`, and consists of these moves:
+//!
+//! | move | from -> to | cost |
+//! |---|---|---|
+//! | `match` | action a: `(i, s) -> (i+1, s')` | `A(a) + D(o_{i+1}, s')` |
+//! | `extra` | action a: `(i, s) -> (i, s')` | `A(a) + D(o_i, s')` |
+//! | `skip` | no action: `(i, s) -> (i+1, s)` | `D(o_{i+1}, s)` |
+//!
+//! That is dynamic time warping of a sequence against a walk in a graph (Gudla & Huber, "Cost-Based Policy Mapping for
+//! Imitation", FLAIRS 2003). Skipping everything is always possible, so a mapping always exists.
+//!
+//! ```text
+//! Problem (model, demonstration, weights, start)
+//!    |                     Projections (per model) --> Projected (per problem: distances, costs-to-go)
+//!    v                                                     |
+//! Mapper::map ---- search (layer by layer, best first) <---+
+//!    |                |  long: a sweep over all nodes; budget over: the incumbent, or completion (greedy)
+//!    v                v
+//! Mapping (moves, status, lower bound, counts) --> Policy (what a client gets), WrittenPolicy (the same, as it is answered and stored)
+//! ```
+//!
+//! [`OnlineMapping`] does the same while the demonstration is still running.
+//!
+//! **Ties.** Among mappings of equal cost the search returns the one that it comes to first, which is determined: what was
+//! found is given up only for what costs less. Of a node's successors `skip` is found first, then, by action, `match` before `extra`;
+//! the first way found to a node at its least cost is kept; costs are compared as the sums of floats along the path. Small problems
+//! are searched layer by layer, those nodes first that beams keep, and in the order in which they were found. In others nodes are
+//! expanded in the order of `f` to a thousandth, the most recently found of equals first. A search that takes long may be
+//! replaced by a sweep over all nodes, from the last observation back, in which a node is left by a skip unless a match is cheaper, and by
+//! a match unless an extra action is; when it is depends on the problem and the budget alone.
+
+mod backward;
+#[cfg(test)]
+mod by_definition;
+mod completion;
+mod cost;
+mod demonstration;
+mod distances;
+mod heuristic;
+mod mapper;
+mod online;
+mod open_list;
+mod policy;
+mod problem;
+mod request;
+mod search;
+mod written;
+
+pub use cost::Cost;
+pub use demonstration::Demonstration;
+pub use demonstration::WellFormed;
+pub use heuristic::{Grouping, HeuristicName};
+pub use mapper::{Budget, Mapper, Mapping, Settings, Status, StoppedBy};
+pub(crate) use online::longest_lookahead;
+pub use online::{CommittedStep, OnlineMapping, Stopped};
+pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
+pub use problem::Problem;
+pub use request::Conditions;
+pub use request::{
+    ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,
+};
+pub use search::{Move, MoveKind};
+pub use written::{ShortSteps, StoredPolicy, WriteError, WrittenPolicy};

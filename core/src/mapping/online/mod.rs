@@ -1,0 +1,674 @@
+//! The mapping while the demonstration is still running: observations in, one by one, committed steps out.
+//!
+//! Of every state, the cheapest way from the last committed node, the *root*, to that state at the newest observation is known;
+//! these ways form a tree whose leaves are the *survivors*. A new observation adds a layer to the tree, from the layer before it
+//! alone; branches that no survivor hangs on die. Work for an observation is `O(|E| + |V| log |V|)`, at most `H` times that where
+//! a lookahead of `H` decides, however many observations came before.
+//!
+//! ```text
+//!  committed          tree                   newest layer
+//!  o---o---o ----+---o---o---+---o---o
+//!          root  |           +---o---o   survivors: every state that can be reached
+//!                +---o-------+---o---o
+//! ```
+//!
+//! What is committed is final:
+//!
+//! - a step that all survivors share is *proven*: whatever is still to come, the cheapest mapping that begins with the
+//!   steps committed before it goes on with this one, or with one of equal cost;
+//! - with a lookahead of H, once the observation H past the root's has come, the cheapest way to it decides: it is
+//!   committed up to its first move that advances, and the ways that do not begin so are given up. States that have lost
+//!   their way by that get the cheapest one that is left: by a repair where they are few, which looks only at nodes that
+//!   bounds do not rule out ([`repair`]), else by sweeping the (at most H) layers after the new root again.
+//!
+//! **What can be left out.** Nothing is known of what is to come, so no survivor is ruled out by its cost: an observation may
+//! still come that only it is close to. What rules one out for good is that another reaches it as cheaply, and that is what
+//! extras within the newest layer do: such a state is kept, on the other's branch. A bound from the model's projections
+//! rules out no more: they bound what is to come of known observations, and a survivor's way is wanted whether it is
+//! the cheapest or not, or else nothing would be proven. But three things are never looked at:
+//!
+//! - states that cannot be reached from the root any more (what was grabbed stays grabbed);
+//! - extras from a state that costs no less than it did at the observation before: the same action would have led from there
+//!   as a match, to the same state, for no more;
+//! - nodes at earlier observations that no survivor hangs on, and in a repair those whose lower bound (what they cost from an
+//!   earlier root) is no less than what a way that is left costs.
+//!
+//! **Memory.** Without a lookahead, older layers keep the observation and the nodes that survivors hang on, at most 8 bytes per
+//! state; but no costs, and no distances: of the few states that steps lead to, these are computed again. With a lookahead,
+//! layers are kept whole so that they can be repaired (16 bytes per state and observation after the root's, and tables of
+//! distances), unless that would be more than [`MAX_KEPT`] nodes or terms of distances; requests with a lookahead beyond
+//! [`longest_lookahead`] are refused.
+//!
+//! **Ties.** The way found first is kept: a skip, then matches, from the lower state first, then extras, from the cheaper state
+//! first; of actions between the same two states the cheapest, the first among equals. In a repair, ways that were not
+//! lost come first. Among survivors the lower state is the cheapest. All this depends on the observations alone, so that
+//! the same ones give the same steps.
+
+mod layer;
+mod open_list;
+mod repair;
+mod window;
+
+use std::num::NonZeroU32;
+use std::sync::Arc;
+
+use super::cost::Cost;
+use super::distances::ObservedDistances;
+use super::policy::{Step, StepWriter};
+use super::problem::choose_start;
+use super::{Mapper, Mapping, Move, MoveKind, Status};
+use crate::attribute::{Scalar, Value, Weights};
+use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::model::{Model, StateIdx};
+use layer::{Layer, Node, Sweep};
+use repair::{Predecessors, Repair, Repaired};
+use window::{Place, Window};
+
+/// A step that will not be revised.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CommittedStep {
+    /// The step.
+    pub step: Step,
+    /// Whether it is part of a cheapest mapping of the whole demonstration, whatever is still to come, among those that
+    /// begin with the steps committed before it.
+    pub is_proven: bool,
+    /// How many observations had come when it was committed.
+    pub after: u32,
+}
+
+impl CommittedStep {
+    /// About how many bytes of memory a step of `model` takes.
+    pub fn bytes_of(model: &Model) -> usize {
+        const ATTRIBUTE_BYTES: usize = size_of::<(Arc<str>, Scalar)>() + size_of::<(Arc<str>, f64)>();
+        size_of::<Self>() + model.schema().len() * ATTRIBUTE_BYTES
+    }
+}
+
+/// Why an observation was not taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Stopped {
+    /// The caller lost interest.
+    #[error(transparent)]
+    Cancelled(#[from] Cancelled),
+    /// It would take more memory than the mapping may.
+    #[error("what may still turn out to be the cheapest mapping takes more memory than there is for it")]
+    Memory,
+}
+
+/// A mapping in the making.
+#[derive(Debug)]
+pub struct OnlineMapping {
+    model: Arc<Model>,
+    weights: Weights,
+    start: Option<StateIdx>,
+    lookahead: Option<NonZeroU32>,
+    n_observed: u32,
+    n_swept: u64,
+    window: Window,
+    /// The cost of the way to the window's root, summed as the layers' costs are.
+    root_cost: f64,
+    sweep: Sweep,
+    /// Made when the lookahead decides for the first time.
+    predecessors: Option<Predecessors>,
+    /// Where more than one survivor in this many has lost its way, all layers are swept; none are if it is 0.
+    sweeps_from: usize,
+    writer: StepWriter,
+    moves: Vec<Move>,
+    cost: Cost,
+    was_forced: bool,
+    /// How many terms of distances an observation has, one for each value of an attribute that weighs something.
+    n_terms: usize,
+    max_bytes: usize,
+    /// Whether the survivors' ways are what they should be: not while an observation is taken, nor after one that was broken off.
+    is_whole: bool,
+}
+
+/// Where more than one survivor in this many has lost its way, sweeping all layers takes less time than a repair.
+const SWEEPS_FROM: usize = 8;
+
+/// Most nodes of a window whose layers are kept whole, to be repaired, 16 bytes each; and most terms in its tables of distances,
+/// 8 bytes each. Together 48 MB.
+const MAX_KEPT: u64 = 1 << 21;
+
+/// The longest lookahead whose window takes about `max_bytes` with `model` if all of its nodes are alive, as when nothing tells the ways
+/// apart: that has one layer more, and 8 bytes a node. With 1 GB it has at most 134 million nodes. 0 if not even the shortest one fits.
+pub(crate) fn longest_lookahead(model: &Model, max_bytes: usize) -> u32 {
+    let n_layers = max_bytes / size_of::<Node>() / (model.states().len() as usize).max(1);
+    u32::try_from(n_layers.saturating_sub(1)).unwrap_or(u32::MAX)
+}
+
+impl OnlineMapping {
+    /// A mapping of a demonstration of which nothing has come yet. `start` overrides the model's; `lookahead` is how many
+    /// observations past the current one a decision may wait for, `None` for all.
+    ///
+    /// # Panics
+    ///
+    /// If the model is searched lazily: each layer looks at all states.
+    #[must_use]
+    pub fn new(mapper: &Mapper, weights: Weights, start: Option<StateIdx>, lookahead: Option<NonZeroU32>) -> Self {
+        let model = mapper.shared_model();
+        assert!(!model.is_lazy(), "each layer needs all states");
+        let n_terms = n_terms(&model, |position| weights.as_slice()[position] > 0.0);
+        let keeps = keeps(model.graph().n_states(), n_terms, lookahead);
+        let sweep = Sweep::new(&model);
+        let window = Window::new(model.states().len(), keeps);
+        Self {
+            model,
+            weights,
+            start,
+            lookahead,
+            n_observed: 0,
+            n_swept: 0,
+            window,
+            root_cost: 0.0,
+            sweep,
+            predecessors: None,
+            sweeps_from: SWEEPS_FROM,
+            writer: StepWriter::default(),
+            moves: Vec::new(),
+            cost: Cost::default(),
+            was_forced: false,
+            n_terms,
+            max_bytes: usize::MAX,
+            is_whole: true,
+        }
+    }
+
+    /// The same, in about `max_bytes` at most: an observation that would take more is not taken.
+    #[must_use]
+    pub fn within(self, max_bytes: usize) -> Self {
+        Self { max_bytes, ..self }
+    }
+
+    /// About how much memory a mapping of so many observations takes at most, in bytes, also while it takes one: if all ways to all states
+    /// are alive, as when nothing tells them apart.
+    #[must_use]
+    pub fn most_bytes(model: &Model, lookahead: Option<NonZeroU32>, n_observations: usize) -> usize {
+        /// How many entries of the open list there are for each state, about.
+        const OPEN: usize = 4;
+        let n_states = model.graph().n_states();
+        let n_terms = n_terms(model, |_| true);
+        let reach = lookahead.map_or(usize::MAX, |lookahead| lookahead.get() as usize);
+        let n_layers = n_observations.min(reach.saturating_add(1));
+        let keeps = keeps(n_states, n_terms, lookahead);
+        let each = if keeps {
+            n_states * (layer::NODE_BYTES + repair::NODE_BYTES) + n_terms * size_of::<f64>()
+        } else {
+            n_states * size_of::<Node>()
+        };
+        let each = each + size_of::<Layer>() + model.schema().len() * OBSERVED_BYTES;
+        let once = n_states
+            * (size_of::<f64>() + size_of::<StateIdx>() + OPEN * size_of::<(u64, StateIdx)>() + 3 * layer::NODE_BYTES)
+            + n_terms * size_of::<f64>()
+            + Predecessors::bytes_for(model.graph());
+        let moves = n_observations.saturating_mul(MOVES_PER_OBSERVATION * size_of::<Move>());
+        n_layers.saturating_mul(each).saturating_add(once).saturating_add(moves + BASE_BYTES)
+    }
+
+    /// How many observations have come.
+    #[must_use]
+    pub fn n_observed(&self) -> u32 {
+        self.n_observed
+    }
+
+    /// How many steps were committed.
+    #[must_use]
+    pub fn n_steps(&self) -> usize {
+        self.moves.len()
+    }
+
+    /// How many nodes of observations from the last committed one on survivors hang on. Looks at each of these observations.
+    #[must_use]
+    pub fn n_nodes(&self) -> usize {
+        self.window.n_alive()
+    }
+
+    /// Approximate size in memory, in bytes, without the model. Looks at no layer.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        let predecessors = self.predecessors.as_ref().map_or(0, Predecessors::size_bytes);
+        let moves = self.moves.capacity() * size_of::<Move>();
+        size_of::<Self>() + self.window.size_bytes() + self.sweep.size_bytes() + predecessors + moves
+    }
+
+    /// Checks that there is memory for so many bytes more.
+    fn check_memory(&self, n_bytes: usize) -> Result<(), Stopped> {
+        if self.max_bytes == usize::MAX || self.size_bytes().saturating_add(n_bytes) <= self.max_bytes {
+            Ok(())
+        } else {
+            Err(Stopped::Memory)
+        }
+    }
+
+    /// How much memory the next layer takes, in bytes.
+    fn next_layer_bytes(&self) -> usize {
+        let observed = self.n_terms * size_of::<f64>() + self.weights.as_slice().len() * OBSERVED_BYTES;
+        self.window.layer_bytes(self.model.graph().n_states()) + observed
+    }
+
+    /// How many nodes were looked at: every state once for each layer that was swept.
+    pub(super) fn n_expanded(&self) -> u64 {
+        self.n_swept * self.model.graph().n_states() as u64
+    }
+
+    /// How many transitions were looked at.
+    pub(super) fn n_generated(&self) -> u64 {
+        self.n_swept * self.model.graph().n_transitions() as u64
+    }
+
+    /// The cheapest way to what has come; where an observation was broken off, the committed steps.
+    pub(super) fn into_moves(self) -> Vec<Move> {
+        if self.is_whole { self.end().map(|(_, mapping)| mapping.moves).unwrap_or_default() } else { self.moves }
+    }
+
+    /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits.
+    ///
+    /// # Errors
+    ///
+    /// [`Stopped::Cancelled`] if `interrupt` said so; it is not asked to finish. [`Stopped::Memory`] if the mapping would come to take
+    /// more than it [may](Self::within). The mapping is then of no more use.
+    pub fn observe(
+        &mut self,
+        observation: &[Option<Value>],
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Vec<CommittedStep>, Stopped> {
+        self.check_memory(self.next_layer_bytes())?;
+        self.is_whole = false;
+        let committed = self.take(observation, interrupt)?;
+        self.is_whole = true;
+        Ok(committed)
+    }
+
+    fn take(
+        &mut self,
+        observation: &[Option<Value>],
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Vec<CommittedStep>, Stopped> {
+        let mut committed = Vec::new();
+        let model = &*Arc::clone(&self.model);
+        let observed = ObservedDistances::new(model, observation, &self.weights);
+        self.n_observed += 1;
+        if self.n_observed == 1 {
+            let state = self.start.unwrap_or_else(|| choose_start(model, |state| observed.distance(model, state)));
+            self.root_cost = observed.distance(model, state);
+            self.begin(state, self.root_cost, observed);
+            // There is no other start.
+            committed.push(self.commit(Move { kind: MoveKind::Start, action: None, observation: 0, state }, true));
+        } else {
+            let layer = self.follow(observed, interrupt)?;
+            self.window.push(layer);
+        }
+        self.commit_shared(&mut committed);
+        while self.must_decide() {
+            self.decide(&mut committed);
+            self.restore(interrupt)?;
+            self.commit_shared(&mut committed);
+        }
+        Ok(committed)
+    }
+
+    /// How many steps would be committed if the demonstration ended now.
+    pub fn n_rest(&self) -> usize {
+        let survivor = self.window.layers.back().and_then(Layer::cheapest);
+        survivor.map_or(0, |survivor| self.window.path(survivor).len())
+    }
+
+    /// Ends the demonstration, and commits the rest of the cheapest mapping. `None` if nothing was observed.
+    #[must_use]
+    pub fn end(mut self) -> Option<(Vec<CommittedStep>, Mapping)> {
+        let survivor = self.window.layers.back()?.cheapest()?;
+        let path = self.window.path(survivor);
+        let committed = path.into_iter().map(|place| self.commit_at(place, true)).collect();
+        let status = if self.was_forced { Status::Local } else { Status::Optimal };
+        let lower_bound = (status == Status::Optimal).then_some(self.cost.total);
+        let (n_expanded, n_generated) = (self.n_expanded(), self.n_generated());
+        let mapping = Mapping {
+            moves: self.moves,
+            cost: self.cost,
+            status,
+            lower_bound,
+            stopped_by: None,
+            n_expanded,
+            n_generated,
+            states: None,
+        };
+        Some((committed, mapping))
+    }
+
+    /// Whether the lookahead past the root is used up.
+    fn must_decide(&self) -> bool {
+        let newest = self.n_observed - 1;
+        self.lookahead.is_some_and(|lookahead| self.window.first + lookahead.get() <= newest)
+    }
+
+    /// Commits every step that all survivors share.
+    fn commit_shared(&mut self, committed: &mut Vec<CommittedStep>) {
+        while let Some(child) = self.window.only_child(&self.model) {
+            committed.push(self.commit_at(child, true));
+            self.window.advance(child);
+        }
+    }
+
+    /// Commits the cheapest way to the newest observation, up to its first move that advances.
+    fn decide(&mut self, committed: &mut Vec<CommittedStep>) {
+        self.was_forced = true;
+        let Some(survivor) = self.window.layers.back().and_then(Layer::cheapest) else { return };
+        for place in self.window.path(survivor) {
+            committed.push(self.commit_at(place, false));
+            let (index, _) = place;
+            if index > 0 {
+                self.window.advance(place);
+                return;
+            }
+        }
+    }
+
+    fn commit_at(&mut self, place: Place, is_proven: bool) -> CommittedStep {
+        let step = self.window.step(&self.model, place);
+        self.commit(step, is_proven)
+    }
+
+    fn commit(&mut self, step: Move, is_proven: bool) -> CommittedStep {
+        let model = &self.model;
+        let mut writer = self.writer;
+        let layer = &self.window.layers[(step.observation - self.window.first) as usize];
+        if step.kind != MoveKind::Start {
+            let action_cost = step.action.map_or(0.0, |action| model.action(action).cost);
+            self.root_cost += action_cost;
+            self.root_cost += layer.observed.distance(model, step.state);
+        }
+        let terms = layer.observed.terms(model, step.state);
+        let written = writer.write(model, model.states(), &step, terms);
+        self.cost = writer.cost();
+        self.writer = writer;
+        self.moves.push(step);
+        CommittedStep { step: written, is_proven, after: self.n_observed }
+    }
+
+    /// Gives survivors that have lost their way the cheapest one that is left.
+    fn restore(&mut self, interrupt: &mut dyn Interrupt) -> Result<(), Stopped> {
+        let model = &*Arc::clone(&self.model);
+        let n_survivors = self.window.layers.back().map_or(0, Layer::n_alive);
+        if self.window.keeps() {
+            let made = if self.predecessors.is_none() { Predecessors::bytes_for(model.graph()) } else { 0 };
+            self.check_memory(made + self.window.layers.len() * model.graph().n_states() * repair::NODE_BYTES)?;
+            let predecessors = self.predecessors.get_or_insert_with(|| Predecessors::new(model.graph()));
+            let repair = Repair::new(&mut self.window, model, predecessors, &mut self.sweep);
+            let most = n_survivors.checked_div(self.sweeps_from).unwrap_or(usize::MAX);
+            if repair.run(most, interrupt)? == Repaired::All {
+                return Ok(());
+            }
+        }
+        let root = self.window.root;
+        let mut observed = self.window.clear().into_iter();
+        if let Some(mut first) = observed.next() {
+            first.fill_tables(model);
+            self.begin(root, self.root_cost, first);
+        }
+        for mut observed in observed {
+            observed.fill_tables(model);
+            let layer = self.follow(observed, interrupt)?;
+            if self.window.keeps() {
+                self.window.add(layer);
+            } else {
+                self.window.push(layer);
+            }
+        }
+        if self.window.keeps() {
+            self.window.recount();
+        }
+        Ok(())
+    }
+
+    fn begin(&mut self, root: StateIdx, cost: f64, observed: ObservedDistances) {
+        self.n_swept += 1;
+        let spare = self.window.spare();
+        let layer = self.sweep.begin(&self.model, (root, cost), &self.window.reached, observed, spare);
+        self.window.root = root;
+        self.window.add(layer);
+        self.window.shrink();
+        self.window.recount();
+    }
+
+    /// The layer of the observation after the newest.
+    fn follow(&mut self, observed: ObservedDistances, interrupt: &mut dyn Interrupt) -> Result<Layer, Stopped> {
+        if interrupt.poll() == Signal::Cancel {
+            return Err(Cancelled.into());
+        }
+        self.check_memory(self.window.layer_bytes(self.model.graph().n_states()))?;
+        self.n_swept += 1;
+        let spare = self.window.spare();
+        let before = self.window.layers.back().expect("the first observation's layer begins a window");
+        Ok(self.sweep.follow(&self.model, &before.costs, &self.window.reached, observed, spare))
+    }
+}
+
+/// How many terms of distances an observation has, for each value of the attributes at these positions.
+fn n_terms(model: &Model, weighs: impl Fn(usize) -> bool) -> usize {
+    let weighing = (0..model.schema().len()).filter(|position| weighs(*position));
+    weighing.map(|position| model.states().domain(position).len()).sum()
+}
+
+/// Whether the layers of a window are kept whole.
+fn keeps(n_states: usize, n_terms: usize, lookahead: Option<NonZeroU32>) -> bool {
+    let n_layers = lookahead.map_or(u64::MAX, |lookahead| 1 + u64::from(lookahead.get()));
+    n_layers.saturating_mul(n_states.max(n_terms) as u64) <= MAX_KEPT
+}
+
+/// What an observed attribute takes, besides its terms.
+const OBSERVED_BYTES: usize = 64;
+
+/// What there is however small the model.
+const BASE_BYTES: usize = 1 << 12;
+
+/// About how many steps an observation has at most, with the room for more: bodies that need more are rare.
+const MOVES_PER_OBSERVATION: usize = 8;
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use serde_json::json;
+
+    use super::*;
+    use crate::interrupt::Uninterrupted;
+    use crate::mapping::{Demonstration, HeuristicName, Problem, Settings};
+    use crate::model::{Definition, Limits, Model, Origin};
+
+    /// States on a line, in any order, with any transitions.
+    fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Mapper {
+        let states: Vec<_> = places.iter().map(|x| json!([x])).collect();
+        let actions = [("a", 0.0), ("b", 0.5), ("c", 2.0)];
+        let mut transitions: Vec<_> = transitions
+            .iter()
+            .map(|(from, action, to)| (from % places.len(), actions[*action].0, to % places.len()))
+            .collect();
+        transitions.sort_unstable();
+        transitions.dedup_by_key(|(from, action, _)| (*from, *action));
+        let document = json!({
+            "attributes": [{"name": "x", "kind": "number"}],
+            "actions": actions.map(|(name, cost)| json!({"name": name, "cost": cost})),
+            "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
+        });
+        prepared(&document)
+    }
+
+    fn prepared(model: &serde_json::Value) -> Mapper {
+        let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        Mapper::new(model, &mut Uninterrupted).unwrap()
+    }
+
+    /// Two loops of as many states each. From state 0 either can be entered, and none is left. All attributes tell all states
+    /// apart.
+    fn loops(n_each: usize, n_attributes: usize) -> Mapper {
+        let on = |first: usize| (0..n_each).map(move |n| json!([first + n, "on", first + (n + 1) % n_each]));
+        let entries = [json!([0, "left", 1]), json!([0, "right", 1 + n_each])];
+        let transitions: Vec<_> = entries.into_iter().chain(on(1)).chain(on(1 + n_each)).collect();
+        let states: Vec<Vec<usize>> = (0..=2 * n_each).map(|state| vec![state; n_attributes]).collect();
+        let attributes = (0..n_attributes).map(|n| json!({"name": format!("a{n}"), "kind": "number"}));
+        prepared(&json!({
+            "attributes": attributes.collect::<Vec<_>>(),
+            "actions": [{"name": "left"}, {"name": "right"}, {"name": "on"}],
+            "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
+        }))
+    }
+
+    #[test]
+    fn without_a_lookahead_an_observation_that_commits_nothing_keeps_no_distances() {
+        let (n_each, n_attributes) = (150, 8);
+        let mapper = loops(n_each, n_attributes);
+        let mut online = OnlineMapping::new(&mapper, mapper.model().schema().weights(), None, None);
+        let mut sizes = Vec::new();
+        for n in 0..900_u32 {
+            let observation = vec![Some(Value::Number(f64::from(1 + n % 150))); n_attributes];
+            online.observe(&observation, &mut Uninterrupted).unwrap();
+            assert!(online.window.knows_its_size());
+            sizes.push(online.size_bytes());
+        }
+        // Nobody knows yet that the other loop is not meant.
+        assert_eq!(online.n_steps(), 1);
+        let per_observation = (sizes[899] - sizes[449]) / 450;
+        assert!(per_observation < 2048, "{per_observation} bytes, where distances would take {}", 301 * 8 * 8);
+        let (_, mapping) = online.end().unwrap();
+        assert_eq!((mapping.status, mapping.moves.len()), (Status::Optimal, 901));
+    }
+
+    #[test]
+    fn an_observation_that_would_take_more_memory_than_there_is_is_not_taken_and_what_came_before_can_be_ended() {
+        let mapper = loops(150, 8);
+        let weights = mapper.model().schema().weights();
+        let observe = |online: &mut OnlineMapping, n: u32| {
+            let observation = vec![Some(Value::Number(f64::from(1 + n % 150))); 8];
+            online.observe(&observation, &mut Uninterrupted)
+        };
+        // Window of layers that are thinned, kept whole, and thinned again.
+        for lookahead in [None, Some(100), Some(10_000)] {
+            let lookahead = lookahead.and_then(NonZeroU32::new);
+            let new = || OnlineMapping::new(&mapper, weights.clone(), None, lookahead);
+            let mut unbounded = new();
+            let mut most = 0;
+            for n in 0..300 {
+                observe(&mut unbounded, n).unwrap();
+                most = most.max(unbounded.size_bytes());
+            }
+            let foretold = OnlineMapping::most_bytes(mapper.model(), lookahead, 300);
+            assert!(most <= foretold, "{most} of {foretold}");
+            for max_bytes in [0, 10_000, most / 4, most / 2, most - 1] {
+                let mut online = new().within(max_bytes);
+                let stopped = (0..300).find_map(|n| {
+                    let stopped = observe(&mut online, n).err();
+                    assert!(n == 0 || stopped.is_some() || online.size_bytes() <= max_bytes);
+                    stopped
+                });
+                assert_eq!(stopped, Some(Stopped::Memory), "{max_bytes} of {most}");
+                let n_observed = online.n_observed();
+                assert_eq!(n_observed > 0, max_bytes > 100_000, "{n_observed} in {max_bytes} of {most}");
+                let moves = online.into_moves();
+                assert!(n_observed == 0 || !moves.is_empty());
+            }
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 500, failure_persistence: None, ..ProptestConfig::default() })]
+
+        #[test]
+        fn a_repair_costs_every_survivor_what_a_sweep_does(
+            places in prop::collection::vec(0..12_u32, 2..25),
+            transitions in prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..70),
+            observed in prop::collection::vec(0..12_u32, 2..30),
+            lookahead in 1..7_u32,
+        ) {
+            let mapper = mapper(&places, &transitions);
+            let weights = mapper.model().schema().weights();
+            let new = || OnlineMapping::new(&mapper, weights.clone(), None, NonZeroU32::new(lookahead));
+            let mut repaired = OnlineMapping { sweeps_from: 0, ..new() };
+            let mut swept = OnlineMapping { sweeps_from: usize::MAX, ..new() };
+            // A window that is not kept is always swept.
+            let n_states = mapper.model().states().len();
+            let mut thinned = OnlineMapping { window: Window::new(n_states, false), ..new() };
+            let costs = |online: &OnlineMapping| -> Vec<f64> {
+                let newest = online.window.layers.back().unwrap();
+                let reached = (0..n_states).filter(|state| newest.node(*state).is_alive());
+                reached.map(|state| newest.costs[state as usize]).collect()
+            };
+            for x in observed {
+                let observation = [Some(Value::Number(f64::from(x)))];
+                let observe = |online: &mut OnlineMapping| online.observe(&observation, &mut Uninterrupted).unwrap();
+                prop_assert_eq!(observe(&mut swept), observe(&mut thinned));
+                prop_assert_eq!(costs(&swept), costs(&thinned));
+                prop_assert_eq!(swept.n_nodes(), thinned.n_nodes());
+                observe(&mut repaired);
+                for online in [&repaired, &swept, &thinned] {
+                    prop_assert!(online.window.knows_its_size());
+                }
+                // Where ties were told apart in another way, they go on from different roots: see below.
+                if repaired.moves != swept.moves {
+                    break;
+                }
+                prop_assert_eq!(costs(&repaired), costs(&swept));
+            }
+        }
+
+        #[test]
+        fn what_is_decided_after_repairs_is_as_cheap_as_any_search_finds(
+            places in prop::collection::vec(0..12_u32, 5..25),
+            transitions in prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..70),
+            observed in prop::collection::vec(0..12_u32, 5..25),
+            lookahead in 1..7_u32,
+        ) {
+            let mapper = mapper(&places, &transitions);
+            let weights = mapper.model().schema().weights();
+            let observations: Vec<_> = observed.iter().map(|x| vec![Some(Value::Number(f64::from(*x)))]).collect();
+            // What it costs to go on from a node to the observation `to`, by a search of its own.
+            let to_go = |(i, state): (u32, StateIdx), to: u32| {
+                let rest = Demonstration::of(observations[i as usize..=to as usize].to_vec()).unwrap();
+                let problem = Problem::new(mapper.model(), rest, weights.clone(), Some(Origin::State(state)));
+                let settings = Settings { heuristic: HeuristicName::None, ..Settings::default() };
+                let cost = mapper.map(&problem, settings, &mut Uninterrupted).unwrap().cost.total;
+                cost - problem.distances.distance(0, mapper.model().states().row(state))
+            };
+            let new = OnlineMapping::new(&mapper, weights.clone(), None, NonZeroU32::new(lookahead));
+            let mut online = OnlineMapping { sweeps_from: 0, ..new };
+            let mut at = (0, 0);
+            for (i, observation) in (0..).zip(&observations) {
+                let committed = online.observe(observation, &mut Uninterrupted).unwrap();
+                let mut paid = 0.0;
+                let mut from = at;
+                for (n, CommittedStep { step, is_proven, after }) in committed.iter().enumerate() {
+                    at = (step.observation, step.state_index);
+                    prop_assert_eq!(*after, i + 1);
+                    if step.kind == MoveKind::Start {
+                        from = at;
+                        continue;
+                    }
+                    paid += step.action_cost + step.distance;
+                    // What the lookahead decides is decided up to the step that advances.
+                    let next = committed.get(n + 1);
+                    if !is_proven && at.0 == from.0 && next.is_some_and(|next| !next.is_proven) {
+                        continue;
+                    }
+                    let (best, taken) = (to_go(from, i), paid + to_go(at, i));
+                    prop_assert!((best - taken).abs() <= 1e-9 * (1.0 + best), "{taken} where {best} was possible");
+                    (from, paid) = (at, 0.0);
+                }
+                // Every survivor's way, also where no commit depends on it: as that of a sweep that begins at the root.
+                let (first, root) = (online.window.first as usize, online.window.root);
+                let mut swept = OnlineMapping::new(&mapper, weights.clone(), Some(root), None);
+                for observation in &observations[first..=i as usize] {
+                    swept.observe(observation, &mut Uninterrupted).unwrap();
+                }
+                let before = online.root_cost - online.window.layers[0].observed.distance(mapper.model(), root);
+                let newest = |online: &OnlineMapping| online.window.layers.back().unwrap().costs.clone();
+                for (cost, swept) in newest(&online).into_iter().zip(newest(&swept)) {
+                    let is_same = cost == before + swept || (cost - before - swept).abs() <= 1e-9 * (1.0 + cost);
+                    prop_assert!(is_same, "{cost}, not {before} + {swept}");
+                }
+            }
+            let cost = online.cost.total;
+            let rest = to_go(at, u32::try_from(observations.len()).unwrap() - 1);
+            let (_, mapping) = online.end().unwrap();
+            prop_assert!((mapping.cost.total - cost - rest).abs() <= 1e-9 * (1.0 + cost + rest));
+        }
+    }
+}

@@ -1,0 +1,513 @@
+//! Policies as they are answered, and as they are stored.
+//!
+//! As it is answered, a step names all attributes, though little of its state has changed since the step before. So what is stored
+//! is the summary, which has all names already, and beside it the steps in short, which take less than a tenth of the space. The
+//! answer is written from the same two, now and whenever it is asked for again.
+//!
+//! ```text
+//! Mapping --> summary, ShortSteps --> answer
+//!                |         |
+//!              store     store --> StoredPolicy: the same bytes
+//! ```
+
+use std::ops::Range;
+
+use serde::de::{Error as _, IgnoredAny};
+use serde::{Deserialize, Serialize};
+
+use super::cost::CostSum;
+use super::policy::{Coverage, PolicySummary, SearchReport, Stamp};
+use super::{Mapping, MoveKind, Problem};
+use crate::attribute::ByAttribute;
+
+/// A policy, as it is answered and as it is stored.
+#[derive(Clone, Debug, PartialEq)]
+pub struct WrittenPolicy<'a> {
+    /// JSON: what a [`Policy`](super::Policy) is written as.
+    pub answer: String,
+    /// JSON: what a [`PolicySummary`] is written as.
+    pub summary: String,
+    /// The steps in short. In them, attributes are numbered as they stand in the summary's weights.
+    pub steps: ShortSteps<'a>,
+}
+
+impl<'a> WrittenPolicy<'a> {
+    /// The policy of `mapping`, which must be of `problem`.
+    ///
+    /// # Errors
+    ///
+    /// Never: all of it can be written.
+    pub fn new(stamp: &Stamp, problem: &Problem<'a>, mapping: &Mapping) -> Result<Self, WriteError> {
+        /// About what a summary takes, and each of its weights.
+        const SUMMARY_BYTES: usize = 512;
+        const WEIGHT_BYTES: usize = 24;
+        let weights = problem.named_weights();
+        let short = ShortSteps::of(problem, mapping)?;
+        let mut is_exact = vec![false; problem.demonstration.len()];
+        let mut n_terms = 0;
+        for step in &short.steps {
+            n_terms = step.n_terms.unwrap_or(n_terms);
+            is_exact[step.observation as usize] |= n_terms == 0;
+        }
+        let summary = PolicySummary {
+            id: stamp.id.as_deref(),
+            model: &stamp.model,
+            model_hash: &stamp.model_hash,
+            learner: stamp.learner.as_deref(),
+            weights_version: stamp.weights_version,
+            weights: &weights,
+            lookahead: stamp.lookahead,
+            status: mapping.status,
+            cost: mapping.cost,
+            lower_bound: mapping.lower_bound,
+            coverage: Coverage::of(&is_exact),
+            search: SearchReport {
+                expanded: mapping.n_expanded,
+                generated: mapping.n_generated,
+                elapsed_us: stamp.elapsed_us,
+                stopped_by: mapping.stopped_by,
+            },
+            refines: stamp.refines.as_deref(),
+            refined_by: None,
+        };
+        let mut text = Vec::with_capacity(SUMMARY_BYTES + weights.iter().count() * WEIGHT_BYTES);
+        serde_json::to_writer(&mut text, &summary)?;
+        let summary = String::from_utf8(text).map_err(serde_json::Error::custom)?;
+        let answer = answer(&summary, weights.iter().map(|(name, _)| name), &short, None)?;
+        Ok(Self { answer, steps: short, summary })
+    }
+}
+
+/// Why a policy could not be written, or read again: a defect, or something stored that this program does not write.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    /// In its JSON.
+    #[error("a policy is not what JSON can hold")]
+    Json(#[from] serde_json::Error),
+    /// In its steps in short, something is referred to that is not there.
+    #[error("the steps of a policy refer to {0} that is not there")]
+    Missing(&'static str),
+}
+
+/// A policy as it is stored, about to be written as it was answered.
+#[derive(Debug)]
+pub struct StoredPolicy<'s> {
+    summary: &'s str,
+    weights: ByAttribute<IgnoredAny>,
+    short: ShortSteps<'s>,
+}
+
+impl<'s> StoredPolicy<'s> {
+    /// The policy with this summary and these steps in short.
+    ///
+    /// # Errors
+    ///
+    /// If one of the two is not what this program writes.
+    pub fn read(summary: &'s str, steps: ShortSteps<'s>) -> Result<Self, WriteError> {
+        #[derive(Deserialize)]
+        struct Weights {
+            weights: ByAttribute<IgnoredAny>,
+        }
+        let Weights { weights } = serde_json::from_str(summary)?;
+        Ok(Self { summary, weights, short: steps })
+    }
+
+    fn names(&self) -> impl Iterator<Item = &str> {
+        self.weights.iter().map(|(name, _)| name)
+    }
+
+    /// Most bytes of its answer, with what a link to another policy needs: hardly more than there are.
+    ///
+    /// # Errors
+    ///
+    /// If what is stored is not what this program writes.
+    pub fn answer_bytes(&self) -> Result<usize, WriteError> {
+        /// The names of members, and numbers at their longest.
+        const STEP_BYTES: usize = 240;
+        const NUMBER_BYTES: usize = 25;
+        /// What is between the summary and the steps, and a link.
+        const OTHER_BYTES: usize = 256;
+        let pieces = Pieces::of(self.names(), &self.short.actions)?;
+        let mut value_bytes = vec![0; pieces.names.len()];
+        let mut state_bytes: usize = pieces.names.iter().map(|name| name.len() + 1).sum();
+        let (mut changed, mut terms) = (self.short.changed.iter(), self.short.terms.iter());
+        let (mut term_bytes, mut n_bytes) = (0, self.summary.len() + OTHER_BYTES);
+        for step in &self.short.steps {
+            for (position, n_bytes) in changed.by_ref().take(step.n_changed as usize) {
+                let value = value_bytes.get_mut(*position as usize).ok_or(WriteError::Missing("an attribute"))?;
+                let before = std::mem::replace(value, *n_bytes as usize);
+                state_bytes = state_bytes - before + *value;
+            }
+            if let Some(n_terms) = step.n_terms {
+                term_bytes = 0;
+                for (position, _) in terms.by_ref().take(n_terms as usize) {
+                    term_bytes += pieces.name(*position as usize)?.len() + NUMBER_BYTES;
+                }
+            }
+            let action = step.action.map(|place| pieces.action(place)).transpose()?;
+            // Once in its step, and once among the actions.
+            let action_bytes = action.map_or(0, |(name, cost)| 2 * name.len() + cost.len());
+            n_bytes = n_bytes.saturating_add(STEP_BYTES + state_bytes + term_bytes + action_bytes);
+        }
+        Ok(n_bytes)
+    }
+
+    /// The policy as it was answered (JSON), in room for so many bytes.
+    ///
+    /// # Errors
+    ///
+    /// If what is stored is not what this program writes.
+    pub fn answer(&self, n_bytes: usize) -> Result<String, WriteError> {
+        answer(self.summary, self.names(), &self.short, Some(n_bytes))
+    }
+}
+
+/// The steps of a policy, in short. What some steps have more of than others stands together, in the order of the steps.
+///
+/// There to be serialized, in whatever format, and to be read as a [`StoredPolicy`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ShortSteps<'a> {
+    /// Names and costs of the actions that are taken.
+    #[serde(borrow)]
+    actions: Vec<(&'a str, f64)>,
+    steps: Vec<ShortStep>,
+    /// What of the state has changed since the step before, all of it for the first one: attributes, and the bytes that their values
+    /// take in `values`.
+    changed: Vec<(u32, u32)>,
+    /// JSON, one after the other.
+    values: String,
+    /// Attributes, and the terms of the distance that are not 0.
+    terms: Vec<(u32, f64)>,
+}
+
+/// A step. It has its number and its move from those before it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct ShortStep {
+    observation: u32,
+    /// Its place among the actions.
+    action: Option<u32>,
+    state_index: u32,
+    /// Of the steps up to and including this one.
+    cost: f64,
+    n_changed: u32,
+    /// `None` if the terms are those of the step before.
+    n_terms: Option<u32>,
+}
+
+impl<'a> ShortSteps<'a> {
+    fn of(problem: &Problem<'a>, mapping: &Mapping) -> Result<Self, WriteError> {
+        let model = problem.model;
+        let attributes = model.schema().attributes();
+        let states = mapping.states.as_ref().unwrap_or(model.states());
+        let n_steps = mapping.moves.len();
+        // Most steps change a value or two, and differ from what was observed in one.
+        let n_changed = attributes.len() + 2 * n_steps;
+        let mut short = Self {
+            actions: Vec::with_capacity(model.actions().len().min(n_steps)),
+            steps: Vec::with_capacity(n_steps),
+            changed: Vec::with_capacity(n_changed),
+            values: String::new(),
+            terms: Vec::with_capacity(n_steps),
+        };
+        let mut values = Vec::with_capacity(n_changed * VALUE_BYTES);
+        let mut sum = CostSum::default();
+        // Of the step before: its row, and where its terms stand.
+        let (mut row, mut terms): (&[u32], _) = (&[], 0..0);
+        for step in &mapping.moves {
+            let before = std::mem::replace(&mut row, states.row(step.state));
+            let n_before = short.changed.len();
+            for (position, (attribute, value)) in attributes.iter().zip(row).enumerate() {
+                if before.get(position) != Some(value) {
+                    let from = values.len();
+                    let value = attribute.written(&states.domain(position)[*value as usize]);
+                    serde_json::to_writer(&mut values, &value)?;
+                    short.changed.push((count(position), count(values.len() - from)));
+                }
+            }
+            let from = short.terms.len();
+            let own_terms = problem.distances.terms(step.observation as usize, row);
+            short
+                .terms
+                .extend(own_terms.filter(|(_, term)| *term > 0.0).map(|(position, term)| (count(position), term)));
+            let n_terms = if short.terms[from..] == short.terms[terms.clone()] {
+                short.terms.truncate(from);
+                None
+            } else {
+                terms = from..short.terms.len();
+                Some(count(terms.len()))
+            };
+            let action = step.action.map(|action| model.action(action));
+            let action_cost = action.map_or(0.0, |action| action.cost);
+            sum.add(action_cost, distance(&short.terms[terms.clone()]));
+            let action = action.map(|action| short.place_of(&action.name, action_cost));
+            short.steps.push(ShortStep {
+                observation: step.observation,
+                action,
+                state_index: step.state,
+                cost: sum.total(),
+                n_changed: count(short.changed.len() - n_before),
+                n_terms,
+            });
+        }
+        short.values = String::from_utf8(values).map_err(serde_json::Error::custom)?;
+        Ok(short)
+    }
+
+    /// About how many bytes they take in a format in which small numbers take one.
+    #[must_use]
+    pub fn n_bytes(&self) -> usize {
+        /// Most numbers take one, costs eight.
+        const STEP_BYTES: usize = 16;
+        const ACTION_BYTES: usize = 24;
+        self.actions.len() * ACTION_BYTES
+            + self.steps.len() * STEP_BYTES
+            + self.changed.len() * 2
+            + self.values.len()
+            + self.terms.len() * 9
+            + STEP_BYTES
+    }
+
+    /// The place of the action called `name`.
+    fn place_of(&mut self, name: &'a str, cost: f64) -> u32 {
+        let known = self.actions.iter().position(|(known, _)| *known == name);
+        count(known.unwrap_or_else(|| {
+            self.actions.push((name, cost));
+            self.actions.len() - 1
+        }))
+    }
+}
+
+/// The sum of the terms of a distance, in their order.
+fn distance(terms: &[(u32, f64)]) -> f64 {
+    // Not `sum`, of which nothing is -0.
+    terms.iter().fold(0.0, |sum, (_, term)| sum + term)
+}
+
+/// A number of things of which a policy has far fewer than 2^32.
+fn count(n: usize) -> u32 {
+    u32::try_from(n).unwrap_or(u32::MAX)
+}
+
+/// Writes a policy as it is answered: its summary, with the actions and the steps before the coverage. `names` are those of the
+/// attributes. Begins with room for `n_bytes`, or for about as many as it takes.
+fn answer<'n>(
+    summary: &str,
+    names: impl Iterator<Item = &'n str>,
+    short: &ShortSteps<'_>,
+    n_bytes: Option<usize>,
+) -> Result<String, WriteError> {
+    /// What comes after the steps. No string in JSON has a quote that is not escaped, and no weight is an object.
+    const AFTER: &str = r#""coverage":{"#;
+    let (before, after) = summary.split_at(summary.rfind(AFTER).ok_or(WriteError::Missing("a coverage"))?);
+    let pieces = Pieces::of(names, &short.actions)?;
+    let mut writer = AnswerWriter::new(&pieces, summary.len(), short.steps.len(), n_bytes)?;
+    writer.raw(before);
+    writer.raw(r#""actions":["#);
+    for (n, place) in short.steps.iter().filter_map(|step| step.action).enumerate() {
+        writer.raw(if n == 0 { "" } else { "," });
+        writer.raw(pieces.action(place)?.0);
+    }
+    writer.raw(r#"],"steps":["#);
+    let (mut changed, mut values) = (short.changed.iter(), short.values.as_str());
+    let mut terms = short.terms.as_slice();
+    let mut before = None;
+    for step in &short.steps {
+        for (position, n_bytes) in changed.by_ref().take(step.n_changed as usize) {
+            let (value, rest) = values.split_at_checked(*n_bytes as usize).ok_or(WriteError::Missing("a value"))?;
+            writer.set_value(*position, value)?;
+            values = rest;
+        }
+        if let Some(n_terms) = step.n_terms {
+            let (own, rest) = terms.split_at_checked(n_terms as usize).ok_or(WriteError::Missing("a term"))?;
+            writer.set_terms(own)?;
+            terms = rest;
+        }
+        writer.raw(if before.is_none() { "" } else { "," });
+        let kind = match (before.replace(step.observation), step.action) {
+            (None, _) => MoveKind::Start,
+            (Some(_), None) => MoveKind::Skip,
+            (Some(before), Some(_)) if before == step.observation => MoveKind::Extra,
+            (Some(_), Some(_)) => MoveKind::Match,
+        };
+        writer.step(step, kind)?;
+    }
+    writer.raw("],");
+    writer.raw(after);
+    Ok(String::from_utf8(writer.text).map_err(serde_json::Error::custom)?)
+}
+
+/// About how many bytes a value of a state takes.
+const VALUE_BYTES: usize = 6;
+
+/// JSON that an answer has more than once.
+struct Pieces {
+    /// One after the other.
+    text: Vec<u8>,
+    /// By attribute, where its name is, as that of a member of an object.
+    names: Vec<Range<usize>>,
+    /// By action, where its name and its cost are.
+    actions: Vec<(Range<usize>, Range<usize>)>,
+}
+
+impl Pieces {
+    fn of<'n>(names: impl Iterator<Item = &'n str>, actions: &[(&str, f64)]) -> serde_json::Result<Self> {
+        /// About what a name takes, or a cost.
+        const PIECE_BYTES: usize = 16;
+        let n_names = names.size_hint().0;
+        let mut pieces = Self {
+            text: Vec::with_capacity((n_names + 2 * actions.len()) * PIECE_BYTES),
+            names: Vec::with_capacity(n_names),
+            actions: Vec::with_capacity(actions.len()),
+        };
+        for name in names {
+            let name = pieces.add(name)?;
+            pieces.text.push(b':');
+            pieces.names.push(name.start..name.end + 1);
+        }
+        for (name, cost) in actions {
+            let action = (pieces.add(name)?, pieces.add(cost)?);
+            pieces.actions.push(action);
+        }
+        Ok(pieces)
+    }
+
+    fn add(&mut self, piece: &(impl Serialize + ?Sized)) -> serde_json::Result<Range<usize>> {
+        let from = self.text.len();
+        serde_json::to_writer(&mut self.text, piece)?;
+        Ok(from..self.text.len())
+    }
+
+    /// The name of the attribute at `position`.
+    fn name(&self, position: usize) -> Result<&[u8], WriteError> {
+        let name = self.names.get(position).ok_or(WriteError::Missing("an attribute"))?;
+        Ok(&self.text[name.clone()])
+    }
+
+    /// The name and the cost of the action at `place`.
+    fn action(&self, place: u32) -> Result<(&[u8], &[u8]), WriteError> {
+        let (name, cost) = self.actions.get(place as usize).ok_or(WriteError::Missing("an action"))?;
+        Ok((&self.text[name.clone()], &self.text[cost.clone()]))
+    }
+}
+
+/// Writes the steps of a policy as they are answered. What a step has in common with the one before is kept as text.
+struct AnswerWriter<'p> {
+    text: Vec<u8>,
+    pieces: &'p Pieces,
+    /// By attribute.
+    values: Vec<StateValue<'p>>,
+    /// The members of the state; empty where they are to be written anew.
+    state: Vec<u8>,
+    /// The members that tell the distance.
+    distance: Vec<u8>,
+    n_steps: u32,
+}
+
+/// A value of the state.
+#[derive(Clone, Default)]
+struct StateValue<'p> {
+    /// JSON.
+    text: &'p str,
+    /// Where it begins among the members of the state.
+    at: usize,
+}
+
+impl<'p> AnswerWriter<'p> {
+    /// A writer of so many steps, with `n_around` bytes around them, which are `n_bytes` in all if that is known.
+    fn new(pieces: &'p Pieces, n_around: usize, n_steps: usize, n_bytes: Option<usize>) -> Result<Self, WriteError> {
+        /// About what a step takes, beside its state.
+        const STEP_BYTES: usize = 192;
+        let state_bytes: usize = pieces.names.iter().map(|name| name.len() + VALUE_BYTES).sum();
+        let mut writer = Self {
+            text: Vec::with_capacity(n_bytes.unwrap_or(n_around + n_steps * (STEP_BYTES + state_bytes))),
+            pieces,
+            values: vec![StateValue::default(); pieces.names.len()],
+            state: Vec::with_capacity(state_bytes),
+            distance: Vec::with_capacity(STEP_BYTES),
+            n_steps: 0,
+        };
+        writer.set_terms(&[])?;
+        Ok(writer)
+    }
+
+    /// Writes what is JSON already, or a part of it.
+    fn raw(&mut self, text: impl AsRef<[u8]>) {
+        self.text.extend_from_slice(text.as_ref());
+    }
+
+    /// Writes a member of an object, whose name is given with what stands around it.
+    fn member(&mut self, name: &str, value: impl Serialize) -> serde_json::Result<()> {
+        self.raw(name);
+        serde_json::to_writer(&mut self.text, &value)
+    }
+
+    /// From the next step on, the attribute at `position` has this value: JSON.
+    fn set_value(&mut self, position: u32, text: &'p str) -> Result<(), WriteError> {
+        let value = self.values.get_mut(position as usize).ok_or(WriteError::Missing("an attribute"))?;
+        match self.state.get_mut(value.at..value.at + text.len()) {
+            Some(before) if value.text.len() == text.len() => before.copy_from_slice(text.as_bytes()),
+            _ => self.state.clear(),
+        }
+        value.text = text;
+        Ok(())
+    }
+
+    /// Writes the members of the state anew.
+    fn write_state(&mut self) -> Result<(), WriteError> {
+        for (position, value) in self.values.iter_mut().enumerate() {
+            if position > 0 {
+                self.state.push(b',');
+            }
+            self.state.extend_from_slice(self.pieces.name(position)?);
+            value.at = self.state.len();
+            self.state.extend_from_slice(value.text.as_bytes());
+        }
+        Ok(())
+    }
+
+    /// From the next step on, these are the terms of the distance.
+    fn set_terms(&mut self, terms: &[(u32, f64)]) -> Result<(), WriteError> {
+        self.distance.clear();
+        self.distance.extend_from_slice(br#""distance":"#);
+        serde_json::to_writer(&mut self.distance, &distance(terms))?;
+        self.distance.extend_from_slice(br#","distance_by_attribute":{"#);
+        for (n, (position, term)) in terms.iter().enumerate() {
+            if n > 0 {
+                self.distance.push(b',');
+            }
+            self.distance.extend_from_slice(self.pieces.name(*position as usize)?);
+            serde_json::to_writer(&mut self.distance, term)?;
+        }
+        self.distance.push(b'}');
+        Ok(())
+    }
+
+    /// Writes the next step.
+    fn step(&mut self, step: &ShortStep, kind: MoveKind) -> Result<(), WriteError> {
+        let action = step.action.map(|place| self.pieces.action(place)).transpose()?;
+        let (action, action_cost) = action.unwrap_or((b"null", b"0.0"));
+        if self.state.is_empty() {
+            self.write_state()?;
+        }
+        self.member(r#"{"step":"#, self.n_steps)?;
+        self.member(r#","observation":"#, step.observation)?;
+        self.raw(match kind {
+            MoveKind::Start => r#","move":"start","action":"#,
+            MoveKind::Match => r#","move":"match","action":"#,
+            MoveKind::Extra => r#","move":"extra","action":"#,
+            MoveKind::Skip => r#","move":"skip","action":"#,
+        });
+        self.raw(action);
+        self.raw(r#","state":{"#);
+        self.text.extend_from_slice(&self.state);
+        self.member(r#"},"state_index":"#, step.state_index)?;
+        self.raw(r#","action_cost":"#);
+        self.raw(action_cost);
+        self.raw(",");
+        self.text.extend_from_slice(&self.distance);
+        self.member(r#","cost":"#, step.cost)?;
+        self.raw("}");
+        self.n_steps += 1;
+        Ok(())
+    }
+}

@@ -1,0 +1,358 @@
+//! Reading what a table lists.
+
+use std::hash::{BuildHasher, RandomState};
+use std::sync::Arc;
+
+use hashbrown::HashTable;
+
+use super::{Edges, Table};
+use crate::attribute::{Attribute, Schema, Value};
+use crate::document::{Faults, Object, Path, Place, index_of};
+use crate::interrupt::{Interrupted, Meter};
+use crate::model::action::ReadActions;
+use crate::model::reading::{Distinct, NoTransition, Raw, RawIndex, RawStates, RawTransitions};
+use crate::model::{ActionIdx, Limits, Start, StateIdx, States};
+
+/// Reads the dynamics. `attributes` and `actions` are `None` where they had faults of their own; what does not
+/// depend on them is checked all the same. `lists` are the states and transitions that were taken out of the dynamics.
+pub(in crate::model) fn read(
+    place: &Place<'_, '_>,
+    lists: (Option<RawStates>, Option<RawTransitions>),
+    attributes: Option<Vec<Option<Attribute>>>,
+    actions: Option<ReadActions<'_>>,
+    limits: Limits,
+    meter: &mut Meter<'_>,
+    faults: &mut Faults,
+) -> Result<Option<Table>, Interrupted> {
+    let Some(object) = place.object(&["kind", "states", "transitions", "start", "unsafe"], faults) else {
+        return Ok(None);
+    };
+    let rows = object.required("states", faults).and_then(|place| place.array(faults).map(|_| place));
+    let rows = rows.zip(lists.0).filter(|(place, rows)| {
+        let is_number_right = (1..=limits.max_states).contains(&rows.n_states);
+        if !is_number_right {
+            faults.note(place, format!("expected 1 to {} states, found {}", limits.max_states, rows.n_states));
+        }
+        is_number_right
+    });
+    // Where the states are missing, any index may be right.
+    let n_states = rows.as_ref().map_or(StateIdx::MAX as usize, |(_, rows)| rows.n_states);
+    let states = match rows.zip(attributes.as_ref()) {
+        Some(((_, rows), attributes)) => read_states(rows, attributes, meter, faults)?,
+        None => None,
+    };
+    let items = object.required("transitions", faults).and_then(|place| place.array(faults).map(|_| place));
+    let items = items.zip(lists.1).filter(|(place, items)| {
+        let is_number_right = items.n_transitions <= limits.max_transitions;
+        if !is_number_right {
+            let detail =
+                format!("expected at most {} transitions, found {}", limits.max_transitions, items.n_transitions);
+            faults.note(place, detail);
+        }
+        is_number_right
+    });
+    let edges = match items {
+        Some((_, items)) => read_transitions(items, n_states, actions.as_ref(), meter, faults)?,
+        None => None,
+    };
+    let unsafe_states = match object.optional("unsafe") {
+        Some(place) => read_state_list(&place, n_states, faults).map(|mut states| {
+            // A set, however it is written.
+            states.sort_unstable();
+            states.dedup();
+            states
+        }),
+        None => Some(Vec::new()),
+    };
+    let start = read_start(&object, n_states, unsafe_states.as_deref().unwrap_or_default(), faults);
+    let table = || {
+        Some(Table {
+            schema: Schema::of(attributes?.into_iter().collect::<Option<_>>()?),
+            actions: actions?.complete()?,
+            states: Arc::new(states?),
+            edges: edges?,
+            start: start?,
+            unsafe_states: unsafe_states?,
+        })
+    };
+    Ok(table())
+}
+
+/// The values of a column, as far as they are values of its attribute.
+struct Domain {
+    /// Distinct values, in the order in which they were first met.
+    values: Vec<Value>,
+    /// Where each of the column's distinct raw values stands in `values`; [`Self::NONE`] for what is none.
+    positions: Vec<u32>,
+}
+
+impl Domain {
+    const NONE: u32 = u32::MAX;
+
+    fn read(column: &[Raw], attribute: &Attribute, meter: &mut Meter<'_>) -> Result<Self, Interrupted> {
+        let mut values: Vec<Value> = Vec::with_capacity(column.len());
+        // Numbers that are written in several ways, such as 1 and 1.0, are one.
+        let mut known: HashTable<u32> = HashTable::with_capacity(column.len());
+        let hasher = RandomState::default();
+        let mut positions = Vec::with_capacity(column.len());
+        let mut ignored = Faults::default();
+        for raw in column {
+            meter.spend_or_stop(1)?;
+            let value = raw.scalar().and_then(|json| attribute.read_value(&Place::root(&json), &mut ignored));
+            let Some(value) = value else {
+                positions.push(Self::NONE);
+                continue;
+            };
+            let hash = hasher.hash_one(&value);
+            let entry = known.entry(
+                hash,
+                |position| values[*position as usize] == value,
+                |position| hasher.hash_one(&values[*position as usize]),
+            );
+            let position = match entry {
+                hashbrown::hash_table::Entry::Occupied(entry) => *entry.get(),
+                hashbrown::hash_table::Entry::Vacant(entry) => {
+                    #[expect(clippy::cast_possible_truncation, reason = "at most as many as raw values")]
+                    let position = values.len() as u32;
+                    entry.insert(position);
+                    values.push(value);
+                    position
+                }
+            };
+            positions.push(position);
+        }
+        Ok(Self { values, positions })
+    }
+
+    /// Whether every raw value is a value of its own.
+    fn is_as_found(&self) -> bool {
+        self.values.len() == self.positions.len()
+    }
+}
+
+fn read_states(
+    rows: RawStates,
+    attributes: &[Option<Attribute>],
+    meter: &mut Meter<'_>,
+    faults: &mut Faults,
+) -> Result<Option<States>, Interrupted> {
+    let RawStates { n_states, columns, mut cells, width, lens, no_rows, places } = rows;
+    let width_wanted = attributes.len();
+    let is_even = lens.is_none() && width == width_wanted;
+    // As long as no fault is to be told, a column's raw values are let go as soon as they are read.
+    let mut columns: Vec<Vec<Raw>> = columns.into_iter().map(Distinct::into_values).collect();
+    let mut domains = Vec::with_capacity(width_wanted);
+    for (column, attribute) in columns.iter_mut().zip(attributes) {
+        let domain = match attribute {
+            Some(attribute) => Some(Domain::read(column, attribute, meter)?),
+            None => None,
+        };
+        if is_even && domain.as_ref().is_some_and(|domain| !domain.positions.contains(&Domain::NONE)) {
+            *column = Vec::new();
+        }
+        domains.push(domain);
+    }
+    let is_faultless =
+        domains.iter().all(|domain| domain.as_ref().is_some_and(|domain| !domain.positions.contains(&Domain::NONE)));
+    if is_even && is_faultless {
+        for (k, domain) in domains.iter().flatten().enumerate() {
+            if !domain.is_as_found() {
+                meter.spend_or_stop(n_states as u64)?;
+                for cell in cells.iter_mut().skip(k).step_by(width) {
+                    *cell = domain.positions[*cell as usize];
+                }
+            }
+        }
+        cells.shrink_to_fit();
+        let domains = domains.into_iter().flatten().map(|domain| domain.values).collect();
+        return Ok(Some(States::new(domains, cells)));
+    }
+
+    let n_before = faults.count();
+    let mut no_rows = no_rows.into_iter();
+    let mut next_cell = 0;
+    for n in 0..n_states {
+        meter.spend_or_stop(1)?;
+        let len = lens.as_ref().map_or(width, |lens| lens[n] as usize);
+        if len == RawStates::NO_ROW as usize {
+            match no_rows.next() {
+                Some(found) => places.with_path("states", n, |path| faults.note_mismatch(path, "an array", found)),
+                None => faults.count_unlisted(1),
+            }
+            continue;
+        }
+        let row = &cells[next_cell..][..len.min(Schema::MAX_ATTRIBUTES)];
+        next_cell += row.len();
+        if len != width_wanted {
+            let detail = format!("expected {width_wanted} values, one per attribute, found {len}");
+            places.with_path("states", n, |path| faults.note_at(path, detail));
+            continue;
+        }
+        for (k, cell) in row.iter().enumerate() {
+            let (Some(domain), Some(attribute)) = (&domains[k], &attributes[k]) else { continue };
+            if domain.positions[*cell as usize] == Domain::NONE {
+                let found = &columns[k][*cell as usize];
+                places.with_path("states", n, |path| note_no_value(&Path::Item(path, k), found, attribute, faults));
+            }
+        }
+    }
+    debug_assert!(faults.count() > n_before || attributes.contains(&None), "there was a reason");
+    Ok(None)
+}
+
+/// Notes that `found` is no value of `attribute`.
+fn note_no_value(path: &Path<'_>, found: &Raw, attribute: &Attribute, faults: &mut Faults) {
+    match found.scalar() {
+        Some(value) => drop(attribute.read_value(&Place { value: &value, path: *path }, faults)),
+        None => faults.note_mismatch(path, &attribute.expected(), found),
+    }
+}
+
+fn read_transitions(
+    items: RawTransitions,
+    n_states: usize,
+    actions: Option<&ReadActions<'_>>,
+    meter: &mut Meter<'_>,
+    faults: &mut Faults,
+) -> Result<Option<Edges>, Interrupted> {
+    let RawTransitions { n_transitions, from, mut action, to, references, odd, n_odd, places } = items;
+    let read_reference = |found: &Raw, path: &Path<'_>, faults: &mut Faults| {
+        let actions = actions?;
+        if let Some(value) = found.scalar() {
+            return actions.read_reference(&Place { value: &value, path: *path }, faults);
+        }
+        faults.note_mismatch(path, &index_of("action"), found);
+        None
+    };
+    let mut ignored = Faults::default();
+    let known: Vec<Option<ActionIdx>> =
+        references.values().iter().map(|found| read_reference(found, &Path::Root, &mut ignored)).collect();
+    let n_before = faults.count();
+    // Of any length, so that the chunks are looked at in between.
+    let are_states = |states: &[StateIdx]| states.iter().all(|state| (*state as usize) < n_states);
+    let is_faultless = n_odd == 0 && known.iter().all(Option::is_some) && are_states(&from) && are_states(&to);
+    // Where it leaves from, and by which action, of what is a transition.
+    let key = |n: usize| {
+        let action = known.get(usize::from(action[n])).copied().flatten()?;
+        ((from[n] as usize) < n_states && (to[n] as usize) < n_states && from[n] != RawTransitions::NOWHERE)
+            .then_some((from[n], action))
+    };
+    let again = find_repeated(n_transitions, key, meter)?;
+    if !is_faultless || !again.is_empty() {
+        let mut odd = odd.into_iter();
+        let mut again = again.into_iter().peekable();
+        let read_index = |found: RawIndex, path: &Path<'_>, faults: &mut Faults| match found {
+            Err(found) => faults.note_mismatch(path, &index_of("state"), found),
+            Ok(index) if index as usize >= n_states => faults.note_no_index(path, "state", index, n_states),
+            Ok(_) => {}
+        };
+        let read_parts = |path: &Path<'_>, from: RawIndex, reference: &Raw, to: RawIndex, faults: &mut Faults| {
+            read_index(from, &Path::Item(path, 0), faults);
+            read_reference(reference, &Path::Item(path, 1), faults);
+            read_index(to, &Path::Item(path, 2), faults);
+        };
+        for n in 0..n_transitions {
+            meter.spend_or_stop(1)?;
+            if from[n] == RawTransitions::NOWHERE {
+                let Some(odd) = odd.next() else {
+                    faults.count_unlisted(1);
+                    continue;
+                };
+                places.with_path("transitions", n, |path| match odd {
+                    NoTransition::Other(found) => faults.note_mismatch(path, "an array", found),
+                    NoTransition::Array(len) => {
+                        faults.note_at(path, format!("expected [from, action, to], found an array of {len}"));
+                    }
+                    NoTransition::Parts(from, reference, to) => read_parts(path, from, &reference, to, faults),
+                });
+                continue;
+            }
+            let repeated = again.next_if(|(again, _)| *again as usize == n);
+            let (reference, is_action) = (&references.values()[usize::from(action[n])], known[usize::from(action[n])]);
+            if is_action.is_none() || from[n] as usize >= n_states || to[n] as usize >= n_states {
+                places.with_path("transitions", n, |path| read_parts(path, Ok(from[n]), reference, Ok(to[n]), faults));
+            } else if let Some((_, other)) = repeated {
+                let detail = format!("state {} has a transition by this action already: transition {other}", from[n]);
+                places.with_path("transitions", n, |path| faults.note_at(path, detail));
+            }
+        }
+        debug_assert!(faults.count() > n_before || known.contains(&None), "there was a reason");
+        return Ok(None);
+    }
+    for action in &mut action {
+        // All are known.
+        *action = known[usize::from(*action)].unwrap_or_default();
+    }
+    Ok(Some(Edges { from, action, to }))
+}
+
+/// Of `n_transitions` with these keys, those whose key an earlier one has, each with the last such one, in order.
+fn find_repeated(
+    n_transitions: usize,
+    key: impl Fn(usize) -> Option<(StateIdx, ActionIdx)>,
+    meter: &mut Meter<'_>,
+) -> Result<Vec<(u32, u32)>, Interrupted> {
+    // Most documents list transitions in order, which makes this simple.
+    let mut last = None;
+    let is_ascending = (0..n_transitions).all(|n| {
+        let before = std::mem::replace(&mut last, key(n));
+        last.is_some() && before < last
+    });
+    if is_ascending {
+        return Ok(Vec::new());
+    }
+    let mut keys: Vec<(StateIdx, ActionIdx, u32)> = Vec::with_capacity(n_transitions);
+    for (n, number) in (0..n_transitions).zip(0..) {
+        meter.spend_or_stop(1)?;
+        keys.extend(key(n).map(|(from, action)| (from, action, number)));
+    }
+    keys.sort_unstable();
+    let pairs = keys.windows(2).filter(|pair| (pair[0].0, pair[0].1) == (pair[1].0, pair[1].1));
+    let mut again: Vec<(u32, u32)> = pairs.map(|pair| (pair[1].2, pair[0].2)).collect();
+    again.sort_unstable();
+    Ok(again)
+}
+
+fn read_state_list(place: &Place<'_, '_>, n_states: usize, faults: &mut Faults) -> Option<Vec<StateIdx>> {
+    let items = place.array(faults)?;
+    let indices = items.iter().enumerate().map(|(n, item)| place.item(n, item).index(n_states, "state", faults));
+    let indices: Vec<_> = indices.collect();
+    indices.into_iter().collect()
+}
+
+fn read_start(
+    object: &Object<'_, '_>,
+    n_states: usize,
+    unsafe_states: &[StateIdx],
+    faults: &mut Faults,
+) -> Option<Start> {
+    let is_unsafe: rustc_hash::FxHashSet<_> = unsafe_states.iter().copied().collect();
+    let note_unsafe = |place: &Place<'_, '_>, state: StateIdx, faults: &mut Faults| {
+        if is_unsafe.contains(&state) {
+            faults.note(place, format!("state {state} is unsafe"));
+        }
+    };
+    match object.optional("start") {
+        Some(place) if place.value.is_array() => {
+            let candidates = read_state_list(&place, n_states, faults)?;
+            if candidates.is_empty() {
+                return place.mismatch("at least one candidate", faults);
+            }
+            for (n, state) in candidates.iter().enumerate() {
+                note_unsafe(&place.item(n, &place.value[n]), *state, faults);
+            }
+            Some(Start::Candidates(candidates))
+        }
+        Some(place) => {
+            let state = place.index(n_states, "state", faults)?;
+            note_unsafe(&place, state, faults);
+            Some(Start::State(state))
+        }
+        None => {
+            if is_unsafe.len() >= n_states {
+                faults.note_at(&object.path, "every state is unsafe: there is nowhere to start");
+            }
+            Some(Start::Any)
+        }
+    }
+}
