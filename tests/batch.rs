@@ -279,7 +279,7 @@ async fn local_items_of_a_batch_are_refined_in_the_background() {
         };
         let (_, refined) = service.get(&format!("/v1/policies/{refined_by}")).await;
         assert_eq!((&refined["refines"], &refined["status"]), (&local["id"], &json!("optimal")));
-        assert_eq!(refined["cost"]["total"], 48.0);
+        assert_eq!(refined["cost"]["total"], 48.2);
     }
 }
 

@@ -172,7 +172,7 @@ async fn a_demonstration_is_followed_while_it_runs() {
     let (_, stored) = service.get(&format!("/v1/sessions/{session}")).await;
     assert_eq!((&stored["status"], &stored["observations"]), (&json!("done"), &json!(16)));
     assert_eq!(stored["policy_id"], done["policy_id"]);
-    assert_eq!((&stored["weights"], &stored["weights"]["outside"]), (&policy["weights"], &json!(4.0)));
+    assert_eq!((&stored["weights"], &stored["weights"]["outside"]), (&policy["weights"], &json!(5.0)));
     assert_eq!(service.get("/v1/sessions").await.1["items"], json!([stored]));
     assert_eq!(service.get("/v1/sessions/nothing").await.1["type"], "/problems/unknown-session");
 
@@ -247,7 +247,7 @@ async fn lines_go_both_ways_at_the_same_time() {
         }
         assert_eq!(frame["proven"], true, "{frame}");
     };
-    assert_eq!((&done["status"], &done["cost"]["total"]), (&json!("optimal"), &json!(48.0)));
+    assert_eq!((&done["status"], &done["cost"]["total"]), (&json!("optimal"), &json!(48.2)));
     assert_eq!(receive().await, None, "the answer ends by itself");
 }
 

@@ -113,7 +113,7 @@ async fn a_trial_goes_from_drawn_to_learned() {
     assert_eq!((&trial["weights_version"], &trial["reward"]), (&json!(0), &Value::Null));
     let policy = &trial["policy"];
     assert_eq!((&policy["id"], &policy["learner"]), (&trial["policy_id"], &json!("gold")));
-    assert_eq!((&policy["weights"]["x"], &policy["weights"]["outside"]), (&trial["weights"]["x"], &json!(4.0)));
+    assert_eq!((&policy["weights"]["x"], &policy["weights"]["outside"]), (&trial["weights"]["x"], &json!(5.0)));
     assert_eq!(service.get(&location).await, (200, trial.clone()));
     let (_, stored) = service.get(&format!("/v1/policies/{}", trial["policy_id"].as_str().unwrap())).await;
     assert_eq!(&stored, policy);
@@ -373,7 +373,7 @@ async fn policies_use_the_means_of_a_learner_where_a_request_names_no_weight() {
     let (status, policy) = service.post("/v1/policies", &request).await;
     assert_eq!((status, &policy["learner"], &policy["weights_version"]), (201, &json!("keen"), &json!(0)));
     let weights = &policy["weights"];
-    assert_eq!((&weights["gold"], &weights["x"], &weights["outside"]), (&json!(3.0), &json!(1.0), &json!(4.0)));
+    assert_eq!((&weights["gold"], &weights["x"], &weights["outside"]), (&json!(3.0), &json!(1.0), &json!(5.0)));
     assert_eq!(policy["cost"]["total"], 20.1);
 }
 

@@ -84,7 +84,7 @@ pub(crate) fn as_table(model: &Value) -> Value {
         json!({"name": "heading", "kind": "cyclic", "labels": HEADINGS, "weight": 1}),
         json!({"name": "gold", "kind": "number", "weight": 1}),
         json!({"name": "arrows", "kind": "number", "weight": 1}),
-        json!({"name": "outside", "kind": "category", "weight": 4}),
+        json!({"name": "outside", "kind": "category", "weight": 5}),
     ];
     for k in 1..=wumpi.len() {
         attributes.push(json!({"name": format!("wumpus_{k}"), "kind": "category", "weight": 0}));

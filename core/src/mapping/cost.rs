@@ -14,13 +14,13 @@ pub(super) const SLACK: f64 = 1e-9;
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Cost {
     /// The whole, `actions + distance`.
-    #[cfg_attr(feature = "openapi", schema(example = 48.0))]
+    #[cfg_attr(feature = "openapi", schema(example = 48.2))]
     pub total: f64,
     /// Costs of the actions taken, `C_a`.
-    #[cfg_attr(feature = "openapi", schema(example = 6.0))]
+    #[cfg_attr(feature = "openapi", schema(example = 7.2))]
     pub actions: f64,
     /// Weighted distances between observed and own states, one per step, `C_s`.
-    #[cfg_attr(feature = "openapi", schema(example = 42.0))]
+    #[cfg_attr(feature = "openapi", schema(example = 41.0))]
     pub distance: f64,
 }
 

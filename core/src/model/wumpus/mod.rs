@@ -266,7 +266,7 @@ impl Cave {
             attribute("heading", &heading, 1.0),
             attribute("gold", &number, 1.0),
             attribute("arrows", &number, 1.0),
-            attribute("outside", &Kind::Category, 4.0),
+            attribute("outside", &Kind::Category, 5.0),
         ];
         attributes.extend((1..=self.wumpi.len()).map(|k| attribute(&format!("wumpus_{k}"), &Kind::Category, 0.0)));
         attributes.extend((1..=self.gold.len()).map(|k| attribute(&format!("gold_{k}"), &Kind::Category, 0.0)));
