@@ -396,8 +396,11 @@ impl Target {
                 (N_SESSIONS, Read, messages)
             }
             Attack::LargePolicy => {
+                /// Of a larger one, the policy is larger than it may be.
+                const MAX_OBSERVATIONS: usize = 20_000;
                 self.put("wide", &wide()).await?;
-                let path = self.make_policy(&vec![json!({}); 2 * size.n_observations]).await?;
+                let n_observations = MAX_OBSERVATIONS.min(2 * size.n_observations);
+                let path = self.make_policy(&vec![json!({}); n_observations]).await?;
                 (60, Read, vec![at_once(self.get(&path))])
             }
             Attack::LargeFrames => {
