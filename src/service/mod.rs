@@ -79,6 +79,22 @@ pub struct Settings {
     pub time_limits: TimeLimits,
 }
 
+#[cfg(test)]
+impl Settings {
+    /// One thread, a small cache, and much memory.
+    fn of_test(directory: &std::path::Path) -> Self {
+        Self {
+            database: directory.join("etude.db"),
+            limits: Limits::DEFAULT,
+            memory: Memory::with_room(1 << 30),
+            model_cache_bytes: 1 << 20,
+            session_idle_timeout: Duration::MAX,
+            time_limits: TimeLimits::DEFAULT,
+            pool: PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
+        }
+    }
+}
+
 /// How long searches and compilations may take.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TimeLimits {

@@ -575,7 +575,7 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::service::{Client, ModelText, Name, PoolSettings, Settings, TimeLimits};
+    use crate::service::{Client, ModelText, Name, PoolSettings, Settings};
     use etude_core::interrupt::Uninterrupted;
     use etude_core::model::{Definition, Format, Limits};
 
@@ -585,15 +585,7 @@ mod tests {
 
     /// A service that has `model`, called `m`.
     async fn etude(directory: &std::path::Path, model: &Value) -> Etude {
-        let settings = Settings {
-            database: directory.join("etude.db"),
-            limits: Limits::DEFAULT,
-            memory: Memory::with_room(1 << 30),
-            model_cache_bytes: 1 << 20,
-            session_idle_timeout: Duration::MAX,
-            time_limits: TimeLimits::DEFAULT,
-            pool: PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
-        };
+        let settings = Settings::of_test(directory);
         let etude = Etude::open(&settings, &TaskTracker::new(), CancellationToken::new()).await.unwrap();
         let text = ModelText::Whole(model.to_string().into_bytes());
         etude.put_model(&Name::new("m").unwrap(), text, Format::Json, caller()).await.unwrap();

@@ -251,10 +251,10 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::service::{Caller, Client, ModelText, Name, PoolSettings, TimeLimits};
+    use crate::service::{Caller, Client, ModelText, Name};
     use crate::store::NewPolicy;
     use etude_core::interrupt::Uninterrupted;
-    use etude_core::model::{Format, Limits};
+    use etude_core::model::Format;
 
     const NOW: Timestamp = Timestamp::UNIX_EPOCH;
 
@@ -263,15 +263,7 @@ mod tests {
     }
 
     async fn etude(directory: &std::path::Path) -> Etude {
-        let settings = super::super::Settings {
-            database: directory.join("etude.db"),
-            limits: Limits::DEFAULT,
-            memory: Memory::with_room(1 << 30),
-            model_cache_bytes: 1 << 20,
-            session_idle_timeout: Duration::MAX,
-            time_limits: TimeLimits::DEFAULT,
-            pool: PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
-        };
+        let settings = crate::service::Settings::of_test(directory);
         let etude = Etude::open(&settings, &TaskTracker::new(), CancellationToken::new()).await.unwrap();
         let world = ModelText::Whole(br#"{"dynamics": {"kind": "wumpus", "width": 4, "height": 4}}"#.to_vec());
         etude.put_model(&Name::new("world").unwrap(), world, Format::Json, caller()).await.unwrap();
