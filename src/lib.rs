@@ -28,21 +28,21 @@
 //! | [`config`], [`telemetry`] | settings, logs and measurements |
 //!
 //! A request for a policy passes `http::policies` (body), `service::policies` (a place in `service::pool`), `service::outline` (its
-//! demonstration, for the model from `service::cache`), [`etude_core::mapping::Request`] (faults), [`etude_core::mapping::Mapper`] (search),
-//! [`etude_core::mapping::WrittenPolicy`] (the answer, and what is stored of it), and `store::writer` (disk) before it is answered. An observation
-//! of a stream passes `http::stream` (transport), [`stream::run`] (frames), `service::sessions` (durable before it is acknowledged) and
-//! [`etude_core::mapping::OnlineMapping`] (committed steps).
+//! demonstration, for the model from `service::cache`), [`etude_core::mapping::Request`] (faults), [`etude_core::mapping::Mapper`]
+//! (search), [`etude_core::mapping::WrittenPolicy`] (the answer, and what is stored of it), and `store::writer` (disk) before it is
+//! answered. An observation of a stream passes `http::stream` (transport), [`stream::run`] (frames), `service::sessions` (durable before it
+//! is acknowledged) and [`etude_core::mapping::OnlineMapping`] (committed steps).
 //!
-//! A model passes `http::body` (decompressed, and read as it comes if it is large), [`etude_core::model::Definition::parse_from`] (into compact
-//! arrays, with all faults), [`etude_core::model::Model::compile`], and `store::definitions` (its canonical text, in pieces if it is long) before
-//! `store::writer` makes it visible.
+//! A model passes `http::body` (decompressed, and read as it comes if it is large), [`etude_core::model::Definition::parse_from`] (into
+//! compact arrays, with all faults), [`etude_core::model::Model::compile`], and `store::definitions` (its canonical text, in pieces if it
+//! is long) before `store::writer` makes it visible.
 //!
-//! What is large takes its memory from [`memory`] before it begins, and whose turn it is to use a thread is told by `service::pool`. A model
-//! that is not at hand is made ready by `service::compiler`, once, however many ask for it.
+//! What is large takes its memory from [`memory`] before it begins, and whose turn it is to use a thread is told by `service::pool`. A
+//! model that is not at hand is made ready by `service::compiler`, once, however many ask for it.
 //!
-//! A trial goes the same way through `service::trials`, with weights that a [`etude_core::learning::Learner`] draws. Its reward is accepted by
-//! `store::writer`, which numbers rewards in one log per learner; `service::learner_task` folds what is new in the log into
-//! the next version of the weights.
+//! A trial goes the same way through `service::trials`, with weights that a [`etude_core::learning::Learner`] draws. Its reward is accepted
+//! by `store::writer`, which numbers rewards in one log per learner; `service::learner_task` folds what is new in the log into the next
+//! version of the weights.
 
 pub mod cli;
 pub mod config;
