@@ -369,24 +369,21 @@ async fn batch(address: SocketAddr, demonstration: &Value) -> Result<f64, Failur
 async fn inserts(stored: &StoredPolicy, n_rows: usize) -> Result<f64, Failure> {
     let directory = tempfile::tempdir()?;
     let mut connection = open(directory.path()).await?;
-    for migration in [
-        include_str!("../migrations/0001_models_and_policies.sql"),
-        include_str!("../migrations/0006_short_policies.sql"),
-    ] {
-        sqlx::raw_sql(migration).execute(&mut connection).await?;
-    }
+    sqlx::raw_sql(include_str!("../migrations/0001_schema.sql")).execute(&mut connection).await?;
     let started = Instant::now();
     let mut n_inserted = 0;
     while started.elapsed() < WINDOW {
         let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
         for _ in 0..n_rows {
-            sqlx::query("INSERT INTO policies (id, summary, policy, steps, created_at_ms) VALUES ($1, $2, '', $3, $4)")
-                .bind(uuid::Uuid::now_v7().to_string())
-                .bind(&stored.summary)
-                .bind(&stored.steps)
-                .bind(1_800_000_000_000_i64)
-                .execute(&mut *transaction)
-                .await?;
+            sqlx::query(
+                "INSERT INTO policies (id, summary, steps, checksum, created_at_ms) VALUES ($1, $2, $3, 0, $4)",
+            )
+            .bind(uuid::Uuid::now_v7().to_string())
+            .bind(&stored.summary)
+            .bind(&stored.steps)
+            .bind(1_800_000_000_000_i64)
+            .execute(&mut *transaction)
+            .await?;
         }
         transaction.commit().await?;
         n_inserted += n_rows;

@@ -85,7 +85,7 @@ fn included() -> BTreeSet<PathBuf> {
 #[test]
 fn the_builder_is_sent_and_copies_whatever_the_program_includes() {
     let (copied, included) = (copied(), included());
-    assert!(included.contains(Path::new("migrations/0001_models_and_policies.sql")), "{included:?}");
+    assert!(included.contains(Path::new("migrations/0001_schema.sql")), "{included:?}");
     let is_copied = |path: &Path| copied.iter().any(|copy| path.starts_with(copy));
     let missing: Vec<_> = included.iter().filter(|path| !is_copied(path) || !is_sent(path)).collect();
     assert!(missing.is_empty(), "{missing:?}");

@@ -1,4 +1,4 @@
-//! Policies as they are stored, and as those of earlier versions were.
+//! Policies as they are stored.
 
 #![expect(
     clippy::unwrap_used,
@@ -10,8 +10,6 @@
 mod oracle;
 mod problems;
 
-use std::path::Path;
-
 use etude::store::{NewPolicy, NewRefinement, RefinementEnd, Store, pack_steps};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
@@ -20,7 +18,6 @@ use jiff::Timestamp;
 use problems::{example, mapper, problem};
 use proptest::prelude::*;
 use serde_json::{Value, json};
-use sqlx::{ConnectOptions, Connection};
 use tokio_util::task::TaskTracker;
 
 /// A policy as it is answered, and as it is stored.
@@ -101,44 +98,30 @@ fn a_policy_takes_a_fifth_of_what_is_answered_at_most() {
     );
 }
 
-/// Stores a policy in `database` as it was done before its steps were packed.
-async fn store_whole(database: &Path, policy: &Policy) {
-    let mut connection = sqlx::sqlite::SqliteConnectOptions::new().filename(database).connect().await.unwrap();
-    sqlx::query("INSERT INTO policies (id, summary, policy, created_at_ms) VALUES ($1, $2, $3, 0)")
-        .bind(policy.id.as_deref())
-        .bind(serde_json::to_string(&PolicySummary::of(policy)).unwrap())
-        .bind(serde_json::to_string(policy).unwrap())
-        .execute(&mut connection)
-        .await
-        .unwrap();
-    connection.close().await.unwrap();
-}
-
 #[tokio::test]
-async fn policies_of_earlier_versions_are_read_listed_and_refined_like_new_ones() {
+async fn a_refined_policy_is_read_and_listed_with_its_link() {
     let directory = tempfile::tempdir().unwrap();
-    let database = directory.path().join("etude.db");
-    let store = Store::open(&database, &TaskTracker::new()).await.unwrap();
-    let refinement =
-        |id: &str| NewRefinement { policy_id: id.to_owned(), model_hash: String::new(), request: "{}".to_owned() };
-    // Both refinements are noted with the new one.
-    store_whole(&database, &figure_4(&stamp("old")).0).await;
-    let refinements = vec![refinement("old"), refinement("new")];
-    store.add_policies(vec![new("new", figure_4(&stamp("new")).1)], refinements).await.unwrap();
-    for (id, refined_by) in [("old", "old-refined"), ("new", "new-refined")] {
-        let (mut policy, written) = figure_4(&stamp(id));
-        assert_eq!(store.policy(id).await.unwrap().unwrap(), written.answer);
-        let (_, refined) = figure_4(&Stamp { refines: Some(id.to_owned()), ..stamp(refined_by) });
-        let answer = refined.answer.clone();
-        let end = RefinementEnd { policy_id: id.to_owned(), refined: Some(new(refined_by, refined)) };
-        store.end_refinement(end).await.unwrap();
-        policy.refined_by = Some(refined_by.to_owned());
-        assert_eq!(store.policy(id).await.unwrap().unwrap(), serde_json::to_string(&policy).unwrap());
-        assert_eq!(store.policy(refined_by).await.unwrap().unwrap(), answer);
-    }
+    let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+    let refinement = NewRefinement {
+        policy_id: "p".to_owned(),
+        model_hash: String::new(),
+        session_id: None,
+        request: "{}".to_owned(),
+    };
+    let (mut policy, written) = figure_4(&stamp("p"));
+    store.add_policies(vec![new("p", written.clone())], vec![refinement]).await.unwrap();
+    assert_eq!(store.policy("p").await.unwrap().unwrap(), written.answer);
+    let (_, refined) = figure_4(&Stamp { refines: Some("p".to_owned()), ..stamp("q") });
+    let answer = refined.answer.clone();
+    let end = RefinementEnd { policy_id: "p".to_owned(), refined: Some(new("q", refined)) };
+    store.end_refinement(end).await.unwrap();
+    policy.refined_by = Some("q".to_owned());
+    assert_eq!(store.policy("p").await.unwrap().unwrap(), serde_json::to_string(&policy).unwrap());
+    assert_eq!(store.policy("q").await.unwrap().unwrap(), answer);
     let listed = store.policies(0, 100).await.unwrap().items;
-    let ids = listed.iter().map(|row| serde_json::from_str::<Value>(&row.summary).unwrap()["id"].clone());
-    assert_eq!(ids.collect::<Vec<_>>(), ["old", "new", "old-refined", "new-refined"]);
+    let listed: Vec<Value> = listed.iter().map(|row| serde_json::from_str(&row.summary).unwrap()).collect();
+    assert_eq!(listed.iter().map(|summary| &summary["id"]).collect::<Vec<_>>(), ["p", "q"]);
+    assert_eq!(listed[0]["refined_by"], "q");
 }
 
 #[tokio::test]

@@ -30,7 +30,7 @@ use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{Problem, ProblemKind};
 use crate::service::Caller;
-use crate::store::{SessionRow, SessionWeights};
+use crate::store::SessionRow;
 use crate::stream::{Gone, Incoming, PROTOCOL, Room, SMALL_FRAME_BYTES, Sender};
 use etude_core::attribute::ByAttribute;
 
@@ -190,10 +190,7 @@ impl From<SessionRow> for SessionBody {
             id: row.id,
             model: row.model,
             model_hash: row.model_hash,
-            weights: match row.weights {
-                SessionWeights::Named(weights) => Some(weights),
-                SessionWeights::InOrder(_) => None,
-            },
+            weights: Some(row.weights),
             lookahead: row.lookahead,
             learner: row.learner,
             weights_version: row.weights_version,

@@ -425,6 +425,7 @@ pub(super) fn follow(
         Ok::<_, ServiceError>(NewRefinement {
             policy_id: stamp.id.clone().unwrap_or_default(),
             model_hash: stamp.model_hash.clone(),
+            session_id: None,
             request: text,
         })
     });

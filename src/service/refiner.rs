@@ -175,7 +175,7 @@ impl Etude {
         struct Local {
             cost: Cost,
         }
-        let NewRefinement { policy_id, model_hash, request } = refinement;
+        let NewRefinement { policy_id, model_hash, session_id: _, request } = refinement;
         let mut held = None;
         self.memory.hold(&mut held, request.len() + document::parsed_bytes(request.as_bytes()))?;
         let document = document::parse(request.as_bytes())?;
@@ -295,7 +295,8 @@ mod tests {
         ] {
             let policy =
                 NewPolicy { id: id.to_owned(), summary: policy.to_owned(), steps: Vec::new(), created_at: NOW };
-            let refinement = NewRefinement { policy_id: id.to_owned(), model_hash: hash.clone(), request };
+            let refinement =
+                NewRefinement { policy_id: id.to_owned(), model_hash: hash.clone(), session_id: None, request };
             etude.store.add_policies(vec![policy], vec![refinement]).await.unwrap();
         }
         let good = made(&etude, &request()).await;

@@ -46,13 +46,8 @@ pub(super) async fn note(
             tracing::info!(gap_ms, n_sessions = n_moved, "time without service does not count for open sessions");
         }
     }
-    sqlx::query(
-        "INSERT INTO service (id, last_alive_ms) VALUES (1, $1)
-         ON CONFLICT (id) DO UPDATE SET last_alive_ms = excluded.last_alive_ms",
-    )
-    .bind(now_ms)
-    .execute(connection)
-    .await?;
+    let noted = sqlx::query("UPDATE service SET last_alive_ms = $1");
+    noted.bind(now_ms).execute(connection).await?;
     Ok(())
 }
 

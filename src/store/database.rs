@@ -18,16 +18,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rustix::process::geteuid;
-use sqlx::migrate::{Migration, MigrationType, Migrator};
 use sqlx::pool::PoolConnection;
 use sqlx::sqlite::{SqliteConnectOptions, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{ConnectOptions, Connection, SqlSafeStr, Sqlite, SqliteConnection};
+use sqlx::{ConnectOptions, Connection, Sqlite, SqliteConnection};
 use tokio::sync::RwLock;
 
-use super::{Depth, StoreError, Unavailable};
-
-/// Earlier ones can corrupt a database in WAL mode.
-const LEAST_SQLITE_VERSION: (u32, u32, u32) = (3, 51, 3);
+use super::{Depth, StoreError, Unavailable, schema};
 
 /// How long a connection waits for another process's lock.
 const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
@@ -41,9 +37,6 @@ const MAX_LOG_PAGES: &str = "16384";
 
 /// Statements that a connection keeps prepared: all that there are, those with a number of rows as often as there are numbers.
 const N_STATEMENTS: usize = 256;
-
-/// What migration 7 sets.
-const APPLICATION_ID: i64 = 0x6574_7564;
 
 /// Nobody but the service's user is to read what others have sent.
 const MODE: u32 = 0o600;
@@ -209,12 +202,12 @@ impl Database {
             self.check_files()?;
             return Ok(None);
         }
-        check_version(connection).await?;
-        check_whose(connection).await?;
-        quick_check(connection).await?;
+        schema::check_version(connection).await?;
+        schema::check_whose(connection).await?;
+        schema::quick_check(connection).await?;
         let mode: String = sqlx::query_scalar("PRAGMA journal_mode = WAL").fetch_one(&mut *connection).await?;
         self.has_log = mode == "wal";
-        migrator().run_direct(None, connection, false).await?;
+        schema::migrate(connection).await?;
         // A file that can only be read has been opened all the same. That it is locked is no reason not to have it open.
         let written =
             sqlx::query("UPDATE service SET last_alive_ms = last_alive_ms WHERE FALSE").execute(&mut *connection);
@@ -456,213 +449,15 @@ async fn readers(options: SqliteConnectOptions) -> Result<SqlitePool, StoreError
 /// Ways to read a database that is whole, and has this version's schema.
 async fn look_at(options: SqliteConnectOptions, depth: Depth) -> Result<SqlitePool, StoreError> {
     let mut connection = options.connect().await?;
-    check_version(&mut connection).await?;
-    check_whose(&mut connection).await?;
-    check_schema(&mut connection).await?;
+    schema::check_version(&mut connection).await?;
+    schema::check_whose(&mut connection).await?;
+    schema::check_current(&mut connection).await?;
     if depth == Depth::Whole {
-        quick_check(&mut connection).await?;
+        schema::quick_check(&mut connection).await?;
     }
     connection.close().await?;
     readers(options).await
 }
 
-/// Every migration, in order. They are part of the program, so that it runs wherever it is copied to.
-fn migrator() -> Migrator {
-    let migration = |version, description: &'static str, sql: &'static str| {
-        Migration::new(version, description.into(), MigrationType::Simple, sql.into_sql_str(), false)
-    };
-    Migrator {
-        migrations: vec![
-            migration(1, FIRST_MIGRATION, include_str!("../../migrations/0001_models_and_policies.sql")),
-            migration(2, "sessions", include_str!("../../migrations/0002_sessions.sql")),
-            migration(3, "learners and trials", include_str!("../../migrations/0003_learners_and_trials.sql")),
-            migration(4, "large definitions", include_str!("../../migrations/0004_large_definitions.sql")),
-            migration(5, "arrivals", include_str!("../../migrations/0005_arrivals.sql")),
-            migration(6, "short policies", include_str!("../../migrations/0006_short_policies.sql")),
-            migration(7, "incidents", include_str!("../../migrations/0007_incidents.sql")),
-        ]
-        .into(),
-        ..Migrator::DEFAULT
-    }
-}
-
-/// By which databases are known that were not migrated for long.
-const FIRST_MIGRATION: &str = "models and policies";
-
-async fn check_version(connection: &mut SqliteConnection) -> Result<(), StoreError> {
-    let found: String = sqlx::query_scalar("SELECT sqlite_version()").fetch_one(connection).await?;
-    let mut parts = found.split('.').map(|part| part.parse::<u32>().unwrap_or(0));
-    let mut next = || parts.next().unwrap_or(0);
-    let version = (next(), next(), next());
-    if version < LEAST_SQLITE_VERSION {
-        return Err(StoreError::Version { found, needed: LEAST_SQLITE_VERSION });
-    }
-    Ok(())
-}
-
-/// Refuses what another program has made. An empty database is anybody's.
-async fn check_whose(connection: &mut SqliteConnection) -> Result<(), StoreError> {
-    let id: i64 = sqlx::query_scalar("PRAGMA application_id").fetch_one(&mut *connection).await?;
-    if id != 0 {
-        return if id == APPLICATION_ID { Ok(()) } else { Err(StoreError::Foreign) };
-    }
-    let names: Vec<String> =
-        sqlx::query_scalar("SELECT name FROM sqlite_schema WHERE name NOT LIKE 'sqlite\\_%' ESCAPE '\\'")
-            .fetch_all(&mut *connection)
-            .await?;
-    let is_begun = names.iter().any(|name| name == "_sqlx_migrations");
-    // Whoever was killed while it made the first tables has left this one.
-    if names.len() == usize::from(is_begun) {
-        return Ok(());
-    }
-    let is_ours = is_begun && {
-        let query =
-            sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM _sqlx_migrations WHERE version = 1 AND description = $1)");
-        query.bind(FIRST_MIGRATION).fetch_one(connection).await?
-    };
-    if is_ours { Ok(()) } else { Err(StoreError::Foreign) }
-}
-
-/// Refuses a file whose pages do not fit together.
-async fn quick_check(connection: &mut SqliteConnection) -> Result<(), StoreError> {
-    let checked = sqlx::query_scalar::<_, String>("PRAGMA quick_check(1)").fetch_one(connection).await;
-    match checked.map_err(StoreError::from) {
-        Ok(finding) if finding == "ok" => Ok(()),
-        Ok(finding) => Err(StoreError::Damaged { finding }),
-        Err(error) => Err(error),
-    }
-}
-
-/// Refuses a database that has another schema than this version's.
-async fn check_schema(connection: &mut SqliteConnection) -> Result<(), StoreError> {
-    let applied: Vec<i64> =
-        sqlx::query_scalar("SELECT version FROM _sqlx_migrations ORDER BY version").fetch_all(connection).await?;
-    let known = migrator();
-    let last = known.migrations.last().map_or(0, |migration| migration.version);
-    match applied.last() {
-        Some(applied) if *applied > last => Err(StoreError::Newer { migration: *applied }),
-        Some(applied) if *applied == last => Ok(()),
-        _ => Err(StoreError::Outdated),
-    }
-}
-
 #[cfg(test)]
-mod tests {
-    use sqlx::Row;
-    use tokio_util::task::TaskTracker;
-
-    use super::*;
-    use crate::store::Store;
-
-    #[tokio::test]
-    async fn a_database_of_the_version_before_is_migrated_with_what_it_knows() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("etude.db");
-        let mut before = options(&path).create_if_missing(true).connect().await.unwrap();
-        let mut migrator = migrator();
-        migrator.migrations.to_mut().pop();
-        migrator.run_direct(None, &mut before, false).await.unwrap();
-        // One learner has a reward that is not folded in, and one policy was refined.
-        let refined = r#"{"coverage":{},"refines":null,"refined_by":"q"}"#;
-        let rows = "INSERT INTO learners VALUES (1, 'behind', '', '', 0), (2, 'even', '', '', 0);
-            INSERT INTO weights VALUES (1, 0, 0, NULL, '[]', '[]', 0), (2, 0, 0, NULL, '[]', '[]', 0);
-            INSERT INTO trials (sequence, id, learner, number, weights, weights_version, policy_id, lease_expires_at_ms, created_at_ms)
-                VALUES (1, 't', 1, 1, '{}', 0, 'p', 0, 0);
-            INSERT INTO rewards VALUES (1, 1, 1, 7.0, 0);";
-        sqlx::raw_sql(rows).execute(&mut before).await.unwrap();
-        let policy = sqlx::query("INSERT INTO policies (id, summary, policy, created_at_ms) VALUES ('p', $1, $1, 0)");
-        policy.bind(refined).execute(&mut before).await.unwrap();
-        before.close().await.unwrap();
-
-        let read = Store::open_to_read(&path, &TaskTracker::new()).await;
-        assert!(matches!(read, Err(StoreError::Outdated)), "whoever only reads does not migrate it");
-        let store = Store::open(&path, &TaskTracker::new()).await.unwrap();
-        assert_eq!(store.learners_behind().await.unwrap(), ["behind"]);
-        assert_eq!(store.policy("p").await.unwrap().unwrap(), refined);
-        assert_eq!(store.policies(0, 10).await.unwrap().items[0].summary, refined);
-        let id = sqlx::query("PRAGMA application_id").fetch_one(&mut *store.reader().await.unwrap()).await.unwrap();
-        assert_eq!(id.get::<i64, _>(0), APPLICATION_ID);
-    }
-
-    #[tokio::test]
-    async fn a_service_keeps_others_from_files_that_they_could_read_and_whoever_only_reads_leaves_them() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("etude.db");
-        let at = |end: &str| directory.path().join(format!("etude.db{end}"));
-        let of_all = ["", "-wal", "-shm", "-lock"];
-        let modes = || of_all.map(|end| fs::metadata(at(end)).unwrap().mode() & 0o777);
-        let tasks = TaskTracker::new();
-        let store = Store::open_alone(&path, &tasks).await.unwrap();
-        store.close().await;
-        tasks.close();
-        tasks.wait().await;
-        for end in ["", "-lock"] {
-            fs::set_permissions(at(end), Permissions::from_mode(0o644)).unwrap();
-        }
-        // SQLite gives what it makes the mode of the database.
-        let reading = Store::open_to_read(&path, &TaskTracker::new()).await.unwrap();
-        assert_eq!(modes(), [0o644; 4]);
-        let _store = Store::open_alone(&path, &TaskTracker::new()).await.unwrap();
-        assert_eq!(modes(), [0o600; 4]);
-        reading.policies(0, 1).await.unwrap();
-
-        let foreign = directory.path().join("foreign.db");
-        let mut other = options(&foreign).create_if_missing(true).connect().await.unwrap();
-        sqlx::query("CREATE TABLE others (id INTEGER)").execute(&mut other).await.unwrap();
-        fs::set_permissions(&foreign, Permissions::from_mode(0o644)).unwrap();
-        assert!(matches!(Store::open_alone(&foreign, &TaskTracker::new()).await, Err(StoreError::Foreign)));
-        assert_eq!(fs::metadata(&foreign).unwrap().mode() & 0o777, 0o644);
-    }
-
-    #[test]
-    fn what_its_owner_must_not_write_to_stays_so_and_what_a_link_leads_to_is_left() {
-        let directory = tempfile::tempdir().unwrap();
-        let (path, link) = (directory.path().join("file"), directory.path().join("link"));
-        fs::write(&path, "").unwrap();
-        fs::set_permissions(&path, Permissions::from_mode(0o444)).unwrap();
-        std::os::unix::fs::symlink(&path, &link).unwrap();
-        let mode = || fs::metadata(&path).unwrap().mode() & 0o777;
-        assert!(!keep_from_others(&link).unwrap());
-        assert_eq!(mode(), 0o444);
-        assert!(keep_from_others(&path).unwrap());
-        assert_eq!(mode(), 0o400);
-        assert!(!keep_from_others(&path).unwrap());
-        assert!(!keep_from_others(&directory.path().join("none")).unwrap());
-    }
-
-    #[tokio::test]
-    async fn who_waits_for_a_way_to_read_gets_it_before_others_take_their_place() {
-        let directory = tempfile::tempdir().unwrap();
-        let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
-        let mut taken = Vec::new();
-        for _ in 0..N_READERS {
-            taken.push(store.reader().await.unwrap());
-        }
-        let mut waiting = Box::pin(store.reader());
-        assert!(futures_util::poll!(&mut waiting).is_pending());
-        let replaced = async { store.readers.pool.write().await.close().await };
-        let reads = async move {
-            taken.clear();
-            sqlx::query("SELECT * FROM models").fetch_all(&mut *waiting.await?).await?;
-            Ok::<_, StoreError>(())
-        };
-        let ((), read) = tokio::join!(biased; replaced, reads);
-        read.unwrap();
-    }
-
-    #[tokio::test]
-    async fn a_database_of_a_newer_version_is_refused_and_left_as_it_is() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("etude.db");
-        drop(Store::open(&path, &TaskTracker::new()).await.unwrap());
-        let mut newer = options(&path).connect().await.unwrap();
-        let applied = "INSERT INTO _sqlx_migrations (version, description, success, checksum, execution_time)
-            VALUES (1000, 'later', TRUE, x'00', 0)";
-        sqlx::query(applied).execute(&mut newer).await.unwrap();
-        newer.close().await.unwrap();
-        let opened = Store::open(&path, &TaskTracker::new()).await;
-        assert!(matches!(opened, Err(StoreError::Newer { migration: 1000 })), "{opened:?}");
-        let read = Store::open_to_read(&path, &TaskTracker::new()).await;
-        assert!(matches!(read, Err(StoreError::Newer { migration: 1000 })), "{read:?}");
-    }
-}
+mod tests;

@@ -68,6 +68,12 @@ pub enum StoreError {
     /// The database is only read, and has the schema of an earlier version of this program.
     #[error("the database has the schema of an earlier version; it is migrated by the next start of the service")]
     Outdated,
+    /// The database has the schema of a version of this program that was never released. It was left as it is.
+    #[error(
+        "a development version of this program has written the database, and its schema cannot be migrated: use a new file, or that \
+         version"
+    )]
+    Unreleased,
     /// The database could not be brought to this version's schema.
     #[error("the database could not be migrated")]
     Migrate(#[source] MigrateError),
@@ -205,7 +211,6 @@ impl From<MigrateError> for StoreError {
                 Self::Database(error) => Self::Migrate(MigrateError::ExecuteMigration(error, version)),
                 error => error,
             },
-            MigrateError::VersionMissing(migration) => Self::Newer { migration },
             error => Self::Migrate(error),
         }
     }

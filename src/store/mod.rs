@@ -21,6 +21,7 @@ mod models;
 mod page;
 mod policies;
 mod refinements;
+mod schema;
 mod sessions;
 mod trials;
 mod writer;
@@ -43,7 +44,6 @@ pub use policies::{NewPolicy, PolicySummaryRow, pack_steps};
 pub use refinements::{MAX_ATTEMPTS, NewRefinement, RefinementEnd};
 pub use sessions::{
     ExpiredSession, MAX_EXPIRED_AT_ONCE, NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus,
-    SessionWeights,
 };
 
 use sqlx::Sqlite;

@@ -100,11 +100,8 @@ impl Store {
     async fn policy_row(&self, id: &str, max_bytes: usize) -> Result<Option<SqliteRow>, StoreError> {
         let query = sqlx::query(
             "SELECT n_bytes, checksum, refined_by, IIF(n_bytes <= $2, summary, '') AS summary,
-                 IIF(n_bytes <= $2, policy, '') AS policy, IIF(n_bytes <= $2, steps, NULL) AS steps
-             FROM (
-                 SELECT *, octet_length(summary) + octet_length(policy) + IFNULL(octet_length(steps), 0) AS n_bytes
-                 FROM policies WHERE id = $1
-             )",
+                 IIF(n_bytes <= $2, steps, x'') AS steps
+             FROM (SELECT *, octet_length(summary) + octet_length(steps) AS n_bytes FROM policies WHERE id = $1)",
         );
         let query = query.bind(id).bind(as_integer(max_bytes as u64));
         Ok(query.fetch_optional(&mut *self.reader().await?).await?)
@@ -116,18 +113,9 @@ impl Store {
         held: Option<Held>,
         memory: &Memory,
     ) -> Result<(String, Option<Held>), StoreError> {
-        let steps: Option<Vec<u8>> = row.try_get("steps")?;
+        let steps: Vec<u8> = row.try_get("steps")?;
         let summary: String = row.try_get("summary")?;
-        let stored = stored_checksum(row)?;
-        let Some(steps) = steps else {
-            let policy: String = row.try_get("policy")?;
-            let mut held = held;
-            if let Some(held) = &mut held {
-                held.shrink_to(policy.len() as u64);
-            }
-            return Ok((linked(policy, row)?, held));
-        };
-        if stored.is_some_and(|stored| stored != checksum(&summary, &steps)) {
+        if row.try_get::<i64, _>("checksum")? != checksum(&summary, &steps) {
             return Err(corrupt("checksum")("it is not that of the summary and the steps"));
         }
         if summary.len() + steps.len() <= MAX_INLINE_BYTES
@@ -179,14 +167,9 @@ fn half_checksum(summary: &str) -> i64 {
     i64::from(crc32fast::hash(summary.as_bytes())) << 32
 }
 
-/// The one that is stored; `None` of a policy that was stored before there were any.
-fn stored_checksum(row: &SqliteRow) -> Result<Option<i64>, StoreError> {
-    Ok(row.try_get("checksum")?)
-}
-
 fn read_summary(row: &SqliteRow) -> Result<PolicySummaryRow, StoreError> {
     let summary: String = row.try_get("summary")?;
-    if stored_checksum(row)?.is_some_and(|stored| (stored >> 32) << 32 != half_checksum(&summary)) {
+    if (row.try_get::<i64, _>("checksum")? >> 32) << 32 != half_checksum(&summary) {
         return Err(corrupt("checksum")("it is not that of the summary"));
     }
     Ok(PolicySummaryRow { sequence: row.try_get("sequence")?, id: row.try_get("id")?, summary: linked(summary, row)? })
@@ -312,9 +295,8 @@ async fn insert(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> R
 fn insert_of(n_rows: usize) -> SqlStr {
     static INSERTS: [OnceLock<SqlStr>; MAX_ROWS + 1] = [const { OnceLock::new() }; MAX_ROWS + 1];
     let put_together = || {
-        let rows = vec!["(?, ?, '', ?, ?, ?)"; n_rows].join(", ");
-        let insert =
-            format!("INSERT INTO policies (id, summary, policy, steps, checksum, created_at_ms) VALUES {rows}");
+        let rows = vec!["(?, ?, ?, ?, ?)"; n_rows].join(", ");
+        let insert = format!("INSERT INTO policies (id, summary, steps, checksum, created_at_ms) VALUES {rows}");
         AssertSqlSafe(insert).into_sql_str()
     };
     match INSERTS.get(n_rows) {

@@ -16,6 +16,8 @@ pub struct NewRefinement {
     pub policy_id: String,
     /// Hash of its model's content.
     pub model_hash: String,
+    /// The session whose observations are the demonstration; `None` if the request has that.
+    pub session_id: Option<String>,
     /// JSON: the request for the refined policy.
     pub request: String,
 }
@@ -44,13 +46,14 @@ impl Store {
     /// If the database failed.
     pub async fn next_refinement(&self, after: i64) -> Result<Option<(i64, NewRefinement)>, StoreError> {
         let query = sqlx::query(
-            "SELECT rowid AS sequence, policy_id, model_hash, request FROM refinements WHERE rowid > $1
+            "SELECT rowid AS sequence, policy_id, model_hash, session_id, request FROM refinements WHERE rowid > $1
              ORDER BY rowid LIMIT 1",
         );
         let Some(row) = query.bind(after).fetch_optional(&mut *self.reader().await?).await? else { return Ok(None) };
         let refinement = NewRefinement {
             policy_id: row.try_get("policy_id")?,
             model_hash: row.try_get("model_hash")?,
+            session_id: row.try_get("session_id")?,
             request: row.try_get("request")?,
         };
         Ok(Some((row.try_get("sequence")?, refinement)))
@@ -96,9 +99,10 @@ impl Store {
 }
 
 pub(super) async fn add(connection: &mut SqliteConnection, refinement: &NewRefinement) -> Result<(), StoreError> {
-    sqlx::query("INSERT INTO refinements (policy_id, model_hash, request) VALUES ($1, $2, $3)")
+    sqlx::query("INSERT INTO refinements (policy_id, model_hash, session_id, request) VALUES ($1, $2, $3, $4)")
         .bind(&refinement.policy_id)
         .bind(&refinement.model_hash)
+        .bind(&refinement.session_id)
         .bind(&refinement.request)
         .execute(connection)
         .await?;

@@ -4,7 +4,6 @@ use std::collections::{BTreeMap, HashSet};
 use std::time::Duration;
 
 use jiff::Timestamp;
-use serde::Deserialize;
 use serde_json::Value;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
@@ -57,7 +56,7 @@ pub struct SessionRow {
     /// Hash of its model's content.
     pub model_hash: String,
     /// The weights of its distance.
-    pub weights: SessionWeights,
+    pub weights: ByAttribute<f64>,
     /// How many observations past the current one a decision may wait for; `None` for all.
     pub lookahead: Option<u32>,
     /// Index of the start state, if the request named one.
@@ -78,16 +77,6 @@ pub struct SessionRow {
     pub created_at: Timestamp,
     /// When something last came.
     pub active_at: Timestamp,
-}
-
-/// The weights of a session's distance, as they are stored.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(untagged)]
-pub enum SessionWeights {
-    /// By attribute.
-    Named(ByAttribute<f64>),
-    /// Of a session that was opened before attributes were stored: one for each, in the model's order.
-    InOrder(Vec<f64>),
 }
 
 /// A session to be opened.
@@ -350,8 +339,8 @@ pub(super) async fn open(connection: &mut SqliteConnection, session: &NewSession
     sqlx::query(
         "INSERT INTO sessions
              (id, model, model_hash, weights, lookahead, start, learner, weights_version, trial_id,
-              status, n_observations, created_at_ms, active_at_ms)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', 0, $10, $10)",
+              status, owner, n_observations, created_at_ms, active_at_ms)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', 1, 0, $10, $10)",
     )
     .bind(&session.id)
     .bind(&session.model)

@@ -22,8 +22,8 @@ use super::owners::{Ownership, TakenOver};
 use super::policies::{MAX_INLINE_BYTES, Named};
 use super::{Caller, Etude, PoolError, ServiceError};
 use crate::memory::Held;
-use crate::store::{MAX_EXPIRED_AT_ONCE, NewSession, Page, SessionRow, SessionStatus, SessionWeights, StoreError};
-use etude_core::attribute::{Schema, Weights};
+use crate::store::{MAX_EXPIRED_AT_ONCE, NewSession, Page, SessionRow, SessionStatus, StoreError};
+use etude_core::attribute::{ByAttribute, Schema, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, time_until_finish};
 use etude_core::mapping::{Budget, CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, TooManySteps};
@@ -213,7 +213,7 @@ impl Etude {
             let name = format!("{} with hash {}", row.model, row.model_hash);
             return Err(ServiceError::Unknown { kind: "model", name, pointer: None }.into());
         }
-        let weights = read_weights(row.weights, mapper.model().schema(), id)?;
+        let weights = weights_in_order(&row.weights, mapper.model().schema(), id)?;
         let lookahead = row.lookahead.and_then(NonZeroU32::new);
         let mut session = Session {
             id: row.id,
@@ -371,18 +371,13 @@ impl Etude {
 /// Looking for idle sessions more often than this would only keep the disk busy.
 const MIN_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
-/// Reads weights that were stored.
-fn read_weights(weights: SessionWeights, schema: &Schema, id: &str) -> Result<Weights, SessionError> {
+/// The weights of the session `id`, as they are stored, in the order of the model's attributes.
+fn weights_in_order(weights: &ByAttribute<f64>, schema: &Schema, id: &str) -> Result<Weights, SessionError> {
     let missing =
         |name: &str| StoreError::corrupt("sessions", "weights", id, format!("the weight of {name:?} is missing"));
-    let weights: Result<Vec<f64>, _> = match weights {
-        SessionWeights::InOrder(weights) => Ok(weights),
-        SessionWeights::Named(weights) => {
-            let names = schema.attributes().iter().map(|attribute| &attribute.name);
-            names.map(|name| weights.get(name).copied().ok_or_else(|| missing(name))).collect()
-        }
-    };
-    Ok(Weights::of(weights?))
+    let names = schema.attributes().iter().map(|attribute| &attribute.name);
+    let weights = names.map(|name| weights.get(name).copied().ok_or_else(|| missing(name)));
+    Ok(Weights::of(weights.collect::<Result<Vec<_>, _>>()?))
 }
 
 /// Observations of up to so many values are read where they are needed, which takes less than a millisecond.

@@ -444,6 +444,7 @@ fn conclude(
         NewRefinement {
             policy_id: policy.id.clone().unwrap_or_default(),
             model_hash: policy.model_hash.clone(),
+            session_id: None,
             request: with_demonstration(&request.to_string(), texts),
         }
     });

@@ -1,0 +1,155 @@
+-- All tables. Times are milliseconds since 1970, UTC.
+
+-- "etud": says whose the file is.
+PRAGMA application_id = 1702131044;
+
+-- What holds for the service as a whole. One row.
+CREATE TABLE service (
+    id                 INTEGER NOT NULL PRIMARY KEY CHECK (id = 1),
+    last_alive_ms      INTEGER,          -- when it was last known to be alive, so that time in which it was not does not count
+    models_generation  INTEGER NOT NULL  -- counts registrations and deletions of models
+) STRICT;
+
+INSERT INTO service (id, last_alive_ms, models_generation) VALUES (1, NULL, 0);
+
+-- Models, by the name that a client gave them. `hash` is SHA-256 of the canonical text of the definition.
+CREATE TABLE models (
+    name           TEXT    NOT NULL PRIMARY KEY,
+    hash           TEXT    NOT NULL,
+    definition     TEXT    NOT NULL, -- the canonical text, unless it is in pieces; then empty
+    definition_id  INTEGER,          -- of a text in pieces
+    attributes     TEXT    NOT NULL, -- JSON
+    actions        TEXT    NOT NULL, -- JSON
+    n_states       INTEGER NOT NULL, -- 0: the model is searched lazily
+    n_transitions  INTEGER NOT NULL,
+    n_unsafe       INTEGER NOT NULL,
+    created_at_ms  INTEGER NOT NULL
+) STRICT;
+
+CREATE INDEX models_by_definition ON models (definition_id) WHERE definition_id IS NOT NULL;
+
+-- Definitions that are too large for a column: their canonical text in pieces, each compressed by itself (zstd). Pieces are
+-- stored one by one, and belong to no model until all of them are; those that belong to none are removed.
+CREATE TABLE definitions (
+    id             INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT
+) STRICT;
+
+CREATE TABLE definition_pieces (
+    definition_id  INTEGER NOT NULL,
+    seq            INTEGER NOT NULL, -- from 0
+    piece          BLOB    NOT NULL,
+    PRIMARY KEY (definition_id, seq)
+) STRICT;
+
+-- Policies, in the order in which they became durable. A policy outlives its model.
+CREATE TABLE policies (
+    sequence       INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT,
+    id             TEXT    NOT NULL UNIQUE,
+    summary        TEXT    NOT NULL, -- JSON: the policy without its steps
+    steps          BLOB    NOT NULL, -- the steps in short (postcard)
+    checksum       INTEGER NOT NULL, -- CRC-32 of the summary (high half) and of the steps (low half)
+    refined_by     TEXT,             -- the id of the policy that refines it
+    created_at_ms  INTEGER NOT NULL
+) STRICT;
+
+-- Policies that a finite lookahead decided and that wait to be refined to the global optimum.
+CREATE TABLE refinements (
+    policy_id   TEXT    NOT NULL PRIMARY KEY,
+    model_hash  TEXT    NOT NULL,
+    session_id  TEXT,                        -- whose observations are the demonstration; NULL: the request has it
+    request     TEXT    NOT NULL,            -- JSON: the request for the refined policy
+    attempts    INTEGER NOT NULL DEFAULT 0   -- how often it was taken up; what has ended the process each time is given up
+) STRICT;
+
+-- Streams. Of a session, what it was opened with and the observations are kept; all else follows from them.
+CREATE TABLE sessions (
+    sequence        INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT,
+    id              TEXT    NOT NULL UNIQUE,
+    model           TEXT    NOT NULL,
+    model_hash      TEXT    NOT NULL,
+    weights         TEXT    NOT NULL, -- JSON: by attribute
+    lookahead       INTEGER,          -- NULL: only proven steps are committed before the end
+    start           INTEGER,          -- state index; NULL: the model's
+    learner         TEXT,             -- whose weights are used, if any
+    weights_version INTEGER,          -- of that learner
+    trial_id        TEXT,             -- the trial that is explored, if any
+    status          TEXT    NOT NULL CHECK (status IN ('open', 'done', 'expired')),
+    owner           INTEGER NOT NULL, -- counts who has opened or resumed it; only the newest one may add to it or end it
+    n_observations  INTEGER NOT NULL,
+    policy_id       TEXT,
+    created_at_ms   INTEGER NOT NULL,
+    active_at_ms    INTEGER NOT NULL
+) STRICT;
+
+CREATE INDEX sessions_by_activity ON sessions (active_at_ms) WHERE status = 'open';
+
+-- Observations as they came, several a row. `states` is a JSON array of `n_states` states, the first of which is the
+-- observation `seq`.
+CREATE TABLE observations (
+    session_id  TEXT    NOT NULL,
+    seq         INTEGER NOT NULL,
+    n_states    INTEGER NOT NULL,
+    states      TEXT    NOT NULL,
+    PRIMARY KEY (session_id, seq)
+) STRICT, WITHOUT ROWID;
+
+-- Observations that are durable and not yet in their table. One row holds what a commit of the writer brought, whichever
+-- sessions it is of: JSON, an array of [session_id, seq, n_states, states, at_ms], in the order in which they came. Now and
+-- then, and before anybody reads observations, everything here moves to `observations` and is counted in `sessions`.
+CREATE TABLE arrivals (
+    sequence     INTEGER NOT NULL PRIMARY KEY,
+    observations TEXT    NOT NULL
+) STRICT;
+
+-- Learners, by the name that a client gave them. `definition` is the canonical text that `hash` (SHA-256) is of. One that is
+-- registered anew under the name of a deleted one is another learner.
+CREATE TABLE learners (
+    sequence       INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT,
+    name           TEXT    NOT NULL UNIQUE,
+    hash           TEXT    NOT NULL,
+    definition     TEXT    NOT NULL,            -- JSON
+    has_pending    INTEGER NOT NULL DEFAULT 0,  -- whether there are rewards that no version of the weights has folded in
+    created_at_ms  INTEGER NOT NULL
+) STRICT;
+
+CREATE INDEX learners_with_pending ON learners (sequence) WHERE has_pending = 1;
+
+-- Trials, in the order in which they became durable. What became of one follows from this row, `rewards` and `weights`.
+CREATE TABLE trials (
+    sequence             INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT,
+    id                   TEXT    NOT NULL UNIQUE,
+    learner              INTEGER NOT NULL REFERENCES learners (sequence) ON DELETE CASCADE,
+    number               INTEGER NOT NULL, -- with the learner's seed, what the draw is keyed by; nobody else's
+    weights              TEXT    NOT NULL, -- JSON: as drawn, by attribute
+    weights_version      INTEGER NOT NULL, -- that they were drawn from
+    policy_id            TEXT    NOT NULL,
+    lease_expires_at_ms  INTEGER NOT NULL,
+    is_failed            INTEGER NOT NULL DEFAULT 0,
+    fail_reason          TEXT,
+    created_at_ms        INTEGER NOT NULL,
+    UNIQUE (learner, number)
+) STRICT;
+
+-- The log of accepted rewards, numbered per learner. Rows are only ever added.
+CREATE TABLE rewards (
+    learner         INTEGER NOT NULL REFERENCES learners (sequence) ON DELETE CASCADE,
+    reward_order    INTEGER NOT NULL,
+    trial           INTEGER NOT NULL UNIQUE REFERENCES trials (sequence) ON DELETE CASCADE,
+    reward          REAL    NOT NULL,
+    accepted_at_ms  INTEGER NOT NULL,
+    PRIMARY KEY (learner, reward_order)
+) STRICT, WITHOUT ROWID;
+
+-- Every version of a learner's distribution: the fold over the rewards up to and including `reward_order`. Version 0 is what
+-- it starts from, at order 0.
+CREATE TABLE weights (
+    learner          INTEGER NOT NULL REFERENCES learners (sequence) ON DELETE CASCADE,
+    version          INTEGER NOT NULL,
+    reward_order     INTEGER NOT NULL,
+    expected_reward  REAL,
+    mean             TEXT    NOT NULL, -- JSON, in the order of the learner's attributes
+    sd               TEXT    NOT NULL, -- JSON, likewise
+    updated_at_ms    INTEGER NOT NULL,
+    PRIMARY KEY (learner, version),
+    UNIQUE (learner, reward_order)
+) STRICT, WITHOUT ROWID;
