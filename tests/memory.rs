@@ -8,7 +8,9 @@
     reason = "tests may panic, and the process that measures prints what it measured"
 )]
 
+#[path = "../core/tests/suite/oracle/mod.rs"]
 mod oracle;
+#[path = "../core/tests/suite/problems.rs"]
 mod problems;
 
 use std::fs;

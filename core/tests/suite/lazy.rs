@@ -1,23 +1,13 @@
 //! Worlds that are searched lazily, against the same worlds known in full.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::too_many_lines,
-    clippy::cast_possible_truncation,
-    reason = "tests may panic, and are read top to bottom"
-)]
-
-mod oracle;
-mod problems;
-
 use std::collections::HashMap;
 
+use crate::problems::{cave, close, mapper, mapper_within, solve, walked};
 use etude_core::attribute::{ByAttribute, Scalar};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
 use etude_core::mapping::{Budget, Policy, Request, Settings, Status};
 use etude_core::model::{Act, Cave, CaveState, Definition, Limits};
-use problems::{cave, close, mapper, mapper_within, solve, walked};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 

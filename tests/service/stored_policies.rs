@@ -1,21 +1,11 @@
 //! Policies as they are stored.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::too_many_lines,
-    clippy::cast_possible_truncation,
-    reason = "tests may panic, and are read top to bottom"
-)]
-
-mod oracle;
-mod problems;
-
+use crate::problems::{example, mapper, problem};
 use etude::store::{NewPolicy, NewRefinement, RefinementEnd, Store, pack_steps};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
 use etude_core::mapping::{Mapper, Policy, PolicySummary, Request, Stamp, WrittenPolicy};
 use jiff::Timestamp;
-use problems::{example, mapper, problem};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 use tokio_util::task::TaskTracker;

@@ -1,7 +1,5 @@
 //! The order of the layers, as `lib.rs` of both packages tells it, held against what the code refers to.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
 use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -1,17 +1,13 @@
 //! Models that are sent compressed, in lines, or are too large to be held as text.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod service;
-
 use std::io::Write;
 
+use crate::harness::service::{Service, answer, example};
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use reqwest::header::{ACCEPT_ENCODING, CONTENT_ENCODING, CONTENT_TYPE};
 use reqwest::{Body, Method};
 use serde_json::{Value, json};
-use service::{Service, answer, example};
 
 const JSON: &str = "application/json";
 /// So many states that a ring of them is stored in pieces, and read as it comes, compressed or not.

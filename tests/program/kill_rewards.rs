@@ -1,9 +1,5 @@
 //! What clients were told is there, whenever the program is killed.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod service;
-
 use std::collections::BTreeMap;
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -11,9 +7,9 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use crate::harness::service::example;
 use reqwest::Client;
 use serde_json::{Value, json};
-use service::example;
 use tokio::sync::{Mutex, Notify};
 
 /// The real program, which is killed.

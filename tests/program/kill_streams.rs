@@ -3,16 +3,12 @@
 //! Nothing that it said was received may be lost, nothing may be doubled, and the steps must be those of a run that
 //! nobody disturbed.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod process;
-
 use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, ChildStdin, Command, Stdio};
 use std::time::Duration;
 
+use crate::harness::process::Process;
 use futures_util::{SinkExt, StreamExt};
-use process::Process;
 use serde_json::{Value, json};
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::Message;
@@ -106,13 +102,13 @@ impl SplitMix {
 
 #[tokio::test]
 async fn a_service_killed_a_hundred_times_loses_and_doubles_nothing() {
-    let there: Vec<Value> = serde_json::from_str(include_str!("../examples/figure-4/demonstration.json")).unwrap();
+    let there: Vec<Value> = serde_json::from_str(include_str!("../../examples/figure-4/demonstration.json")).unwrap();
     let observations: Vec<Value> =
         there.iter().chain(there.iter().rev()).cycle().take(N_OBSERVATIONS).cloned().collect();
     let directory = tempfile::tempdir().unwrap();
     let database = directory.path().join("etude.db");
     let mut process = Process::start(&database);
-    let model: Value = serde_json::from_str(include_str!("../examples/figure-4/model.json")).unwrap();
+    let model: Value = serde_json::from_str(include_str!("../../examples/figure-4/model.json")).unwrap();
     let client = reqwest::Client::builder().no_proxy().build().unwrap();
     let registered = client.put(format!("http://{}/v1/models/figure-4", process.address)).json(&model).send().await;
     assert!(registered.unwrap().status().is_success());
@@ -187,7 +183,7 @@ impl Program {
 #[tokio::test]
 async fn the_command_goes_on_by_itself_when_its_service_is_killed_and_restarted() {
     const N_RESTARTS: usize = 20;
-    let there: Vec<Value> = serde_json::from_str(include_str!("../examples/figure-4/demonstration.json")).unwrap();
+    let there: Vec<Value> = serde_json::from_str(include_str!("../../examples/figure-4/demonstration.json")).unwrap();
     let observations: Vec<Value> =
         there.iter().chain(there.iter().rev()).cycle().take(20 * N_RESTARTS).cloned().collect();
     let mut undisturbed = Program::start(&["--model", "examples/figure-4/model.json"]);

@@ -2,6 +2,8 @@
 
 #![allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its part of this module")]
 
+use std::path::Path;
+
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
 use etude_core::mapping::{Mapper, Policy, Request, Stamp};
@@ -10,7 +12,9 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 pub(crate) fn example(path: &str) -> Value {
-    let path = format!("{}/examples/{path}", env!("CARGO_MANIFEST_DIR"));
+    // Of the repository, whichever of its packages is tested.
+    let mut roots = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors();
+    let path = roots.find_map(|root| Some(root.join("examples").join(path)).filter(|path| path.exists())).unwrap();
     serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
 }
 

@@ -1,21 +1,16 @@
 //! What becomes of the service when its disk is full, fails, cannot be written to, or is not the one that it was.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod process;
-mod service;
-
 use std::fs::{self, File};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
+use crate::harness::process::Process;
+use crate::harness::service::{answer, example};
 use futures_util::{SinkExt, StreamExt};
-use process::Process;
 use reqwest::{Client, Method};
 use serde_json::{Value, json};
-use service::{answer, example};
 use tempfile::TempDir;
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::Message;
@@ -379,7 +374,7 @@ impl Faults {
     fn compile() -> Option<Self> {
         let directory = tempfile::tempdir().unwrap();
         let shim = directory.path().join("failing_disk.so");
-        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/faults/failing_disk.c");
+        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/program/faults/failing_disk.c");
         let compiled = Command::new("cc").args(["-shared", "-fPIC", "-o"]).arg(&shim).arg(source).arg("-ldl").output();
         if compiled.is_ok_and(|output| output.status.success()) {
             return Some(Self { directory, shim });

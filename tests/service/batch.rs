@@ -1,12 +1,8 @@
 //! Batches, from outside.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod service;
-
+use crate::harness::service::{Service, answer, example, long_way, to_and_fro};
 use reqwest::Method;
 use serde_json::{Value, json};
-use service::{Service, answer, example, long_way, to_and_fro};
 
 const BATCH: &str = "/v1/policies:batch";
 

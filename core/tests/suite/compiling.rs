@@ -1,7 +1,5 @@
 //! What it takes to make models ready to be searched.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
 use etude_core::interrupt::{Cancelled, Interrupt, Interrupted, Signal, Uninterrupted};
 use etude_core::mapping::Mapper;
 use etude_core::model::{Definition, Limits, Model};

@@ -1,7 +1,5 @@
 //! The program as its surroundings treat it: signals, and logs that nobody reads.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::process::{Child, ChildStderr, Command, ExitStatus, Stdio};

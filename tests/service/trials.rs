@@ -1,14 +1,10 @@
 //! Learners and trials, from outside.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod service;
-
+use crate::harness::service::{Service, answer, example};
 use etude_core::learning::{Distribution, Learner};
 use reqwest::Method;
 use reqwest::header::{ETAG, IF_NONE_MATCH, LOCATION};
 use serde_json::{Value, json};
-use service::{Service, answer, example};
 
 /// Long enough never to come, so that only `POST learn` learns.
 const ONLY_WHEN_TOLD: [&str; 2] = ["--learn-every", "1000h"];

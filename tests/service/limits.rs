@@ -1,18 +1,14 @@
 //! What one request may take of the service: time, memory, and the patience of others.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod service;
-
 use std::time::Instant;
 
+use crate::harness::service::{Service, answer, example, flags, long_way, to_and_fro};
 use etude::memory::SMALL_BYTES;
 use etude::service::{Caller, Client, Etude, ModelText, Name, Registered, ServiceError};
 use etude_core::model::Format;
 use jiff::Timestamp;
 use reqwest::Method;
 use serde_json::{Value, json};
-use service::{Service, example, long_way, to_and_fro};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
@@ -83,7 +79,7 @@ async fn a_deadline_counts_while_a_cold_model_is_compiled_which_goes_on_for_the_
     request["deadline_ms"] = json!(0);
     let response = service.send(Method::POST, "/v1/policies", &request).await;
     assert!(response.headers().contains_key("retry-after"));
-    let (status, problem) = service::answer(response).await;
+    let (status, problem) = answer(response).await;
     assert_eq!((status, &problem["type"]), (503, &json!("/problems/busy")));
     assert!(problem["detail"].as_str().unwrap().contains("still being compiled"), "{problem}");
     // Whoever comes again without waiting finds it ready in the end.
@@ -105,7 +101,7 @@ async fn a_model_that_takes_too_long_to_compile_is_refused() {
 async fn a_model_that_is_there_already_is_not_compiled_again() {
     let directory = with_hard_model(&[]).await.stop().await;
     let database = directory.path().join("etude.db");
-    let flags = service::flags(&["--database", database.to_str().unwrap()]);
+    let flags = flags(&["--database", database.to_str().unwrap()]);
     let etude = Etude::open(&flags.settings(), &TaskTracker::new(), CancellationToken::new()).await.unwrap();
     // Without memory, nothing can be compiled.
     let memory = etude.memory();

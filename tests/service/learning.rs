@@ -1,16 +1,12 @@
 //! What is learned: the paper's experiments, and what survives a kill.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod service;
-
 use std::path::Path;
 use std::process::Command;
 
+use crate::harness::service::{Service, example};
 use etude::experiment::{CurvePlan, Laboratory, Local, Scene, figure_4, figure_7, figure_8};
 use etude_core::learning::PerAttributeDocument;
 use serde_json::{Value, json};
-use service::{Service, example};
 
 /// What an imitator earns in `scene` with a given weight of gold.
 fn earned(scene: &Scene, gold: Option<f64>) -> f64 {

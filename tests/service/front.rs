@@ -1,18 +1,13 @@
 //! What stands before the contract: hosts, web pages, slow and silent clients, and places for connections.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod process;
-mod service;
-
 use std::net::SocketAddr;
 use std::time::Duration;
 
+use crate::harness::process::Process;
+use crate::harness::service::{Service, answer, example, long_way, to_and_fro};
 use futures_util::future::join_all;
-use process::Process;
 use reqwest::Method;
 use serde_json::{Value, json};
-use service::{Service, example, long_way, to_and_fro};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio_tungstenite::tungstenite;
@@ -348,7 +343,7 @@ async fn bodies_that_do_not_fit_into_the_memory_are_refused_and_others_are_not()
     let large = vec![b' '; 1_200_000];
     let send = async || {
         let request = service.client.post(service.url("/v1/policies")).header("content-type", "application/json");
-        service::answer(request.body(large.clone()).send().await.unwrap()).await
+        answer(request.body(large.clone()).send().await.unwrap()).await
     };
     // Until both were read.
     while service.measurement("etude_memory_held_bytes").await < f64::from(4 << 20) {
@@ -367,7 +362,7 @@ async fn bodies_that_do_not_fit_into_the_memory_are_refused_and_others_are_not()
     let bomb = zstd::bulk::compress(&vec![b' '; 6 << 20], 1).unwrap();
     let request = service.client.post(service.url("/v1/policies")).header("content-type", "application/json");
     let sent = request.header("content-encoding", "zstd").body(bomb).send().await.unwrap();
-    assert_eq!(service::answer(sent).await.0, 503);
+    assert_eq!(answer(sent).await.0, 503);
 }
 
 /// A connection with a small window, on which `GET path` was sent.

@@ -1,22 +1,17 @@
 //! The stream protocol, from outside, over both transports.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod process;
-mod service;
-
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use crate::harness::process::Process;
+use crate::harness::service::{Service, answer, example, flags, long_way, to_and_fro};
 use etude::service::{Caller, Etude};
 use etude::stream::{Closed, Incoming, Outgoing, Receiver, Sender, queue};
 use etude_core::document::Place;
 use futures_util::{SinkExt, StreamExt};
 use jiff::Timestamp;
-use process::Process;
 use reqwest::{Body, Method};
 use serde_json::{Value, json};
-use service::{Service, example, long_way, to_and_fro};
 use tempfile::TempDir;
 use tokio::net::{TcpSocket, TcpStream};
 use tokio::sync::mpsc;
@@ -888,7 +883,7 @@ async fn who_asks_for_a_stream_without_a_websocket_is_told_to_upgrade() {
     let service = Service::start(&[]).await;
     let response = service.send(Method::GET, "/v1/stream", &Value::Null).await;
     assert_eq!(response.headers()["upgrade"], "websocket");
-    let (status, problem) = service::answer(response).await;
+    let (status, problem) = answer(response).await;
     assert_eq!((status, &problem["type"]), (426, &json!("/problems/upgrade-required")), "{problem}");
 }
 
@@ -1035,7 +1030,7 @@ const CLIENT: etude::service::Client = etude::service::Client::LOCAL;
 async fn without_service(service: Service, abort: &CancellationToken) -> (Etude, TempDir) {
     let directory = service.stop().await;
     let database = directory.path().join("etude.db");
-    let flags = service::flags(&["--database", database.to_str().unwrap()]);
+    let flags = flags(&["--database", database.to_str().unwrap()]);
     (Etude::open(&flags.settings(), &TaskTracker::new(), abort.clone()).await.unwrap(), directory)
 }
 
@@ -1073,7 +1068,7 @@ async fn who_stays_slow_is_closed_as_overloaded() {
     let (service, _) = figure_4().await;
     let abort = CancellationToken::new();
     let (etude, _directory) = without_service(service, &abort).await;
-    let limits = service::flags(&["--slow-reader-timeout", "100ms"]).stream_limits();
+    let limits = flags(&["--slow-reader-timeout", "100ms"]).stream_limits();
     let (came, mut incoming) = queue(1000);
     // Room for `hello` alone.
     let (outgoing, mut goes) = queue(1);
@@ -1092,7 +1087,7 @@ async fn many_frames_that_are_answered_at_once_let_others_have_their_turn() {
     let (service, _) = figure_4().await;
     let abort = CancellationToken::new();
     let (etude, _directory) = without_service(service, &abort).await;
-    let limits = service::flags(&[]).stream_limits();
+    let limits = flags(&[]).stream_limits();
     let (came, mut incoming) = queue(65_536);
     let (outgoing, mut goes) = queue(1 << 20);
     came.send(frame(&json!({"type": "open", "model": "figure-4"}))).await.unwrap();
@@ -1139,7 +1134,7 @@ impl Wire {
         let (to_server, mut incoming) = queue(65_536);
         let (outgoing, from_server) = queue(1);
         let (etude, stopping) = (Arc::clone(etude), stopping.clone());
-        let limits = service::flags(&["--slow-reader-timeout", "1h"]).stream_limits();
+        let limits = flags(&["--slow-reader-timeout", "1h"]).stream_limits();
         let running = tokio::spawn(async move {
             let there = std::future::pending();
             etude::stream::run(&etude, CLIENT, limits, &mut incoming, &outgoing, &stopping, there).await

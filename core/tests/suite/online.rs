@@ -1,17 +1,13 @@
 //! The mapping in the making, against its definition.
 
-#![expect(clippy::unwrap_used, clippy::cast_possible_truncation, clippy::too_many_lines, reason = "tests are small")]
-
-mod oracle;
-mod problems;
-
 use std::num::NonZeroU32;
 use std::sync::Arc;
 
+use crate::oracle;
+use crate::problems::{close, example, mapper, problem};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
 use etude_core::mapping::{CommittedStep, Mapper, Mapping, OnlineMapping, Policy, Request, Stamp, Status, StoppedBy};
-use problems::{close, example, mapper, problem};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 

@@ -1,7 +1,5 @@
 //! Spawns the whole application on a free port, with a database of its own.
 
-#![allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its part of this module")]
-
 use std::net::SocketAddr;
 use std::path::Path;
 

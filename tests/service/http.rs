@@ -1,16 +1,12 @@
 //! The HTTP contract, from outside.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod service;
-
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpStream};
 
+use crate::harness::service::{Service, answer, example};
 use reqwest::Method;
 use reqwest::header::{ALLOW, CONTENT_TYPE, LOCATION, RETRY_AFTER};
 use serde_json::{Value, json};
-use service::{Service, answer, example};
 
 fn corridor() -> Value {
     json!({
@@ -162,7 +158,7 @@ async fn the_same_request_gives_the_same_bytes_before_and_after_a_restart() {
     assert_eq!(comparable(first.clone()), comparable(restarted));
     assert_eq!(service.get(&format!("/v1/policies/{}", first["id"].as_str().unwrap())).await.1, first);
     // The same text is what `etude map` prints, in a release build too: see .ci/run.
-    let expected = include_str!("../examples/figure-4/policy.json");
+    let expected = include_str!("../../examples/figure-4/policy.json");
     let expected: Value = serde_json::from_str(expected).unwrap();
     assert_eq!(comparable(first), comparable(expected));
 }

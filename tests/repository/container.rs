@@ -1,7 +1,5 @@
 //! The container is built from all that the program includes, without building one.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Component, Path, PathBuf};

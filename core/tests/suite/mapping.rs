@@ -1,17 +1,9 @@
 //! The mapping against the independent solver and the published figures.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::too_many_lines,
-    clippy::cast_possible_truncation,
-    reason = "tests may panic, and are read top to bottom"
-)]
-
-mod oracle;
-mod problems;
-
 use std::collections::HashMap;
 
+use crate::oracle;
+use crate::problems::{cave, close, example, mapper, mapper_within, problem, solve, walked};
 use etude_core::attribute::Scalar;
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
@@ -19,7 +11,6 @@ use etude_core::mapping::{
     Budget, Grouping, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status, StoppedBy,
 };
 use etude_core::model::Limits;
-use problems::{cave, close, example, mapper, problem, solve, walked};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
@@ -406,7 +397,7 @@ fn a_search_takes_as_much_memory_as_its_problem_is_large_and_its_budget_at_most(
         let [small, large] = [16, 500].map(|n_observations| bytes(&figure_4, n_observations, heuristic));
         assert!(small < large && large < 100 << 20, "{heuristic}: {small} and {large}");
     }
-    let lazy = problems::mapper_within(Limits { max_states: 0, ..Limits::DEFAULT }, &model);
+    let lazy = mapper_within(Limits { max_states: 0, ..Limits::DEFAULT }, &model);
     assert_eq!(bytes(&lazy, 16, "default"), Budget::DEFAULT.max_bytes);
 }
 

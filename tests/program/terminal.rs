@@ -1,7 +1,5 @@
 //! `etude stream` on a terminal, where a progress line stands below the steps, and in a pipe, where none does.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
 use std::fs::File;
 use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
@@ -106,7 +104,7 @@ fn stream(output: impl Into<Stdio>, errors: impl Into<Stdio>) -> (Child, ChildSt
 
 #[test]
 fn a_terminal_has_a_progress_line_below_the_steps_and_a_pipe_has_the_same_steps_alone() {
-    let demonstration = include_str!("../examples/figure-4/demonstration.json");
+    let demonstration = include_str!("../../examples/figure-4/demonstration.json");
     let observations: Vec<Value> = serde_json::from_str(demonstration).unwrap();
 
     let (child, mut input) = stream(Stdio::piped(), Stdio::piped());

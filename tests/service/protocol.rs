@@ -1,18 +1,14 @@
 //! The transcript in the description of the stream protocol, replayed.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
-mod service;
-
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use crate::harness::service::Service;
 use futures_util::{SinkExt, StreamExt};
 use serde_json::{Value, json};
-use service::Service;
 use tokio_tungstenite::tungstenite::Message;
 
-const PAGE: &str = include_str!("../src/stream/protocol.md");
+const PAGE: &str = include_str!("../../src/stream/protocol.md");
 
 const PATIENCE: Duration = Duration::from_secs(30);
 

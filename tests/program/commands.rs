@@ -1,7 +1,5 @@
 //! The program itself: its commands, its output, its signals.
 
-#![expect(clippy::unwrap_used, reason = "tests may panic")]
-
 use std::io::{BufRead, BufReader, Write};
 use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
@@ -25,7 +23,7 @@ fn text(bytes: &[u8]) -> &str {
 #[test]
 fn the_committed_description_is_the_one_that_the_code_gives() {
     let generated = run(&["openapi"]);
-    let committed = include_str!("../openapi.yaml");
+    let committed = include_str!("../../openapi.yaml");
     assert!(
         text(&generated.stdout) == committed,
         "run `cargo run -- openapi > openapi.yaml` and review the difference"
@@ -71,7 +69,7 @@ fn map_reads_standard_input_and_bounds_its_search() {
     let bounded = ["--heuristic", "none", "--max-expansions", "10"];
     let mut child =
         etude(&[&arguments[..], &bounded].concat()).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
-    let demonstration = include_bytes!("../examples/figure-4/demonstration.json");
+    let demonstration = include_bytes!("../../examples/figure-4/demonstration.json");
     child.stdin.take().unwrap().write_all(demonstration).unwrap();
     let policy: Value = serde_json::from_slice(&child.wait_with_output().unwrap().stdout).unwrap();
     assert_eq!((&policy["status"], &policy["search"]["expanded"]), (&"bounded".into(), &10.into()));
@@ -220,7 +218,8 @@ impl Streaming {
 }
 
 fn demonstration() -> Vec<String> {
-    let demonstration: Value = serde_json::from_str(include_str!("../examples/figure-4/demonstration.json")).unwrap();
+    let demonstration: Value =
+        serde_json::from_str(include_str!("../../examples/figure-4/demonstration.json")).unwrap();
     demonstration.as_array().unwrap().iter().map(Value::to_string).collect()
 }
 

@@ -1,7 +1,5 @@
 //! A service in a process of its own.
 
-#![allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its part of this module")]
-
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};

@@ -1,0 +1,13 @@
+//! The program as a process: its commands, its signals, kills, disks and terminals.
+
+#![expect(clippy::unwrap_used, reason = "tests may panic")]
+
+#[path = "../harness/mod.rs"]
+mod harness;
+
+mod commands;
+mod disk;
+mod kill_rewards;
+mod kill_streams;
+mod signals;
+mod terminal;

@@ -1,0 +1,26 @@
+//! The service, in the process of the tests, mostly over HTTP.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::too_many_lines,
+    clippy::cast_possible_truncation,
+    reason = "tests may panic, and are read top to bottom"
+)]
+
+#[path = "../harness/mod.rs"]
+mod harness;
+#[path = "../../core/tests/suite/oracle/mod.rs"]
+mod oracle;
+#[path = "../../core/tests/suite/problems.rs"]
+mod problems;
+
+mod batch;
+mod front;
+mod http;
+mod learning;
+mod limits;
+mod protocol;
+mod stored_policies;
+mod stream;
+mod trials;
+mod uploads;
