@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{Budget, Grouping, HeuristicName, Mapper, Request, StoppedBy};
+use etude_core::mapping::{Budget, HeuristicName, Mapper, Request, StoppedBy};
 use etude_core::model::Limits;
 use problems::{mapper, mapper_within};
 use serde_json::{Value, json};
@@ -70,7 +70,6 @@ struct Case {
     mapper: Mapper,
     request: Value,
     heuristic: HeuristicName,
-    grouping: Grouping,
     max_expansions: u64,
 }
 
@@ -83,8 +82,8 @@ fn case((model, demonstration): (Value, Value)) -> Case {
 
 fn case_of(mapper: Mapper, demonstration: &Value) -> Case {
     let request = json!({"model": "m", "demonstration": demonstration});
-    let (heuristic, grouping) = (HeuristicName::Default, Grouping::WhenItPays);
-    Case { mapper, request, heuristic, grouping, max_expansions: u64::MAX }
+    let heuristic = HeuristicName::Default;
+    Case { mapper, request, heuristic, max_expansions: u64::MAX }
 }
 
 const MEMORY: Option<StoppedBy> = Some(StoppedBy::Memory);
@@ -98,7 +97,6 @@ const CASES: &[Named] = &[
     ),
     ("sweep", || case(belt(100, 2000)), &[(8, None), (32, None)]),
     ("layered", || case(belt(60, 100)), &[(1, None), (8, None)]),
-    ("groups", || Case { grouping: Grouping::Widest, ..case(cave(16, 5, 60)) }, &[(8, None), (24, None), (128, None)]),
     (
         "without heuristic",
         || Case { heuristic: HeuristicName::None, ..case(belt(400, 1000)) },
@@ -135,13 +133,12 @@ fn resident(name: &str) -> usize {
 
 /// Solves a case within a budget, and gives what it was stopped by, and what it took of the memory at most, in bytes.
 fn measure(case: Case, max_bytes: usize) -> (Option<StoppedBy>, usize) {
-    let Case { mapper, request, heuristic, grouping, max_expansions } = case;
+    let Case { mapper, request, heuristic, max_expansions } = case;
     let mapper = Arc::new(mapper);
     let mut faults = Faults::default();
     let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
     let mut request = Request::read(mapper.model(), &object, &mut faults).unwrap();
     request.settings.heuristic = heuristic;
-    request.settings.grouping = grouping;
     request.settings.budget = Budget { max_expansions, max_bytes };
     // From here on, the peak is counted anew.
     fs::write("/proc/self/clear_refs", "5").unwrap();

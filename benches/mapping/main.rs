@@ -1,5 +1,5 @@
 //! The mapping against its peers on the same problems, in one run: `cargo bench --bench mapping [-- part ..]`, where a part is `peers`,
-//! `growth`, `deadline`, `limit` or `instructions`; all if none is named.
+//! `large`, `growth`, `deadline`, `limit` or `instructions`; all if none is named.
 //!
 //! Every solver is given the problem ready: models are compiled, and terms of distances are tabulated by observation and value,
 //! for the peers too. Rounds are interleaved, so that a machine that slows down slows all of them down; in each, a solver
@@ -11,9 +11,12 @@
 #![expect(clippy::cast_precision_loss, reason = "counts and costs here are far below 2^52")]
 
 mod deadline;
+mod grid;
 mod growth;
 mod instructions;
+mod large;
 mod limit;
+mod logistics;
 mod peers;
 mod table;
 #[path = "../worlds/mod.rs"]
@@ -23,7 +26,7 @@ use std::time::{Duration, Instant};
 
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{Grouping, HeuristicName, Mapper, Problem, Request, Settings};
+use etude_core::mapping::{HeuristicName, Mapper, Problem, Request, Settings};
 use etude_core::model::{Definition, Limits, Model};
 use peers::{Peer, Solved};
 use serde_json::json;
@@ -48,6 +51,9 @@ fn main() {
         ] {
             compare(&world);
         }
+    }
+    if is_wanted("large") {
+        large::measure();
     }
     if is_wanted("growth") {
         growth::measure();
@@ -98,8 +104,8 @@ fn compare(world: &World) {
         problem.demonstration().len(),
     );
 
-    let etude = |heuristic, grouping| {
-        let settings = Settings { heuristic, grouping, ..Settings::default() };
+    let etude = |heuristic| {
+        let settings = Settings { heuristic, ..Settings::default() };
         move || {
             let mapping = mapper.map(problem, settings, &mut Uninterrupted).expect("nothing interrupts");
             Solved { cost: mapping.cost.total, n_expanded: mapping.n_expanded, n_steps: Some(mapping.moves.len()) }
@@ -107,9 +113,8 @@ fn compare(world: &World) {
     };
     let bound = mapper.lower_bounds(problem);
     let solvers: Vec<(&str, Solver<'_>)> = vec![
-        ("etude", Box::new(etude(HeuristicName::Default, Grouping::WhenItPays))),
-        ("etude, widest groups", Box::new(etude(HeuristicName::Default, Grouping::Widest))),
-        ("etude, no heuristic", Box::new(etude(HeuristicName::None, Grouping::WhenItPays))),
+        ("etude", Box::new(etude(HeuristicName::Default))),
+        ("etude, no heuristic", Box::new(etude(HeuristicName::None))),
         ("pathfinding A*, paper's", Box::new(|| peer.pathfinding(|node| peer.paper(node)))),
         ("pathfinding A*, ours", Box::new(|| peer.pathfinding(|(i, state)| peers::micro_floor(bound(i, state))))),
         ("pathfinding A*, none", Box::new(|| peer.pathfinding(|_| 0))),

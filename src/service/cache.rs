@@ -122,7 +122,7 @@ mod tests {
     use super::*;
     use etude_core::document::{Faults, Place};
     use etude_core::interrupt::Uninterrupted;
-    use etude_core::mapping::{Grouping, Request, Settings};
+    use etude_core::mapping::{Request, Settings};
     use etude_core::model::{Definition, Limits, Model};
 
     fn mapper(side: u32) -> Arc<Mapper> {
@@ -169,9 +169,8 @@ mod tests {
         let mut faults = Faults::default();
         let object = Place::root(&object).object(&Request::FIELDS, &mut faults).unwrap();
         let request = Request::read(growing.model(), &object, &mut faults).unwrap();
-        let settings = Settings { grouping: Grouping::Widest, ..Settings::default() };
-        growing.map(&request.problem, settings, &mut Uninterrupted).unwrap();
-        assert!(growing.size_bytes() > size_bytes, "groups of attributes were made");
+        growing.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap();
+        assert!(growing.size_bytes() > size_bytes, "what it searched with is kept");
         for name in ["other", "growing", "other", "another", "other"] {
             cache.insert(&key(name), &other);
             assert!(cache.cache.weight() <= cache.cache.capacity(), "{}", cache.cache.weight());

@@ -52,7 +52,7 @@ mod written;
 pub use cost::Cost;
 pub use demonstration::Demonstration;
 pub use demonstration::WellFormed;
-pub use heuristic::{Grouping, HeuristicName};
+pub use heuristic::HeuristicName;
 pub use mapper::{Budget, Mapper, Mapping, Settings, Status, StoppedBy};
 pub(crate) use online::longest_lookahead;
 pub use online::{CommittedStep, OnlineMapping, Stopped};

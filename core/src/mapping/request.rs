@@ -8,8 +8,8 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::{
-    Budget, Demonstration, Grouping, HeuristicName, Mapper, Mapping, Move, MoveKind, OnlineMapping, Policy, Problem,
-    Settings, Stopped, StoppedBy, longest_lookahead,
+    Budget, Demonstration, HeuristicName, Mapper, Mapping, Move, MoveKind, OnlineMapping, Policy, Problem, Settings,
+    Stopped, StoppedBy, longest_lookahead,
 };
 use crate::attribute::{Scalar, Weights};
 use crate::document::{Faults, Object, Place};
@@ -228,7 +228,7 @@ impl<'m> Request<'m> {
             None => Some(None),
         };
         let budget = Budget { max_expansions: max_expansions?, ..Budget::DEFAULT };
-        let settings = Settings { heuristic: heuristic?, budget, upper_bound: None, grouping: Grouping::default() };
+        let settings = Settings { heuristic: heuristic?, budget, upper_bound: None };
         Some(Options { settings, lookahead: lookahead?, deadline: deadline? })
     }
 }

@@ -7,22 +7,10 @@ use crate::problems::{cave, close, example, mapper, mapper_within, problem, solv
 use etude_core::attribute::Scalar;
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
-use etude_core::mapping::{
-    Budget, Grouping, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status, StoppedBy,
-};
+use etude_core::mapping::{Budget, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status, StoppedBy};
 use etude_core::model::Limits;
 use proptest::prelude::*;
 use serde_json::{Value, json};
-
-fn solve_grouped(mapper: &Mapper, request: &Value, grouping: Grouping) -> Policy {
-    let mut faults = Faults::default();
-    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
-    let read = Request::read(mapper.model(), &object, &mut faults);
-    let request = faults.check(read).unwrap();
-    let settings = Settings { grouping, ..request.settings };
-    let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
-    Policy::new(Stamp::default(), &request.problem, &mapping)
-}
 
 /// Checks everything that a policy promises about itself, against the model's JSON (`table` dynamics).
 fn check_policy(model: &Value, demonstration: &Value, weights: &Value, policy: &Policy) {
@@ -91,13 +79,12 @@ proptest! {
     fn costs_equal_the_independent_solvers((model, demonstration, weights, start) in problem()) {
         let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
         let mapper = mapper(&model);
-        let searches = [("default", Grouping::WhenItPays), ("default", Grouping::Widest), ("none", Grouping::WhenItPays)];
-        for (heuristic, grouping) in searches {
+        for heuristic in ["default", "none"] {
             let request = json!({
                 "model": "m", "demonstration": demonstration, "weights": weights, "start": start, "heuristic": heuristic,
             });
-            let policy = solve_grouped(&mapper, &request, grouping);
-            prop_assert!(close(policy.cost.total, optimum), "{heuristic}, {grouping:?}: {} against {optimum}", policy.cost.total);
+            let policy = solve(&mapper, &request);
+            prop_assert!(close(policy.cost.total, optimum), "{heuristic}: {} against {optimum}", policy.cost.total);
             prop_assert_eq!(policy.status, Status::Optimal);
             check_policy(&model, &demonstration, &weights, &policy);
         }
@@ -108,7 +95,6 @@ proptest! {
         (model, demonstration, weights, start) in problem(),
         max_expansions in 0u64..12,
         heuristic in prop_oneof![Just("default"), Just("none"), Just("paper")],
-        grouping in prop_oneof![Just(Grouping::WhenItPays), Just(Grouping::Widest)],
     ) {
         let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
         let mapper = mapper(&model);
@@ -116,7 +102,7 @@ proptest! {
             "model": "m", "demonstration": demonstration, "weights": weights, "start": start,
             "heuristic": heuristic, "max_expansions": max_expansions,
         });
-        let policy = solve_grouped(&mapper, &request, grouping);
+        let policy = solve(&mapper, &request);
         check_policy(&model, &demonstration, &weights, &policy);
         let bound = policy.lower_bound.unwrap();
         prop_assert!(bound <= optimum + 1e-9 * (1.0 + optimum), "bound {bound} above the optimum {optimum}");
@@ -144,13 +130,10 @@ proptest! {
 
         let demonstration = walked(&model, &walk);
         let optimum = oracle::optimal_cost(&table, &demonstration, &json!({}), None);
-        for grouping in [Grouping::WhenItPays, Grouping::Widest] {
-            let request = json!({"model": "m", "demonstration": demonstration});
-            let policy = solve_grouped(&cave_mapper, &request, grouping);
-            prop_assert!(close(policy.cost.total, optimum), "{grouping:?}: {} against {optimum}", policy.cost.total);
-            prop_assert_eq!(policy.status, Status::Optimal);
-            check_policy(&table, &demonstration, &json!({}), &policy);
-        }
+        let policy = solve(&cave_mapper, &json!({"model": "m", "demonstration": demonstration}));
+        prop_assert!(close(policy.cost.total, optimum), "{} against {optimum}", policy.cost.total);
+        prop_assert_eq!(policy.status, Status::Optimal);
+        check_policy(&table, &demonstration, &json!({}), &policy);
     }
 }
 
@@ -223,23 +206,13 @@ fn figure_4_goes_around_the_wumpus_and_takes_the_gold() {
 }
 
 #[test]
-fn projecting_attributes_together_takes_fewer_expansions() {
-    let mapper = mapper(&example("figure-4/model.json"));
-    let request = json!({"model": "m", "demonstration": example("figure-4/demonstration.json")});
-    let [singly, together] = [Grouping::WhenItPays, Grouping::Widest].map(|g| solve_grouped(&mapper, &request, g));
-    assert_eq!(singly.cost, together.cost);
-    let [singly, together] = [singly, together].map(|policy| policy.search.expanded);
-    assert!(together * 3 < singly, "{together} against {singly} expansions");
-}
-
-#[test]
-fn a_search_is_cut_short_while_it_projects_attributes_together() {
+fn a_long_search_is_cut_short_wherever_it_is() {
     let request = long_request(2_000, &json!({}));
     let mapper = mapper(&example("figure-4/model.json"));
     let mut faults = Faults::default();
     let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
     let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
-    let settings = Settings { grouping: Grouping::Widest, ..request.settings };
+    let settings = request.settings;
     let map_until = |n: u32, signal: Signal| {
         let mut n_polls = 0;
         let mut interrupt = || {
@@ -406,11 +379,11 @@ fn what_a_mapper_keeps_of_searches_counts_and_can_be_released() {
     let mapper = mapper(&example("figure-4/model.json"));
     let request = long_request(200, &json!({}));
     let at_first = mapper.size_bytes();
-    let policy = solve_grouped(&mapper, &request, Grouping::Widest);
+    let policy = solve(&mapper, &request);
     assert!(mapper.size_bytes() > 2 * at_first, "{} and {at_first}", mapper.size_bytes());
     mapper.release();
     assert_eq!(mapper.size_bytes(), at_first);
-    assert_eq!(solve_grouped(&mapper, &request, Grouping::Widest).search.expanded, policy.search.expanded);
+    assert_eq!(solve(&mapper, &request).search.expanded, policy.search.expanded);
 }
 
 #[test]

@@ -1,70 +1,52 @@
-//! How the costs of actions are shared among groups, and the ways between a group's classes at these costs.
+//! What ways between the values of an attribute cost, where the costs of actions are shared among the attributes that change.
 
+use super::projection::{Projection, Projections, ValueIdx};
 use crate::mapping::Problem;
-use crate::mapping::backward::Price;
-use crate::mapping::heuristic::projection::{ClassIdx, Group, ProjectedEdge, Projections};
 use crate::model::Rows;
 
-/// How the costs of actions are divided, as one group sees it.
-pub(super) struct Parts<'p> {
-    problem: &'p Problem<'p>,
-    /// By kind of edge: what the action's cost is divided by.
-    divisors: Vec<f64>,
-}
-
-impl<'p> Parts<'p> {
-    /// As the group of the attributes at `positions` sees it. `used` tells which groups of a single attribute have tables.
-    ///
-    /// Each attribute that a transition changes, of those with tables, pays the same part of the action's cost, and a group pays
-    /// for its attributes. Where none of these changes, the first group of the partition that does pays all.
-    pub(super) fn new(projections: &Projections, problem: &'p Problem<'p>, used: &[bool], positions: &[usize]) -> Self {
-        let is_used = |number: &&u16| used[usize::from(**number)];
-        let is_own = |number: &&u16| {
-            let position = projections.groups()[usize::from(**number)].positions().next();
-            position.is_some_and(|position| positions.contains(&position))
-        };
-        let divisors = projections.change_sets().iter().flat_map(|set| {
-            let (mut n_all, mut n_own) = (0u32, 0u32);
-            for number in set.iter().filter(is_used) {
-                n_all += 1;
-                n_own += u32::from(is_own(&number));
-            }
-            if n_all == 0 { [f64::INFINITY, 1.0] } else { [f64::from(n_all) / f64::from(n_own); 2] }
-        });
-        Self { problem, divisors: divisors.collect() }
-    }
-
-    /// What an edge costs, if its transition costs `more` than the action.
-    #[inline]
-    pub(super) fn of(&self, edge: &ProjectedEdge, more: f64) -> f64 {
-        (self.problem.model.action(edge.action).cost + more) / self.divisors[edge.kind as usize]
-    }
-}
-
-/// The ways between classes, by where they lead or where they come from, the cheapest of each pair.
+/// The ways into each value of an attribute, of each pair of values the cheapest.
 #[derive(Debug)]
-pub(super) struct Ways(Rows<Way>);
+pub(super) struct SharedWays(Rows<SharedWay>);
 
-/// The way to or from a class.
+/// A way from a value.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Way {
-    pub(super) class: ClassIdx,
-    /// The least share of those that there are, and the least part, which may be of different ones.
-    pub(super) price: Price,
+pub(super) struct SharedWay {
+    pub(super) from: ValueIdx,
+    /// The attribute's share of the action's cost: the least of all ways between the two values.
+    pub(super) share: f64,
+    /// Which part of the least distance it pays if the action is extra: the least of all ways, which may be another one's.
+    pub(super) part: f64,
 }
 
-impl Ways {
-    /// The ways into each class, with where they come from.
-    pub(super) fn into_classes(group: &Group, parts: &Parts<'_>) -> Self {
-        let mut ways = group.edges().map(|edge| {
-            let part = 1.0 / parts.divisors[edge.kind as usize];
-            Way { class: edge.from, price: Price { share: parts.of(edge, 0.0), part } }
+impl SharedWay {
+    /// What the attribute pays of an extra action, where `least_distance` is paid in all.
+    #[inline]
+    pub(super) fn of_extra(self, least_distance: f64) -> f64 {
+        self.share + self.part * least_distance
+    }
+}
+
+impl SharedWays {
+    /// The ways of `projection`. Each attribute that a transition changes, of those with tables, pays the same part; `used` tells which
+    /// have tables, and this one must.
+    pub(super) fn new(
+        projections: &Projections,
+        projection: &Projection,
+        problem: &Problem<'_>,
+        used: &[bool],
+    ) -> Self {
+        let n_sharing = |set: &Vec<u16>| set.iter().map(|number| u32::from(used[usize::from(*number)])).sum::<u32>();
+        let n_sharing: Vec<f64> = projections.change_sets().iter().map(|set| f64::from(n_sharing(set))).collect();
+        let mut ways = projection.edges.map(|edge| {
+            let n_sharing = n_sharing[edge.change_set as usize];
+            let share = problem.model.action(edge.action).cost / n_sharing;
+            SharedWay { from: edge.from, share, part: 1.0 / n_sharing }
         });
         ways.dedup(|way, other| {
-            let is_same = way.class == other.class;
+            let is_same = way.from == other.from;
             if is_same {
-                way.price.share = way.price.share.min(other.price.share);
-                way.price.part = way.price.part.min(other.price.part);
+                way.share = way.share.min(other.share);
+                way.part = way.part.min(other.part);
             }
             is_same
         });
@@ -72,29 +54,9 @@ impl Ways {
         Self(ways)
     }
 
-    /// The same ways, by where they come from.
-    pub(super) fn reversed(&self) -> Self {
-        let ways = self
-            .0
-            .iter()
-            .zip(0..)
-            .flat_map(|(ways, to)| ways.iter().map(move |way| (way.class, Way { class: to, ..*way })));
-        Self(Rows::of_entries(self.0.n_rows(), ways))
-    }
-
     #[inline]
-    pub(super) fn of(&self, class: usize) -> &[Way] {
-        self.0.of(class)
-    }
-
-    /// The ways of one class after the other.
-    pub(super) fn iter(&self) -> impl Iterator<Item = &[Way]> {
-        self.0.iter()
-    }
-
-    /// How many there are.
-    pub(super) fn len(&self) -> usize {
-        self.0.n_items()
+    pub(super) fn into_value(&self, value: usize) -> &[SharedWay] {
+        self.0.of(value)
     }
 
     /// Size in memory, in bytes.

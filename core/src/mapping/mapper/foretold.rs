@@ -1,6 +1,6 @@
 //! How much memory a search will take at most.
 
-use super::{Grouping, HeuristicName, Mapper, Settings, way_bytes};
+use super::{HeuristicName, Mapper, Settings, way_bytes};
 use crate::mapping::Problem;
 use crate::mapping::heuristic::projected::{self, TableRoom};
 use crate::mapping::search::{astar, best_first, layered, sweep};
@@ -15,7 +15,7 @@ impl Mapper {
     #[must_use]
     pub fn search_bytes(&self, problem: &Problem<'_>, settings: Settings) -> usize {
         self.check(problem);
-        let Settings { heuristic, budget, grouping, .. } = settings;
+        let Settings { heuristic, budget, .. } = settings;
         let model = &*self.model;
         if model.is_lazy() {
             return budget.max_bytes;
@@ -24,8 +24,7 @@ impl Mapper {
         let n_nodes = model.graph().n_states().saturating_mul(n_observations);
         let (tables, are_all_in_columns) =
             projected::most_bytes(&self.projections, problem, TableRoom::within(budget.max_bytes));
-        let is_layered = grouping == Grouping::WhenItPays
-            && are_all_in_columns
+        let is_layered = are_all_in_columns
             && n_nodes <= self.patience.max_layered_nodes
             && layered::is_within(budget, model, n_nodes);
         let n_bytes = match heuristic {

@@ -17,7 +17,7 @@ use super::cost::{Cost, ROUNDING, SLACK, cost_of};
 use super::heuristic::paper::Paper;
 use super::heuristic::projected::{self, Projected, TableRoom};
 use super::heuristic::projection::Projections;
-use super::heuristic::{Blind, Grouping, Heuristic, HeuristicName};
+use super::heuristic::{Blind, Heuristic, HeuristicName};
 use super::search::{Found, Move, astar, best_first, layered};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
 use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
@@ -28,8 +28,8 @@ use escalation::Patience;
 pub struct Budget {
     /// Most nodes expanded.
     pub max_expansions: u64,
-    /// About the most memory that it takes, in bytes: for the nodes and states that it finds, for tables of estimates, half of it at most
-    /// before groups of attributes are projected together, and for what these take; for ways and for the mapping. What does not fit is
+    /// About the most memory that it takes, in bytes: for the nodes and states that it finds, for tables of estimates, which take
+    /// half of it at most, for ways and for the mapping. What does not fit is
     /// left out, and when nothing is left, the search ends.
     ///
     /// Not counted are the problem itself, the model, what its mapper [keeps](Mapper::size_bytes) of searches before, and about a
@@ -71,8 +71,6 @@ pub struct Settings {
     /// The cost of a mapping that is known already: nothing that costs more is looked at. If it is below the optimum, the mapping
     /// is bounded by it, unless all nodes had to be looked at. Has no effect with the paper's heuristic.
     pub upper_bound: Option<f64>,
-    /// When the default heuristic projects attributes together.
-    pub grouping: Grouping,
 }
 
 /// What was proven of a mapping.
@@ -226,7 +224,7 @@ impl Mapper {
     }
 
     /// Approximate size in memory, in bytes: that of the model, and of what is kept for searches, which grows with these. Of as many
-    /// searches as ran at the same time, up to 16 MB each are kept; and the groups of attributes that long ones have made.
+    /// searches as ran at the same time, up to 16 MB each are kept.
     #[must_use]
     pub fn size_bytes(&self) -> usize {
         let buffers: usize = self.buffers().iter().map(|(_, buffers)| buffers.size_bytes()).sum();
@@ -236,7 +234,6 @@ impl Mapper {
     /// Gives back what was kept of searches. The next ones take longer, and find the same.
     pub fn release(&self) {
         drop(std::mem::take(&mut *self.buffers()));
-        self.projections.release();
     }
 
     fn buffers(&self) -> MutexGuard<'_, Vec<(ThreadId, Box<Buffers>)>> {
@@ -254,7 +251,7 @@ impl Mapper {
     pub fn lower_bounds<'p>(&'p self, problem: &'p Problem<'p>) -> impl Fn(u32, StateIdx) -> f64 + 'p {
         self.check(problem);
         let room = TableRoom::within(usize::MAX);
-        let solved = self.solve(problem, Grouping::WhenItPays, room, &mut Uninterrupted);
+        let solved = self.solve(problem, room, &mut Uninterrupted);
         let projected = solved.ok().flatten();
         let projected = projected.expect("nothing interrupts");
         move |observation, state| projected.cost_to_go(observation as usize, self.model.states().row(state))
@@ -312,7 +309,7 @@ impl Mapper {
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, space.row(problem.start));
                 let room = TableRoom::within(budget.max_bytes);
-                if let Some(projected) = self.solve(problem, settings.grouping, room, interrupt)? {
+                if let Some(projected) = self.solve(problem, room, interrupt)? {
                     let least_f = first + projected.cost_to_go(0, space.row(problem.start));
                     conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
                 } else {
@@ -333,13 +330,13 @@ impl Mapper {
         most_f: f64,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Mapping>, Cancelled> {
-        let Settings { budget, grouping, .. } = settings;
-        let n_states = if grouping == Grouping::Widest { None } else { space.n_states() };
-        let n_nodes = n_states.map_or(usize::MAX, |n_states| n_states.saturating_mul(problem.demonstration.len()));
+        let budget = settings.budget;
+        let n_nodes =
+            space.n_states().map_or(usize::MAX, |n_states| n_states.saturating_mul(problem.demonstration.len()));
         if n_nodes > self.patience.max_layered_nodes || !layered::is_within(budget, &self.model, n_nodes) {
             return Ok(None);
         }
-        let solved = self.solve(problem, grouping, TableRoom::within(budget.max_bytes), interrupt)?;
+        let solved = self.solve(problem, TableRoom::within(budget.max_bytes), interrupt)?;
         let Some(projected) = solved.filter(Projected::are_all_in_columns) else { return Ok(None) };
         let found = self.with_buffers(budget.max_bytes, |Buffers { layered, .. }| {
             layered::search(problem, &projected, budget, most_f, layered, interrupt)
@@ -351,12 +348,11 @@ impl Mapper {
     fn solve<'p>(
         &'p self,
         problem: &'p Problem<'p>,
-        grouping: Grouping,
         room: TableRoom,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Projected<'p>>, Cancelled> {
         self.with_buffers(room.max_bytes, |Buffers { solving, .. }| {
-            Projected::solve(&self.projections, problem, grouping, room, solving, interrupt)
+            Projected::solve(&self.projections, problem, room, solving, interrupt)
         })
     }
 

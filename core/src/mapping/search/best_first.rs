@@ -6,8 +6,6 @@
 //!    is the new incumbent. When no node is left whose `f` is below the incumbent's cost, that is the optimum.
 //! 3. Should that take long, wider probes look for better incumbents in between: they keep the memory small, and a search
 //!    that runs out of budget has something to show.
-//! 4. Should it take very long, attributes are projected together ([`Projected::deepen`]). All nodes get their better estimates;
-//!    the ways to them that were found stay as they are.
 //!
 //! So the nodes are expanded whose `f` is below the optimum, as A* must (Dechter & Pearl 1985), and those of the probes; but
 //! none of the many whose `f` equals it. As incumbents bound `f`, the open list needs no heap: costs are
@@ -23,7 +21,7 @@ use super::seen::{Estimates, Seen, SeenIdx, Way};
 use super::{End, Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
-use crate::mapping::heuristic::projected::{Deepened, Projected};
+use crate::mapping::heuristic::projected::Projected;
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::{Budget, Problem, StoppedBy};
 use crate::model::{Model, Space};
@@ -87,7 +85,7 @@ impl Open {
 pub(in crate::mapping) fn search<S: Space>(
     problem: &Problem<'_>,
     space: &mut S,
-    projected: &mut Projected<'_>,
+    projected: &Projected<'_>,
     budget: Budget,
     most: f64,
     buffers: &mut Buffers,
@@ -135,7 +133,7 @@ pub(in crate::mapping) fn search<S: Space>(
 struct Search<'s, 'p, S> {
     problem: &'s Problem<'s>,
     space: &'s mut S,
-    projected: &'s mut Projected<'p>,
+    projected: &'s Projected<'p>,
     budget: Budget,
     seen: &'s mut Seen,
     nodes: &'s mut Nodes,
@@ -222,14 +220,7 @@ impl<S: Space> Search<'_, '_, S> {
         let n_layers = self.problem.last() as u64;
         let probe_at = |width: u64| width.saturating_mul(n_layers).saturating_mul(PROBE_SHARE);
         let mut probe_width = PROBE_WIDENING;
-        while self.is_deepening_due() {
-            let end = self.deepen(open)?;
-            if end != End::Done {
-                return Ok(end);
-            }
-        }
         let Some(mut bucketed_limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(OUT_OF_TIME) };
-        let mut help_at = self.projected.deepening_due().min(probe_at(probe_width));
         while let Some(Reached { id, g, f }) = open.buckets.pop() {
             // Of a node that was put in more than once, the cheapest way comes out first.
             if self.nodes.is_closed(id) || f >= self.limit {
@@ -241,15 +232,8 @@ impl<S: Space> Search<'_, '_, S> {
                 Err(stopped_by) => return Ok(End::CutShort(stopped_by)),
             };
             self.expand(id, g, step, ways, |found, _| open.buckets.push(found));
-            if self.n_expanded < help_at && self.limit >= bucketed_limit / 4.0 {
+            if self.n_expanded < probe_at(probe_width) && self.limit >= bucketed_limit / 4.0 {
                 continue;
-            }
-            let is_deepening_due = self.is_deepening_due();
-            if is_deepening_due {
-                let end = self.deepen(open)?;
-                if end != End::Done {
-                    return Ok(end);
-                }
             }
             let is_probe_due = self.n_expanded >= probe_at(probe_width);
             if is_probe_due {
@@ -259,36 +243,13 @@ impl<S: Space> Search<'_, '_, S> {
                     return Ok(end);
                 }
             }
-            // What a probe found is not in the buckets, and better estimates are for others; and those for a much higher limit
-            // are too wide.
-            if is_deepening_due || is_probe_due || self.limit < bucketed_limit / 4.0 {
+            // What a probe found is not in the buckets, and those for a much higher limit are too wide.
+            if is_probe_due || self.limit < bucketed_limit / 4.0 {
                 let Some(limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(OUT_OF_TIME) };
                 bucketed_limit = limit;
-                help_at = self.projected.deepening_due().min(probe_at(probe_width));
             }
         }
         Ok(End::Done)
-    }
-
-    /// Whether better estimates are worth a try. They are for what is cheaper than a known mapping; until there is one, a
-    /// completion may need the estimates of all nodes.
-    fn is_deepening_due(&self) -> bool {
-        self.n_expanded >= self.projected.deepening_due() && self.incumbent.is_some()
-    }
-
-    /// Has better estimates made, if there are any, and gives them to all nodes.
-    #[cold]
-    fn deepen(&mut self, open: &mut Open) -> Result<End, Cancelled> {
-        let max_bytes = self.left_bytes(&open.buckets);
-        match self.projected.deepen(self.limit, self.n_expanded, max_bytes, &mut self.meter)? {
-            Deepened::CutShort => return Ok(OUT_OF_TIME),
-            Deepened::No => return Ok(End::Done),
-            Deepened::Yes => {}
-        }
-        let Self { nodes, seen, projected, space, .. } = self;
-        let estimates = Estimates { seen, projected, space: &**space };
-        nodes.estimate_again(|Step { state, observation, .. }| estimates.of(state, observation));
-        self.probe(1, open)
     }
 
     /// Puts all open nodes into the buckets, and gives the limit that these are for; `None` if there is no time for it.
@@ -357,10 +318,10 @@ impl<S: Space> Search<'_, '_, S> {
         }
     }
 
-    /// How much memory this takes, in bytes, with what better estimates take, without the states that were found.
+    /// How much memory this takes, in bytes, without the states that were found.
     fn size_bytes(&self, buckets: &Buckets) -> usize {
         let nodes = self.nodes.size_bytes(self.seen.n_states());
-        nodes + self.seen.size_bytes() + buckets.size_bytes() + self.projected.deepened_bytes()
+        nodes + self.seen.size_bytes() + buckets.size_bytes()
     }
 
     /// How much memory is left.

@@ -205,19 +205,6 @@ impl Nodes {
         self.marks[block][in_block] |= CLOSED;
     }
 
-    /// Takes new estimates of all nodes.
-    pub(super) fn estimate_again(&mut self, mut estimate: impl FnMut(Step) -> Estimate) {
-        #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
-        for id in 0..self.marks.as_flattened().len() as NodeId {
-            let (block, in_block) = split(id);
-            if self.marks[block][in_block] & FOUND != 0 {
-                self.estimates[block][in_block] = estimate(self.step(id));
-            } else {
-                self.marks[block][in_block] = 0;
-            }
-        }
-    }
-
     /// Looks for the block of a node.
     #[inline]
     pub(super) fn find(&self, state: SeenIdx, observation: u32) -> Place {

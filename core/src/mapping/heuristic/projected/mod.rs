@@ -1,24 +1,19 @@
 //! Projections solved for one demonstration: tables of distances and exact costs-to-go.
 
-mod deepening;
 mod table;
 
 use std::collections::BinaryHeap;
 use std::ops::AddAssign;
 
-pub(in crate::mapping) use deepening::Deepened;
 pub(in crate::mapping) use table::CHUNK_LEN;
-pub(super) use table::Table;
-use table::stride_for;
+use table::{Table, stride_for};
 
-use super::joint::Joint;
-use super::projection::{Group, Projections};
-use super::shares::{Parts, Way, Ways};
-use super::{Grouping, Heuristic};
+use super::Heuristic;
+use super::projection::{Projection, Projections};
+use super::shares::{SharedWay, SharedWays};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::Problem;
 use crate::mapping::open_list::CheapestFirst;
-use deepening::Deepening;
 
 /// What a node `(i, s)` costs: what is paid on arriving, and what must still be paid after.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -37,15 +32,15 @@ impl AddAssign for Estimate {
     }
 }
 
-/// The distances and the costs-to-go of one problem, tabulated by observation and class of each group.
+/// The distances and the costs-to-go of one problem, tabulated by observation and value of each attribute.
 ///
-/// Both are sums over the groups. Those of single attributes have their tables side by side in memory, and an estimate takes
-/// one look into each. Groups of several attributes have tables of their own once the estimates were deepened.
+/// Both are sums over the attributes, whose tables lie side by side in memory: an estimate takes one look into each. A value's number in
+/// all tables together is its *class*.
 #[derive(Debug)]
 pub(crate) struct Projected<'p> {
     problem: &'p Problem<'p>,
     columns: Vec<Column<'p>>,
-    /// The groups' classes, one group after the other.
+    /// By class, one attribute after the other.
     table: Table<Estimate>,
     /// What the columns come to that no action changes. Shape `[n_observations]`, with room for whole chunks.
     unchanged: Vec<Estimate>,
@@ -59,22 +54,14 @@ pub(crate) struct Projected<'p> {
     least_distances: Vec<f64>,
     /// The least term of each column. Shape `[n_observations, n_columns]`.
     least_terms: Vec<f64>,
-    /// The tables of groups of several attributes. The columns of these have no costs-to-go of their own any more.
-    joint: Vec<Joint>,
-    /// What deeper estimates are made of; `None` if there can be none.
-    deepening: Option<Deepening<'p>>,
 }
 
-/// A group with a table.
+/// An attribute with a table.
 #[derive(Clone, Copy, Debug)]
 struct Column<'p> {
-    group: &'p Group,
-    /// The attribute's.
-    position: usize,
+    projection: &'p Projection,
     /// Where its values begin in the table.
     offset: usize,
-    /// Whether its costs-to-go are in the table of a group of several attributes.
-    is_joined: bool,
 }
 
 /// A column of an attribute that actions change.
@@ -97,9 +84,9 @@ impl ChangingColumn {
 /// What solving takes besides its result, kept to be used again.
 #[derive(Debug, Default)]
 pub(in crate::mapping) struct Buffers {
-    /// By column, the ways into each class, if they are few,
-    ways: Vec<Ways>,
-    /// where these groups have tables: nothing else that they depend on differs from problem to problem of a model.
+    /// By column, the ways into each value, if they are few.
+    ways: Vec<SharedWays>,
+    /// The projections that have tables with these ways: nothing else that they depend on differs from problem to problem of a model.
     used: Vec<bool>,
     layer: Layer,
 }
@@ -115,21 +102,21 @@ struct Layer {
     open: BinaryHeap<CheapestFirst>,
 }
 
-/// Most edges of all groups with tables whose ways are kept: 1.5 MB. To gather more takes little of the time that their tables take.
+/// Most edges of all projections with tables whose ways are kept: 1.5 MB. To gather more takes little of the time that their tables take.
 const MAX_KEPT_EDGES: usize = 1 << 16;
 
 impl Buffers {
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
         let Layer { least, here, next, open } = &self.layer;
-        self.ways.iter().map(Ways::size_bytes).sum::<usize>()
+        self.ways.iter().map(SharedWays::size_bytes).sum::<usize>()
             + least.capacity() * size_of::<f64>()
             + (here.capacity() + next.capacity()) * size_of::<Estimate>()
             + open.capacity() * size_of::<CheapestFirst>()
     }
 }
 
-/// Most entries of all tables together: 256 MB. Groups that do not fit, the largest, are left out, which keeps the bound a
+/// Most entries of all tables together: 256 MB. Attributes that do not fit, the largest, are left out, which keeps the bound a
 /// bound.
 pub(in crate::mapping) const MAX_ENTRIES: usize = 1 << 24;
 
@@ -143,21 +130,19 @@ impl<'p> Projected<'p> {
     pub(crate) fn solve(
         projections: &'p Projections,
         problem: &'p Problem<'p>,
-        grouping: Grouping,
         room: TableRoom,
         buffers: &mut Buffers,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
         /// How many classes are looked at between two looks at the interrupt: tens of microseconds.
         const POLL_EVERY: u64 = 1 << 11;
-        let (used, n_left_out) = used_groups(projections, problem, room);
+        let (used, n_left_out) = used_projections(projections, problem, room);
         let mut projected = Self { n_left_out, ..Self::blind(problem) };
         let (mut width, n_observations) = (0, problem.demonstration.len());
-        for (group, _) in projections.groups().iter().zip(&used).filter(|(_, is_used)| **is_used) {
-            let Some(position) = group.positions().next() else { continue };
-            projected.columns.push(Column { group, position, offset: width, is_joined: false });
-            width += group.n_classes();
-            projected.untabled.retain(|at| *at != position);
+        for (projection, _) in projections.attributes().iter().zip(&used).filter(|(_, is_used)| **is_used) {
+            projected.columns.push(Column { projection, offset: width });
+            width += projection.n_values;
+            projected.untabled.retain(|at| *at != projection.position);
         }
         projected.table = Table::filled_with(Estimate::default(), width, n_observations);
         projected.least_terms = vec![0.0; n_observations * projected.columns.len()];
@@ -171,10 +156,8 @@ impl<'p> Projected<'p> {
             }
         }
         projected.add_constants();
-        let ways_of = |Column { group, position, .. }: &Column<'_>| {
-            Ways::into_classes(group, &Parts::new(projections, problem, &used, &[*position]))
-        };
-        let n_edges: usize = projected.columns.iter().map(|column| column.group.n_edges()).sum();
+        let ways_of = |column: &Column<'_>| SharedWays::new(projections, column.projection, problem, &used);
+        let n_edges: usize = projected.columns.iter().map(|column| column.projection.edges.n_items()).sum();
         let are_kept = n_edges <= MAX_KEPT_EDGES;
         if are_kept && buffers.used != used {
             buffers.ways = projected.columns.iter().map(ways_of).collect();
@@ -190,7 +173,6 @@ impl<'p> Projected<'p> {
             }
         }
         projected.tell_unchanged();
-        projected.deepening = Some(Deepening::new(projections, problem, used, grouping));
         Ok(Some(projected))
     }
 
@@ -206,24 +188,16 @@ impl<'p> Projected<'p> {
             untabled: untabled.collect(),
             least_distances: Vec::new(),
             least_terms: Vec::new(),
-            joint: Vec::new(),
-            deepening: None,
             n_left_out: 0,
         }
     }
 
-    /// How much memory the tables take, in bytes, but for those that deeper estimates are made of.
+    /// How much memory the tables take, in bytes.
     pub(in crate::mapping) fn size_bytes(&self) -> usize {
         self.table.size_bytes()
             + size_of_val(self.unchanged.as_slice())
             + size_of_val(self.least_distances.as_slice())
             + size_of_val(self.least_terms.as_slice())
-    }
-
-    /// The same of those.
-    pub(in crate::mapping) fn deepened_bytes(&self) -> usize {
-        let forward = self.deepening.as_ref().map_or(0, Deepening::size_bytes);
-        forward + self.joint.iter().map(Joint::size_bytes).sum::<usize>()
     }
 
     /// How many entries the tables would have that were left out, because only few were asked for.
@@ -238,8 +212,8 @@ impl<'p> Projected<'p> {
 
     /// Whether something is said of states with this row: what no action changes is as it is at the start.
     pub(in crate::mapping) fn speaks_of(&self, values: &[u32]) -> bool {
-        let mut unchanging = self.columns.iter().filter(|column| column.group.n_edges() == 0);
-        unchanging.all(|column| values[column.position] == self.problem.start_row[column.position])
+        let mut constant = self.columns.iter().map(|column| column.projection).filter(|own| own.is_constant());
+        constant.all(|own| values[own.position] == self.problem.start_row[own.position])
     }
 
     /// The classes of the state with this row, by their numbers in the table: one of each of the
@@ -252,7 +226,7 @@ impl<'p> Projected<'p> {
     /// Whether that and what is the same for all states is all that an estimate is made of.
     #[inline]
     pub(in crate::mapping) fn are_all_in_columns(&self) -> bool {
-        self.joint.is_empty() && self.untabled.is_empty()
+        self.untabled.is_empty()
     }
 
     /// What the node of a state costs that the start leads to and that is of [these classes](Self::classes). `values` gives its row.
@@ -299,9 +273,6 @@ impl<'p> Projected<'p> {
     #[inline(never)]
     fn others(&self, observation: usize, values: &[u32]) -> Estimate {
         let mut sum = Estimate::default();
-        for table in &self.joint {
-            sum.cost_to_go += table.cost_to_go(observation, values);
-        }
         for position in &self.untabled {
             sum.distance += self.problem.distances.term(*position, observation, values[*position]);
         }
@@ -311,13 +282,14 @@ impl<'p> Projected<'p> {
     /// Writes the terms of a column, and the least of them at each observation. What no action changes stays as it was at the start.
     fn write_terms(&mut self, number: usize, least: &mut Vec<f64>, meter: &mut Meter<'_>) -> Signal {
         let (n_observations, n_columns) = (self.problem.demonstration.len(), self.columns.len());
-        let Column { group, position, offset, .. } = self.columns[number];
+        let Column { projection, offset } = self.columns[number];
+        let position = projection.position;
         let start = self.problem.start_row[position];
-        let is_unchanged = group.n_edges() == 0;
+        let is_unchanged = projection.is_constant();
         let Some(terms) = self.problem.distances.of(position) else { return Signal::Continue };
         least.clear();
         least.resize(n_observations, f64::INFINITY);
-        for value in (0..).take(group.n_classes()) {
+        for value in (0..).take(projection.n_values) {
             match meter.spend(n_observations as u64) {
                 Signal::Continue => {}
                 signal => return signal,
@@ -350,18 +322,19 @@ impl<'p> Projected<'p> {
     fn tell_unchanged(&mut self) {
         self.unchanged.fill(Estimate::default());
         self.changing.clear();
-        for Column { group, position, offset, .. } in &self.columns {
-            if group.n_edges() == 0 {
-                let entries = self.table.of_mut(offset + self.problem.start_row[*position] as usize);
+        for Column { projection, offset } in &self.columns {
+            let position = projection.position;
+            if projection.is_constant() {
+                let entries = self.table.of_mut(offset + self.problem.start_row[position] as usize);
                 self.unchanged.iter_mut().zip(entries).for_each(|(sum, entry)| *sum += *entry);
             } else {
                 #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
-                self.changing.push(ChangingColumn { offset: *offset as u32, position: *position as u32 });
+                self.changing.push(ChangingColumn { offset: *offset as u32, position: position as u32 });
             }
         }
     }
 
-    /// Fills the table of a group: with `N_i(v) = term(i+1, v) + H_{i+1}(v)`, what it costs to be next at class `v`,
+    /// Fills the table of an attribute: with `N_i(v) = term(i+1, v) + H_{i+1}(v)`, what it costs to be next at class `v`,
     ///
     /// ```text
     /// H_n(v) = 0
@@ -374,29 +347,35 @@ impl<'p> Projected<'p> {
     ///
     /// The last line refers to the same observation, so each observation is a pass of Dijkstra's algorithm from those
     /// classes that an extra action improves.
-    fn solve_column(&mut self, number: usize, predecessors: &Ways, layer: &mut Layer, meter: &mut Meter<'_>) -> Signal {
-        let Column { group, offset, .. } = self.columns[number];
-        let n_classes = group.n_classes();
+    fn solve_column(
+        &mut self,
+        number: usize,
+        predecessors: &SharedWays,
+        layer: &mut Layer,
+        meter: &mut Meter<'_>,
+    ) -> Signal {
+        let Column { projection, offset } = self.columns[number];
+        let n_values = projection.n_values;
         let Layer { here, next, open, .. } = layer;
         next.clear();
-        next.extend((0..n_classes).map(|class| self.table.at(offset + class, self.problem.last())));
+        next.extend((0..n_values).map(|value| self.table.at(offset + value, self.problem.last())));
         here.clone_from(next);
         open.clear();
         let (mut here, mut next) = (here.as_mut_slice(), next.as_mut_slice());
         for i in (0..self.problem.last()).rev() {
-            match meter.spend(n_classes as u64) {
+            match meter.spend(n_values as u64) {
                 Signal::Continue => {}
                 signal => return signal,
             }
-            for (class, (here, next)) in here.iter_mut().zip(&*next).enumerate() {
-                here.distance = self.table.at(offset + class, i).distance;
+            for (value, (here, next)) in here.iter_mut().zip(&*next).enumerate() {
+                here.distance = self.table.at(offset + value, i).distance;
                 here.cost_to_go = next.distance + next.cost_to_go;
             }
-            for (class, next) in next.iter().enumerate() {
+            for (value, next) in next.iter().enumerate() {
                 let cost = next.distance + next.cost_to_go;
-                for way in predecessors.of(class) {
-                    let matched = way.price.share + cost;
-                    let known = &mut here[way.class as usize].cost_to_go;
+                for way in predecessors.into_value(value) {
+                    let matched = way.share + cost;
+                    let known = &mut here[way.from as usize].cost_to_go;
                     if matched < *known {
                         *known = matched;
                     }
@@ -404,23 +383,23 @@ impl<'p> Projected<'p> {
             }
             let least = self.least_terms[i * self.columns.len() + number];
             let least_distance = self.least_distances[i];
-            for class in 0..n_classes {
-                let cost = here[class].distance - least + here[class].cost_to_go;
-                relax(predecessors, class, cost, least_distance, here, open);
+            for value in 0..n_values {
+                let cost = here[value].distance - least + here[value].cost_to_go;
+                relax(predecessors, value, cost, least_distance, here, open);
             }
-            while let Some(CheapestFirst { cost, id: class }) = open.pop() {
+            while let Some(CheapestFirst { cost, id: value }) = open.pop() {
                 match meter.spend(1) {
                     Signal::Continue => {}
                     signal => return signal,
                 }
-                let entry = here[class as usize];
+                let entry = here[value as usize];
                 if cost <= entry.cost_to_go {
                     let cost = entry.distance - least + cost;
-                    relax(predecessors, class as usize, cost, least_distance, here, open);
+                    relax(predecessors, value as usize, cost, least_distance, here, open);
                 }
             }
-            for (class, entry) in here.iter().enumerate() {
-                self.table.at_mut(offset + class, i).cost_to_go = entry.cost_to_go;
+            for (value, entry) in here.iter().enumerate() {
+                self.table.at_mut(offset + value, i).cost_to_go = entry.cost_to_go;
             }
             std::mem::swap(&mut here, &mut next);
         }
@@ -428,22 +407,22 @@ impl<'p> Projected<'p> {
     }
 }
 
-/// Offers every class an extra action into `class`, which costs `cost` from its arrival on, without the least distance.
+/// Offers every value an extra action into `value`, which costs `cost` from its arrival on, without the least distance.
 #[inline]
 fn relax(
-    predecessors: &Ways,
-    class: usize,
+    predecessors: &SharedWays,
+    value: usize,
     cost: f64,
     least_distance: f64,
     here: &mut [Estimate],
     open: &mut BinaryHeap<CheapestFirst>,
 ) {
-    for way in predecessors.of(class) {
-        let extra = way.price.of_extra(least_distance) + cost;
-        let known = &mut here[way.class as usize].cost_to_go;
+    for way in predecessors.into_value(value) {
+        let extra = way.of_extra(least_distance) + cost;
+        let known = &mut here[way.from as usize].cost_to_go;
         if extra < *known {
             *known = extra;
-            open.push(CheapestFirst { cost: extra, id: way.class });
+            open.push(CheapestFirst { cost: extra, id: way.from });
         }
     }
 }
@@ -451,9 +430,8 @@ fn relax(
 impl Heuristic for Projected<'_> {
     #[inline]
     fn cost_to_go(&self, observation: usize, row: &[u32]) -> f64 {
-        let joint: f64 = self.joint.iter().map(|table| table.cost_to_go(observation, row)).sum();
-        self.columns.iter().fold(joint, |sum, Column { position, offset, .. }| {
-            sum + self.table.at(offset + row[*position] as usize, observation).cost_to_go
+        self.columns.iter().fold(0.0, |sum, Column { projection, offset }| {
+            sum + self.table.at(offset + row[projection.position] as usize, observation).cost_to_go
         })
     }
 }
@@ -467,16 +445,16 @@ pub(in crate::mapping) fn most_bytes(
 ) -> (usize, bool) {
     /// Two tables; beside each, the least terms take half as much at most.
     const N_TIMES: usize = 3;
-    let (used, _) = used_groups(projections, problem, TableRoom { few: room.most, ..room });
-    let groups = projections.groups().iter().zip(&used).filter(|(_, is_used)| **is_used).map(|(group, _)| group);
+    let (used, _) = used_projections(projections, problem, TableRoom { few: room.most, ..room });
+    let tabled = projections.attributes().iter().zip(&used).filter(|(_, is_used)| **is_used).map(|(own, _)| own);
     let n_observations = problem.demonstration.len();
-    let n_classes: usize = groups.clone().map(Group::n_classes).sum();
+    let n_classes: usize = tabled.clone().map(|own| own.n_values).sum();
     let n_entries = Table::<Estimate>::n_entries_for(n_classes, n_observations);
-    let n_edges: usize = groups.clone().map(Group::n_edges).sum();
+    let n_edges: usize = tabled.clone().map(|own| own.edges.n_items()).sum();
     let n_bytes = N_TIMES * n_entries * size_of::<Estimate>()
-        + 2 * n_edges * size_of::<Way>()
+        + 2 * n_edges * size_of::<SharedWay>()
         + 2 * stride_for(n_observations) * (size_of::<Estimate>() + size_of::<f64>());
-    let has = |position| groups.clone().any(|group| group.positions().any(|at| at == position));
+    let has = |position| tabled.clone().any(|own| own.position == position);
     let mut active = (0..problem.model.schema().len()).filter(|position| problem.distances.is_active(*position));
     (n_bytes, active.all(has))
 }
@@ -488,7 +466,7 @@ pub(in crate::mapping) struct TableRoom {
     pub(in crate::mapping) few: usize,
     /// and those that may be made instead, if the search takes long.
     pub(in crate::mapping) most: usize,
-    /// How many ways there may be between the classes of a group.
+    /// How many ways there may be between the values of an attribute.
     max_ways: usize,
     /// What the search may take in all.
     pub(in crate::mapping) max_bytes: usize,
@@ -499,7 +477,7 @@ impl TableRoom {
     pub(in crate::mapping) fn within(max_bytes: usize) -> Self {
         const PART: usize = 4;
         let most = MAX_ENTRIES.min(max_bytes / PART / size_of::<Estimate>());
-        Self { few: most, most, max_ways: max_bytes / PART / size_of::<Way>(), max_bytes }
+        Self { few: most, most, max_ways: max_bytes / PART / size_of::<SharedWay>(), max_bytes }
     }
 
     /// At first at most so many entries.
@@ -508,27 +486,25 @@ impl TableRoom {
     }
 }
 
-/// Which groups have tables, the smallest first as far as there is room for a few; and how many entries the others would have, as far
-/// as there is room for most.
-fn used_groups(projections: &Projections, problem: &Problem<'_>, room: TableRoom) -> (Vec<bool>, u64) {
-    let groups = projections.groups();
-    // A group whose attributes weigh nothing would take its share of the actions' costs to no purpose.
-    let is_wanted = |group: &Group| {
-        group.is_kept()
-            && group.n_edges() <= room.max_ways
-            && group.positions().any(|at| problem.distances.is_active(at))
+/// Which projections have tables, the smallest first as far as there is room for a few; and how many entries the others would have, as
+/// far as there is room for most.
+fn used_projections(projections: &Projections, problem: &Problem<'_>, room: TableRoom) -> (Vec<bool>, u64) {
+    let attributes = projections.attributes();
+    // An attribute that weighs nothing would take its share of the actions' costs to no purpose.
+    let is_wanted = |own: &Projection| {
+        own.is_kept && own.edges.n_items() <= room.max_ways && problem.distances.is_active(own.position)
     };
-    let mut wanted: Vec<usize> = (0..groups.len()).filter(|number| is_wanted(&groups[*number])).collect();
-    wanted.sort_by_key(|number| groups[*number].n_classes());
-    let mut used = vec![false; groups.len()];
+    let mut wanted: Vec<usize> = (0..attributes.len()).filter(|number| is_wanted(&attributes[*number])).collect();
+    wanted.sort_by_key(|number| attributes[*number].n_values);
+    let mut used = vec![false; attributes.len()];
     let mut n_entries = 0_usize;
     let mut n_left_out = 0;
     for number in wanted {
-        let of_group = stride_for(problem.demonstration.len()).saturating_mul(groups[number].n_classes());
-        n_entries = n_entries.saturating_add(of_group);
+        let of_attribute = stride_for(problem.demonstration.len()).saturating_mul(attributes[number].n_values);
+        n_entries = n_entries.saturating_add(of_attribute);
         match n_entries {
             n if n <= room.few => used[number] = true,
-            n if n <= room.most => n_left_out += of_group as u64,
+            n if n <= room.most => n_left_out += of_attribute as u64,
             _ => break,
         }
     }

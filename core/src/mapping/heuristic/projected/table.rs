@@ -3,7 +3,7 @@
 /// What each class costs at each observation. Those of a class are one after the other, so that what a state costs at neighbouring
 /// observations is read together.
 #[derive(Debug, Default)]
-pub(in crate::mapping::heuristic) struct Table<T> {
+pub(super) struct Table<T> {
     /// Shape `[n_classes, stride]`.
     entries: Vec<T>,
     /// The observations, with room for whole chunks of [`CHUNK_LEN`].
@@ -24,7 +24,7 @@ pub(super) fn stride_for(n_observations: usize) -> usize {
 
 impl<T: Copy> Table<T> {
     /// The same entry everywhere.
-    pub(in crate::mapping::heuristic) fn filled_with(entry: T, n_classes: usize, n_observations: usize) -> Self {
+    pub(super) fn filled_with(entry: T, n_classes: usize, n_observations: usize) -> Self {
         Self {
             entries: vec![entry; Self::n_entries_for(n_classes, n_observations)],
             stride: stride_for(n_observations),
@@ -32,12 +32,12 @@ impl<T: Copy> Table<T> {
     }
 
     /// How many entries a table has, with the room.
-    pub(in crate::mapping::heuristic) fn n_entries_for(n_classes: usize, n_observations: usize) -> usize {
+    pub(super) fn n_entries_for(n_classes: usize, n_observations: usize) -> usize {
         n_classes.saturating_mul(stride_for(n_observations))
     }
 
     /// Size in memory, in bytes.
-    pub(in crate::mapping::heuristic) fn size_bytes(&self) -> usize {
+    pub(super) fn size_bytes(&self) -> usize {
         size_of_val(self.entries.as_slice())
     }
 
@@ -49,12 +49,12 @@ impl<T: Copy> Table<T> {
 
     /// What a class costs at an observation.
     #[inline]
-    pub(in crate::mapping::heuristic) fn at(&self, class: usize, observation: usize) -> T {
+    pub(super) fn at(&self, class: usize, observation: usize) -> T {
         self.entries[class * self.stride + observation]
     }
 
     #[inline]
-    pub(in crate::mapping::heuristic) fn at_mut(&mut self, class: usize, observation: usize) -> &mut T {
+    pub(super) fn at_mut(&mut self, class: usize, observation: usize) -> &mut T {
         &mut self.entries[class * self.stride + observation]
     }
 

@@ -8,7 +8,6 @@ use crate::document::{Faults, Place};
 use crate::interrupt::Uninterrupted;
 use crate::mapping::Request;
 use crate::mapping::by_definition::{distance, least_costs, moves, nodes};
-use crate::mapping::heuristic::GroupingPatience;
 use crate::model::{Definition, Limits, Model, StateIdx};
 
 /// A model of up to 12 states and three attributes, of which some weigh nothing, and a demonstration.
@@ -52,23 +51,10 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn estimates_are_admissible_and_consistent_and_grow_with_the_groups(
-        (definition, demonstration) in model_and_demonstration(),
-        levels in prop::array::uniform2(prop_oneof![
-            Just(vec![vec![0, 1], vec![2]]), Just(vec![vec![0], vec![1, 2]]), Just(vec![vec![0, 2], vec![1]]),
-            Just(vec![vec![0, 1, 2]]),
-        ]),
-        room in prop_oneof![Just(0.0), 0.0..0.5, Just(1e12)],
-        is_full in any::<bool>(),
-    ) {
+    fn estimates_are_admissible_and_consistent((definition, demonstration) in model_and_demonstration()) {
         let definition = Definition::read(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-        let varies = |at: &usize| model.states().domain(*at).len() > 1;
-        let levels = levels.map(|groups| {
-            let partition = groups.into_iter().map(|group| group.into_iter().filter(varies).collect());
-            partition.filter(|group: &Vec<usize>| !group.is_empty()).collect()
-        });
-        let projections = Projections::with_levels(&model, levels);
+        let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
         let seen: Vec<Value> = demonstration.as_array().unwrap().iter().map(|seen| {
             json!({"a": seen[0], "b": seen[1], "c": seen[2]})
         }).collect();
@@ -78,47 +64,21 @@ proptest! {
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         let [from_start, to_end] = least_costs(&problem);
         let optimum = from_start[problem.last()].iter().copied().fold(f64::INFINITY, f64::min);
-        let limit = optimum * (1.0 + room) + 1e-6;
         let close = 1e-9 * (1.0 + optimum);
 
-        let grouping = if is_full { Grouping::WhenItPays } else { Grouping::Widest };
-        let solved = Projected::solve(&projections, &problem, grouping, TableRoom::within(usize::MAX), &mut Buffers::default(), &mut Uninterrupted).unwrap();
-        let mut projected = solved.unwrap();
-        projected.set_patience(GroupingPatience {
-            min_expansions: 0,
-            expansions_per_transition: 0,
-            expansions_per_entry: u64::MAX,
-            full_entries_per_expansion: u64::MAX,
-        });
+        let room = TableRoom::within(usize::MAX);
+        let solved = Projected::solve(&projections, &problem, room, &mut Buffers::default(), &mut Uninterrupted).unwrap();
+        let projected = solved.unwrap();
         // What no action changes is taken to be as it is at the start, so nothing is said of states that it does not lead to.
         let is_reached = |(i, state): &(usize, StateIdx)| from_start[*i][*state as usize].is_finite();
-        let reached: Vec<_> = nodes(&problem).into_iter().filter(is_reached).collect();
-        let mut alone: Vec<f64> = Vec::new();
-        for n_deepened in 0..=2 {
-            let is_deep = n_deepened > 0;
-            if is_deep {
-                let mut interrupt = Uninterrupted;
-                let mut meter = Meter::new(&mut interrupt, 1);
-                prop_assert_eq!(projected.deepen(limit, 1, usize::MAX, &mut meter), Ok(Deepened::Yes));
-            }
-            for (number, (i, state)) in reached.iter().copied().enumerate() {
-                let estimate = estimate_of(&projected, i, problem.model.states().row(state));
-                prop_assert!((estimate.distance - distance(&problem, i, state)).abs() <= close);
-                let h = estimate.cost_to_go;
-                let through = from_start[i][state as usize] + to_end[i][state as usize];
-                prop_assert!(h.is_finite() || (is_deep && !is_full), "finite at ({i}, {state})");
-                if !is_deep || through < limit {
-                    prop_assert!(h <= to_end[i][state as usize] + close, "admissible at ({i}, {state})");
-                }
-                for (next, to, cost) in moves(&problem, i, state) {
-                    let next_h = estimate_of(&projected, next, problem.model.states().row(to)).cost_to_go;
-                    prop_assert!(h == f64::INFINITY || h <= cost + next_h + close, "consistent at ({i}, {state})");
-                }
-                if is_deep {
-                    prop_assert!(h >= alone[number] - close, "no lower than alone");
-                } else {
-                    alone.push(h);
-                }
+        for (i, state) in nodes(&problem).into_iter().filter(is_reached) {
+            let estimate = estimate_of(&projected, i, problem.model.states().row(state));
+            prop_assert!((estimate.distance - distance(&problem, i, state)).abs() <= close);
+            let h = estimate.cost_to_go;
+            prop_assert!(h <= to_end[i][state as usize] + close, "admissible at ({i}, {state})");
+            for (next, to, cost) in moves(&problem, i, state) {
+                let next_h = estimate_of(&projected, next, problem.model.states().row(to)).cost_to_go;
+                prop_assert!(h <= cost + next_h + close, "consistent at ({i}, {state})");
             }
         }
     }
@@ -142,11 +102,9 @@ fn tables_have_no_more_entries_than_allowed_however_short_the_demonstration() {
         let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         for max_entries in [0, 7, 107, 856, 1_000, 1_712] {
-            let grouping = Grouping::WhenItPays;
             let solved = Projected::solve(
                 &projections,
                 &problem,
-                grouping,
                 TableRoom::within(usize::MAX).at_first(max_entries),
                 &mut buffers,
                 &mut Uninterrupted,
@@ -178,15 +136,8 @@ fn buffers_of_other_problems_change_no_table() {
         let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         let table = |buffers| {
-            let grouping = Grouping::WhenItPays;
-            let solved = Projected::solve(
-                &projections,
-                &problem,
-                grouping,
-                TableRoom::within(usize::MAX),
-                buffers,
-                &mut Uninterrupted,
-            );
+            let solved =
+                Projected::solve(&projections, &problem, TableRoom::within(usize::MAX), buffers, &mut Uninterrupted);
             format!("{:?}", solved.unwrap().unwrap().table)
         };
         assert_eq!(table(&mut buffers), table(&mut Buffers::default()), "weights {a} and {b}");

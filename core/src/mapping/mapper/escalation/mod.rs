@@ -3,8 +3,8 @@
 use super::{Budget, Buffers, Mapper, Mapping, Settings, conclude, within};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::cost::SLACK;
+use crate::mapping::heuristic::Heuristic;
 use crate::mapping::heuristic::projected::{Projected, TableRoom};
-use crate::mapping::heuristic::{GroupingPatience, Heuristic};
 use crate::mapping::search::sweep::{Layer, Swept, sweep};
 use crate::mapping::search::{Found, best_first};
 use crate::mapping::{Problem, StoppedBy};
@@ -22,7 +22,7 @@ impl Mapper {
         most_f: f64,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
-        let Settings { budget, grouping, .. } = settings;
+        let budget = settings.budget;
         let n_nodes =
             space.n_states().map_or(u64::MAX, |n| (n as u64).saturating_mul(problem.demonstration.len() as u64));
         let may_be_swept = space.n_states().is_some();
@@ -34,10 +34,9 @@ impl Mapper {
         let room = TableRoom::within(budget.max_bytes);
         let mut before: Option<(Projected<'_>, Found)> = None;
         for room in [if is_small_budget { room } else { room.at_first(few_entries) }, room] {
-            let solved = self.solve(problem, grouping, room, interrupt)?;
+            let solved = self.solve(problem, room, interrupt)?;
             // No time for estimates, so none for a search with them.
-            let Some(mut projected) = solved else { break };
-            projected.set_patience(patience.grouping);
+            let Some(projected) = solved else { break };
             // The tables of the first attempt are of no more use.
             let found_before = before.take().map(|(_, found)| found);
             let n_before = found_before.as_ref().map_or(0, |found| found.n_expanded);
@@ -53,7 +52,7 @@ impl Mapper {
                 n_untabled => n_untabled / patience.entries_per_expansion,
             };
             let capped = Budget { max_expansions: max_expansions.min(enough), ..budget };
-            let mut found = self.search(space, problem, &mut projected, capped, most_f, interrupt)?;
+            let mut found = self.search(space, problem, &projected, capped, most_f, interrupt)?;
             let is_enough = !found.is_complete && enough < max_expansions && found.n_expanded >= enough;
             let is_out_of_memory = found.stopped_by == Some(StoppedBy::Memory);
             if let Some(before) = found_before {
@@ -78,7 +77,7 @@ impl Mapper {
                     Swept::TooLarge => {
                         let max_expansions = budget.max_expansions - found.n_expanded;
                         let rest = Budget { max_expansions, ..budget };
-                        let more = self.search(space, problem, &mut projected, rest, most_f, interrupt)?;
+                        let more = self.search(space, problem, &projected, rest, most_f, interrupt)?;
                         found = joined(found, more);
                     }
                 }
@@ -89,9 +88,9 @@ impl Mapper {
             let found = Found { stopped_by: Some(StoppedBy::Deadline), ..found };
             return conclude(problem, space, &projected, found, interrupt);
         }
-        let mut blind = Projected::blind(problem);
+        let blind = Projected::blind(problem);
         let budget = Budget { max_expansions: 0, ..budget };
-        let found = self.search(space, problem, &mut blind, budget, most_f, interrupt)?;
+        let found = self.search(space, problem, &blind, budget, most_f, interrupt)?;
         let found = Found { stopped_by: Some(StoppedBy::Deadline), ..found };
         conclude(problem, space, &blind, found, interrupt)
     }
@@ -100,7 +99,7 @@ impl Mapper {
         &self,
         space: &mut S,
         problem: &Problem<'_>,
-        projected: &mut Projected<'_>,
+        projected: &Projected<'_>,
         budget: Budget,
         most_f: f64,
         interrupt: &mut dyn Interrupt,
@@ -111,8 +110,7 @@ impl Mapper {
     }
 }
 
-/// What mappings cost at least, given what it costs to go on from a layer: to come there, they cost no less than the estimate falls.
-/// Those through nodes of infinite estimate cost no less than one that is known. 0 if there are so many states that it would take long.
+/// What mappings cost at least, given what it costs to go on from a layer: to come there, they cost no less than the estimate falls. 0 if there are so many states that it would take long.
 fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &Layer) -> f64 {
     /// That takes some ten milliseconds.
     const MAX_STATES: StateIdx = 1 << 17;
@@ -127,7 +125,7 @@ fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &Layer) -> 
     let states = (0..states.len()).map(|state| states.row(state)).zip(&layer.costs);
     let reachable = states.filter(|(row, _)| projected.speaks_of(row));
     let rises = reachable.map(|(row, cost)| cost - estimate(layer.observation, row));
-    let least_rise = rises.filter(|rise| rise.is_finite()).fold(f64::INFINITY, f64::min);
+    let least_rise = rises.fold(f64::INFINITY, f64::min);
     (estimate(0, &problem.start_row) + least_rise) * (1.0 - SLACK)
 }
 
@@ -160,8 +158,6 @@ pub(super) struct Patience {
     min_expansions_before_sweep: u64,
     /// or after one for so many nodes, if that is more.
     nodes_per_expansion: u64,
-    /// When attributes are projected together.
-    grouping: GroupingPatience,
 }
 
 impl Patience {
@@ -177,7 +173,6 @@ impl Patience {
         min_expansions_before_sweep: 1 << 16,
         // So many are swept in about the time of an expansion, where there are many.
         nodes_per_expansion: 16,
-        grouping: GroupingPatience::DEFAULT,
     };
 }
 

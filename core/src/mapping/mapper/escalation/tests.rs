@@ -5,8 +5,8 @@ use super::*;
 use crate::document::{Faults, Place};
 use crate::interrupt::{Signal, Uninterrupted};
 use crate::mapping::Request;
+use crate::mapping::heuristic::HeuristicName;
 use crate::mapping::heuristic::projected::MAX_ENTRIES;
-use crate::mapping::heuristic::{Grouping, HeuristicName};
 use crate::mapping::mapper::Status;
 use crate::model::{Definition, Limits, Model};
 
@@ -67,7 +67,7 @@ fn wander() -> impl Strategy<Value = (Value, Value)> {
     )
 }
 
-/// A body that goes where it looks, in a hall with walls, and a demonstration. Attributes of it are worth projecting together.
+/// A body that goes where it looks, in a hall with walls, and a demonstration.
 fn hall() -> impl Strategy<Value = (Value, Value)> {
     let seen = (0..4_u32, 0..9_u32, prop::option::of(0..4_u32));
     let walls = prop::collection::vec(prop::bool::weighted(0.1), 4 * 9 * 4);
@@ -116,22 +116,6 @@ const IMPATIENT: Patience = Patience {
     entries_per_expansion: 16,
     min_expansions_before_sweep: 40,
     nodes_per_expansion: u64::MAX,
-    grouping: GroupingPatience {
-        min_expansions: 8,
-        expansions_per_transition: 0,
-        expansions_per_entry: 0,
-        full_entries_per_expansion: 0,
-    },
-};
-
-/// With tables of all classes rather than of those that matter.
-const THOROUGH: Patience = Patience {
-    grouping: GroupingPatience {
-        expansions_per_entry: u64::MAX,
-        full_entries_per_expansion: u64::MAX,
-        ..IMPATIENT.grouping
-    },
-    ..IMPATIENT
 };
 
 proptest! {
@@ -144,10 +128,7 @@ proptest! {
             Just(Patience::DEFAULT),
             Just(Patience { max_layered_nodes: 0, ..Patience::DEFAULT }),
             Just(IMPATIENT),
-            Just(THOROUGH),
-            Just(Patience { min_expansions_before_sweep: u64::MAX, ..THOROUGH }),
             Just(Patience { min_expansions_before_sweep: u64::MAX, ..IMPATIENT }),
-            Just(Patience { grouping: GroupingPatience::DEFAULT, ..IMPATIENT }),
         ],
         few in 0..300_u64,
         looseness in prop_oneof![Just(None), Just(Some(1.0)), Just(Some(1.3))],
@@ -200,7 +181,7 @@ proptest! {
     fn what_a_mapper_searched_before_makes_no_difference(
         (model, request) in prop_oneof![wander(), hall()],
         variations in variations(),
-        patience in prop::sample::select(vec![Patience::DEFAULT, Patience { max_layered_nodes: 0, ..Patience::DEFAULT }, IMPATIENT, THOROUGH]),
+        patience in prop::sample::select(vec![Patience::DEFAULT, Patience { max_layered_nodes: 0, ..Patience::DEFAULT }, IMPATIENT]),
     ) {
         let fresh = || Mapper { patience, ..prepared(&model) };
         let reused = fresh();
@@ -249,7 +230,7 @@ fn classes_that_the_start_does_not_lead_to_do_not_pay_for_going_round_in_circles
         },
     });
     let mapper =
-        Mapper { patience: Patience { min_expansions_before_sweep: u64::MAX, ..THOROUGH }, ..prepared(&model) };
+        Mapper { patience: Patience { min_expansions_before_sweep: u64::MAX, ..IMPATIENT }, ..prepared(&model) };
     let seen: Value = (0..60).map(|i| json!({"x": i * 7 % 10, "clock": i % 16, "map": 1})).collect();
     let request = read(&mapper, &json!({"model": "maps", "demonstration": seen})).problem;
     let map =
@@ -285,7 +266,7 @@ fn tables_left_out_at_first_come_to_the_same_cost_as_a_search_without_heuristic(
     let request = read(&mapper, &request);
     let few_entries = Patience::DEFAULT.few_entries;
     let few = TableRoom::within(usize::MAX).at_first(few_entries);
-    let few = mapper.solve(&request.problem, Grouping::WhenItPays, few, &mut Uninterrupted);
+    let few = mapper.solve(&request.problem, few, &mut Uninterrupted);
     assert!(few.unwrap().unwrap().n_left_out() >= 90_000);
     let map = |heuristic| {
         let settings = Settings { heuristic, ..Settings::default() };
