@@ -4,3 +4,4 @@
 
 pub(crate) mod process;
 pub(crate) mod service;
+pub(crate) mod waiting;

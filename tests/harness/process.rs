@@ -6,11 +6,15 @@ use std::process::{Child, Command, Stdio};
 
 use tokio::sync::mpsc;
 
+use crate::harness::waiting::{Watchdog, send_signal, within};
+
 /// A service in a process of its own.
 pub(crate) struct Process {
     child: Child,
     pub(crate) address: String,
     log: mpsc::UnboundedReceiver<String>,
+    /// So that neither its start nor its end is waited for without end.
+    _watched: Watchdog,
 }
 
 impl Process {
@@ -38,9 +42,13 @@ impl Process {
     }
 
     fn start_as(mut command: Command, flags: &[&str], database: &Path) -> Self {
-        command.args(["serve", "--log-format", "text"]).args(flags).arg("--database").arg(database);
+        command.arg("serve").args(flags).arg("--database").arg(database);
+        if !flags.contains(&"--log-format") {
+            command.args(["--log-format", "text"]);
+        }
         command.env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG");
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+        let watched = Watchdog::watch(child.id());
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);
         let (sender, log) = mpsc::unbounded_channel();
         let listening = |line: &String| {
@@ -51,17 +59,20 @@ impl Process {
         let address = listening.split("http://").nth(1).unwrap().split(['"', ' ']).next().unwrap().to_owned();
         // Nobody may listen any more.
         std::thread::spawn(move || lines.for_each(|line| drop(sender.send(line))));
-        Self { child, address, log }
+        Self { child, address, log, _watched: watched }
     }
 
     /// Completes once a line of the log has all of `parts`.
     pub(crate) async fn has_logged(&mut self, parts: &[&str]) {
-        loop {
-            let line = self.log.recv().await.expect("the service runs");
-            if parts.iter().all(|part| line.contains(part)) {
-                return;
+        let reading = async {
+            loop {
+                let line = self.log.recv().await.expect("the service runs");
+                if parts.iter().all(|part| line.contains(part)) {
+                    return;
+                }
             }
-        }
+        };
+        within(&format!("a log line with {parts:?}"), reading).await;
     }
 
     pub(crate) fn id(&self) -> u32 {
@@ -70,8 +81,16 @@ impl Process {
 
     /// SIGTERM, and waits for the clean end.
     pub(crate) fn stop(mut self) {
-        let sent = Command::new("kill").arg(self.child.id().to_string()).status().unwrap();
-        assert!(sent.success() && self.child.wait().unwrap().success());
+        send_signal("-TERM", self.id());
+        assert!(self.child.wait().unwrap().success());
+    }
+
+    /// Sends a signal that ends it, and gives the exit code and the rest of the log.
+    pub(crate) fn signal(mut self, signal: &str) -> (Option<i32>, String) {
+        send_signal(signal, self.id());
+        let code = self.child.wait().unwrap().code();
+        let rest: Vec<String> = std::iter::from_fn(|| self.log.blocking_recv()).collect();
+        (code, rest.join("\n"))
     }
 
     /// SIGKILL: no handler runs, nothing is flushed.

@@ -12,6 +12,8 @@ use tempfile::TempDir;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 
+use crate::harness::waiting::{LIMIT, until, within};
+
 #[derive(Parser)]
 struct Flags {
     #[command(flatten)]
@@ -59,7 +61,7 @@ impl Service {
         let running = tokio::spawn(async move {
             server.run(async { drop(stopped.await) }).await;
         });
-        let client = Client::builder().no_proxy().build().unwrap();
+        let client = Client::builder().no_proxy().timeout(LIMIT).build().unwrap();
         Self { address, client, directory, stop, running }
     }
 
@@ -67,7 +69,7 @@ impl Service {
     pub(crate) async fn stop(self) -> TempDir {
         drop(self.client);
         drop(self.stop);
-        self.running.await.unwrap();
+        within("the end of the service", self.running).await.unwrap();
         self.directory
     }
 
@@ -105,18 +107,30 @@ impl Service {
         line.map_or(0.0, |value| value.parse().unwrap())
     }
 
+    /// Reads a policy until it is refined, and gives the one that refines it.
+    pub(crate) async fn refined(&self, policy_id: &str) -> Value {
+        let path = format!("/v1/policies/{policy_id}");
+        let refined_by = async || self.get(&path).await.1["refined_by"].as_str().map(str::to_owned);
+        let refined_by = until("a refinement", refined_by).await;
+        self.get(&format!("/v1/policies/{refined_by}")).await.1
+    }
+
+    /// Reads a resource until its status is `status`, and gives it.
+    pub(crate) async fn until_status(&self, path: &str, status: &str) -> Value {
+        let has_status = async || Some(self.get(path).await.1).filter(|found| found["status"] == status);
+        until(&format!("{path} with status {status}"), has_status).await
+    }
+
     /// Waits until something is searched.
     pub(crate) async fn until_searching(&self) {
-        while self.measurement("etude_search_jobs").await < 1.0 {
-            tokio::task::yield_now().await;
-        }
+        let is_searching = async || (self.measurement("etude_search_jobs").await >= 1.0).then_some(());
+        until("the begin of a search", is_searching).await;
     }
 
     /// Waits until nothing is searched any more.
     pub(crate) async fn until_idle(&self) {
-        while self.measurement("etude_search_jobs").await > 0.0 {
-            tokio::task::yield_now().await;
-        }
+        let is_idle = async || (self.measurement("etude_search_jobs").await == 0.0).then_some(());
+        until("the end of all searches", is_idle).await;
     }
 }
 

@@ -1,9 +1,10 @@
 //! The program itself: its commands, its output, its signals.
 
 use std::io::{BufRead, BufReader, Write};
-use std::path::Path;
 use std::process::{Child, Command, Output, Stdio};
 
+use crate::harness::process::Process;
+use crate::harness::waiting::Watchdog;
 use serde_json::Value;
 
 fn etude(arguments: &[&str]) -> Command {
@@ -106,42 +107,6 @@ fn faults_of_files_are_told_with_their_places() {
     assert!(told("nowhere.json", &demonstration).contains("cannot read nowhere.json: No such file"));
 }
 
-/// A service in a process of its own.
-struct Process {
-    child: Child,
-    address: String,
-    log: Option<std::thread::JoinHandle<String>>,
-}
-
-/// Also when a test fails.
-impl Drop for Process {
-    fn drop(&mut self) {
-        // It has ended already, unless the test failed.
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-impl Process {
-    fn start(database: &Path, flags: &[&str]) -> Self {
-        let serve = ["serve", "--listen", "127.0.0.1:0", "--database", database.to_str().unwrap()];
-        let mut child = etude(&[&serve[..], flags].concat()).stderr(Stdio::piped()).spawn().unwrap();
-        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map(Result::unwrap);
-        let first = lines.find(|line| line.contains("listening on http://")).unwrap();
-        let address = first.split("http://").nth(1).unwrap();
-        let address = address.split(['"', ' ']).next().unwrap().to_owned();
-        let log = std::thread::spawn(move || lines.collect::<Vec<_>>().join("\n"));
-        Self { child, address, log: Some(log) }
-    }
-
-    /// Sends a signal, and gives the exit code and the log.
-    fn signal(mut self, signal: &str) -> (Option<i32>, String) {
-        let killed = Command::new("kill").args([signal, &self.child.id().to_string()]).status().unwrap();
-        assert!(killed.success());
-        (self.child.wait().unwrap().code(), self.log.take().unwrap().join().unwrap())
-    }
-}
-
 #[test]
 fn sigterm_and_sigint_end_the_service_cleanly() {
     let directory = tempfile::tempdir().unwrap();
@@ -149,7 +114,10 @@ fn sigterm_and_sigint_end_the_service_cleanly() {
         ("-TERM", ["--log-format", "text", "--log", "etude=debug"]),
         ("-INT", ["--log-format", "json", "--log", "etude=debug"]),
     ] {
-        let service = Process::start(&directory.path().join("etude.db"), &flags);
+        let service = Process::start_with(
+            &[&["--listen", "127.0.0.1:0"][..], &flags].concat(),
+            &directory.path().join("etude.db"),
+        );
         let healthy = run(&["healthcheck", "--listen", &service.address]);
         assert!(healthy.status.success(), "{}", text(&healthy.stderr));
         let address = service.address.clone();
@@ -187,6 +155,7 @@ struct Streaming {
     child: Child,
     input: Option<std::process::ChildStdin>,
     output: BufReader<std::process::ChildStdout>,
+    _watched: Watchdog,
 }
 
 impl Streaming {
@@ -194,7 +163,7 @@ impl Streaming {
         let mut command = etude(&[&["stream"][..], flags].concat());
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
         let output = BufReader::new(child.stdout.take().unwrap());
-        Self { input: child.stdin.take(), child, output }
+        Self { input: child.stdin.take(), _watched: Watchdog::watch(child.id()), child, output }
     }
 
     fn write(&mut self, line: &str) {
@@ -258,7 +227,7 @@ fn steps_are_printed_before_the_input_has_ended() {
 #[test]
 fn a_service_streams_the_same_steps_as_the_program_itself() {
     let directory = tempfile::tempdir().unwrap();
-    let service = Process::start(&directory.path().join("etude.db"), &[]);
+    let service = Process::start(&directory.path().join("etude.db"));
     let url = format!("http://{}", service.address);
     let json = |line: &String| serde_json::from_str::<Value>(line).unwrap();
     let options = &["--json", "--lookahead", "3", "--weight", "gold=2", "--start", "0"][..];

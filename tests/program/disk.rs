@@ -4,10 +4,10 @@ use std::fs::{self, File};
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Duration;
 
 use crate::harness::process::Process;
 use crate::harness::service::{answer, example};
+use crate::harness::waiting::{LIMIT, within};
 use futures_util::{SinkExt, StreamExt};
 use reqwest::{Client, Method};
 use serde_json::{Value, json};
@@ -15,9 +15,6 @@ use tempfile::TempDir;
 use tokio::net::TcpStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
-
-/// Longer than anything here takes; a test that waits for this fails.
-const PATIENCE: Duration = Duration::from_secs(20);
 
 /// Rewards are folded when asked for.
 const FLAGS: [&str; 4] = ["--listen", "127.0.0.1:0", "--learn-every", "24h"];
@@ -38,7 +35,7 @@ impl Stream {
     }
 
     async fn next(&mut self) -> Message {
-        tokio::time::timeout(PATIENCE, self.0.next()).await.unwrap().unwrap().unwrap()
+        within("a message", self.0.next()).await.unwrap().unwrap()
     }
 
     async fn receive(&mut self) -> Value {
@@ -239,7 +236,7 @@ impl Tried {
                 last = told;
             }
         };
-        assert!(tokio::time::timeout(PATIENCE, asking).await.is_ok(), "{status} expected, found {last}");
+        assert!(tokio::time::timeout(LIMIT, asking).await.is_ok(), "{status} expected, found {last}");
     }
 
     /// What clients can read, without times and what is refined in the background.

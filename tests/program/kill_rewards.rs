@@ -1,43 +1,18 @@
 //! What clients were told is there, whenever the program is killed.
 
 use std::collections::BTreeMap;
-use std::io::{BufRead, BufReader};
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
+use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use crate::harness::process::Process;
 use crate::harness::service::example;
+use crate::harness::waiting::within;
 use reqwest::Client;
 use serde_json::{Value, json};
 use tokio::sync::{Mutex, Notify};
 
-/// The real program, which is killed.
-struct Process {
-    child: Child,
-    base: String,
-}
-
-impl Process {
-    fn start(database: &Path) -> Self {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
-        command.args(["serve", "--listen", "127.0.0.1:0", "--learn-every", "3ms", "--log-format", "text"]);
-        let mut child = command.arg("--database").arg(database).stderr(Stdio::piped()).spawn().unwrap();
-        let mut lines = BufReader::new(child.stderr.take().unwrap()).lines();
-        let first = lines.find_map(|line| Some(line.unwrap().split("http://").nth(1)?.to_owned())).unwrap();
-        std::thread::spawn(move || lines.for_each(drop));
-        let address = first.split(['"', ' ']).next().unwrap();
-        Self { child, base: format!("http://{address}") }
-    }
-}
-
-/// `SIGKILL`, also when a test fails.
-impl Drop for Process {
-    fn drop(&mut self) {
-        self.child.kill().unwrap();
-        self.child.wait().unwrap();
-    }
-}
+const FLAGS: [&str; 4] = ["--listen", "127.0.0.1:0", "--learn-every", "3ms"];
 
 /// What clients know when the service is gone.
 #[derive(Default)]
@@ -80,10 +55,11 @@ async fn every_acknowledged_reward_is_there_once_after_a_hundred_kills() {
     // Any numbers will do, as long as they differ.
     let mut random = 12_345_u64;
     for kill in 0..N_KILLS {
-        let process = Process::start(&database);
+        let process = Process::start_with(&FLAGS, &database);
+        let base = format!("http://{}", process.address);
         if kill == 0 {
             let put = async |path: &str, body: Value| {
-                let sent = client.put(format!("{}{path}", process.base)).json(&body).send().await.unwrap();
+                let sent = client.put(format!("{base}{path}")).json(&body).send().await.unwrap();
                 assert_eq!(sent.status(), 201);
             };
             put("/v1/models/figure-6", example("figure-6/model.json")).await;
@@ -91,25 +67,28 @@ async fn every_acknowledged_reward_is_there_once_after_a_hundred_kills() {
         }
         let before = known.n_acknowledged.load(Ordering::Relaxed);
         let working: Vec<_> = (0..N_CLIENTS)
-            .map(|_| tokio::spawn(work(client.clone(), process.base.clone(), request.clone(), known.clone())))
+            .map(|_| tokio::spawn(work(client.clone(), base.clone(), request.clone(), known.clone())))
             .collect();
         random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
         let enough = usize::try_from(random >> 60).unwrap();
-        while known.n_acknowledged.load(Ordering::Relaxed) <= before + enough {
-            known.changed.notified().await;
-        }
-        drop(process);
+        let acknowledged = async {
+            while known.n_acknowledged.load(Ordering::Relaxed) <= before + enough {
+                known.changed.notified().await;
+            }
+        };
+        within("acknowledged rewards", acknowledged).await;
+        process.kill();
         for client in working {
             assert!(client.await.unwrap().is_err(), "the service is gone");
         }
     }
 
-    let process = Process::start(&database);
+    let process = Process::start_with(&FLAGS, &database);
     let mut stored = BTreeMap::new();
     let mut orders = Vec::new();
     let mut query = "?limit=1000".to_owned();
     loop {
-        let url = format!("{}/v1/learners/gold/trials{query}", process.base);
+        let url = format!("http://{}/v1/learners/gold/trials{query}", process.address);
         let page: Value = client.get(url).send().await.unwrap().json().await.unwrap();
         for trial in page["items"].as_array().unwrap().iter().filter(|trial| trial["reward"].is_number()) {
             orders.push(trial["reward_order"].as_u64().unwrap());
@@ -118,7 +97,7 @@ async fn every_acknowledged_reward_is_there_once_after_a_hundred_kills() {
         let Some(next) = page["next"].as_str() else { break };
         query = format!("?limit=1000&after={next}");
     }
-    drop(process);
+    process.kill();
     let acknowledged = known.acknowledged.lock().await;
     assert!(acknowledged.len() > N_KILLS);
     for (trial, reward) in &*acknowledged {

@@ -5,9 +5,9 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::process::{Child, ChildStdin, Command, Stdio};
-use std::time::Duration;
 
 use crate::harness::process::Process;
+use crate::harness::waiting::{Watchdog, within};
 use futures_util::{SinkExt, StreamExt};
 use serde_json::{Value, json};
 use tokio::net::TcpStream;
@@ -17,8 +17,6 @@ use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 const N_KILLS: usize = 100;
 
 /// Longer than anything here takes.
-const PATIENCE: Duration = Duration::from_secs(30);
-
 /// Observations of a stream: the demonstration of figure 4, there and back.
 const N_OBSERVATIONS: usize = 48;
 
@@ -52,7 +50,7 @@ impl Watcher {
     /// Streams from where the service is, until the policy is done or `until` frames have come.
     async fn watch(&mut self, socket: &mut Socket, observations: &[Value], until: usize) {
         for _ in 0..until {
-            let message = tokio::time::timeout(PATIENCE, socket.next()).await.unwrap().unwrap().unwrap();
+            let message = within("a message", socket.next()).await.unwrap().unwrap();
             let Message::Text(text) = message else { panic!("{message:?}") };
             let frame: Value = serde_json::from_str(&text).unwrap();
             match frame["type"].as_str().unwrap() {
@@ -154,6 +152,7 @@ async fn a_service_killed_a_hundred_times_loses_and_doubles_nothing() {
 struct Program {
     child: Child,
     input: Option<ChildStdin>,
+    _watched: Watchdog,
 }
 
 impl Program {
@@ -161,7 +160,7 @@ impl Program {
         let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
         command.args(["stream", "--json", "--lookahead", "4"]).args(flags).env_remove("ETUDE_LOG");
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
-        Self { input: child.stdin.take(), child }
+        Self { input: child.stdin.take(), _watched: Watchdog::watch(child.id()), child }
     }
 
     fn write(&mut self, observations: &[Value]) {

@@ -3,21 +3,16 @@
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::process::{Child, ChildStderr, Command, ExitStatus, Stdio};
-use std::sync::mpsc;
-use std::time::Duration;
 
+use crate::harness::waiting::{LIMIT, Watchdog, send_signal};
 use tempfile::TempDir;
-
-/// Longer than anything here takes; what is not done by then is killed, and its test fails.
-const PATIENCE: Duration = Duration::from_mins(1);
 
 /// A service in a process of its own, whose log is read only when a test reads it.
 struct Process {
     child: Child,
     address: String,
     log: BufReader<ChildStderr>,
-    /// Dropped once it has ended.
-    _watched: mpsc::Sender<()>,
+    _watched: Watchdog,
     _directory: TempDir,
 }
 
@@ -37,27 +32,12 @@ fn serve(address: &str, directory: &TempDir, flags: &[&str]) -> Command {
     command
 }
 
-fn send_signal(signal: &str, process: u32) {
-    assert!(Command::new("kill").args([signal, &process.to_string()]).status().unwrap().success());
-}
-
-/// Kills the process if what is returned is not dropped in time.
-fn watch(process: u32) -> mpsc::Sender<()> {
-    let (watched, ended) = mpsc::channel();
-    std::thread::spawn(move || {
-        if ended.recv_timeout(PATIENCE) == Err(mpsc::RecvTimeoutError::Timeout) {
-            send_signal("-KILL", process);
-        }
-    });
-    watched
-}
-
 impl Process {
     fn start(flags: &[&str]) -> Self {
         let directory = tempfile::tempdir().unwrap();
         let mut child = serve("127.0.0.1:0", &directory, flags).stderr(Stdio::piped()).spawn().unwrap();
         let log = BufReader::new(child.stderr.take().unwrap());
-        let watched = watch(child.id());
+        let watched = Watchdog::watch(child.id());
         let mut process = Self { child, address: String::new(), log, _watched: watched, _directory: directory };
         let listening = process.until_logged("listening on http://");
         let address = listening.split("http://").nth(1).unwrap().split(' ').next().unwrap().trim();
@@ -105,7 +85,7 @@ fn ask(connection: &mut BufReader<TcpStream>, request: &str) -> String {
 
 fn connect(address: &str) -> BufReader<TcpStream> {
     let connection = TcpStream::connect(address).unwrap();
-    connection.set_read_timeout(Some(PATIENCE)).unwrap();
+    connection.set_read_timeout(Some(LIMIT)).unwrap();
     BufReader::new(connection)
 }
 
@@ -151,7 +131,7 @@ fn without_standard_error_requests_are_answered_and_signals_heard() {
     let mut command = Command::new("sh");
     command.args(["-c", r#"exec "$0" "$@" 2>&-"#]).arg(plain.get_program()).args(plain.get_args());
     let mut child = command.stdout(Stdio::null()).spawn().unwrap();
-    let _watched = watch(child.id());
+    let _watched = Watchdog::watch(child.id());
     while TcpStream::connect(&address).is_err() {
         assert_eq!(child.try_wait().unwrap(), None, "it runs");
         std::thread::yield_now();

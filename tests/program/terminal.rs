@@ -5,6 +5,7 @@ use std::io::{Read, Write};
 use std::os::fd::OwnedFd;
 use std::process::{Child, ChildStdin, Command, Stdio};
 
+use crate::harness::waiting::Watchdog;
 use rustix::fs::{Mode, OFlags};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Winsize, tcsetwinsize};
@@ -94,12 +95,13 @@ impl Terminal {
     }
 }
 
-fn stream(output: impl Into<Stdio>, errors: impl Into<Stdio>) -> (Child, ChildStdin) {
+fn stream(output: impl Into<Stdio>, errors: impl Into<Stdio>) -> (Child, ChildStdin, Watchdog) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
     command.args(["stream", "--model", "examples/figure-4/model.json"]).env("TERM", "xterm").env_remove("ETUDE_LOG");
     let mut child = command.stdin(Stdio::piped()).stdout(output).stderr(errors).spawn().unwrap();
     let input = child.stdin.take().unwrap();
-    (child, input)
+    let watched = Watchdog::watch(child.id());
+    (child, input, watched)
 }
 
 #[test]
@@ -107,7 +109,7 @@ fn a_terminal_has_a_progress_line_below_the_steps_and_a_pipe_has_the_same_steps_
     let demonstration = include_str!("../../examples/figure-4/demonstration.json");
     let observations: Vec<Value> = serde_json::from_str(demonstration).unwrap();
 
-    let (child, mut input) = stream(Stdio::piped(), Stdio::piped());
+    let (child, mut input, _piped) = stream(Stdio::piped(), Stdio::piped());
     for observation in &observations {
         writeln!(input, "{observation}").unwrap();
     }
@@ -119,7 +121,7 @@ fn a_terminal_has_a_progress_line_below_the_steps_and_a_pipe_has_the_same_steps_
     let lines: Vec<&str> = output.lines().collect();
 
     let (mut terminal, side) = Terminal::open();
-    let (mut child, mut input) = stream(side.try_clone().unwrap(), side);
+    let (mut child, mut input, _shown) = stream(side.try_clone().unwrap(), side);
     writeln!(input, "{}", observations[0]).unwrap();
     let progress = |lines: &[String]| lines.last().unwrap().trim_end().to_owned();
     // Below the header and the start.

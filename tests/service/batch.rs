@@ -1,6 +1,7 @@
 //! Batches, from outside.
 
 use crate::harness::service::{Service, answer, example, long_way, to_and_fro};
+use crate::harness::waiting::until;
 use reqwest::Method;
 use serde_json::{Value, json};
 
@@ -266,14 +267,7 @@ async fn local_items_of_a_batch_are_refined_in_the_background() {
     for local in items(&service, &batch).await {
         assert_eq!((&local["status"], &local["lookahead"]), (&json!("local"), &json!(1)));
         let id = local["id"].as_str().unwrap();
-        let refined_by = loop {
-            let (_, policy) = service.get(&format!("/v1/policies/{id}")).await;
-            if let Some(refined_by) = policy["refined_by"].as_str() {
-                break refined_by.to_owned();
-            }
-            tokio::task::yield_now().await;
-        };
-        let (_, refined) = service.get(&format!("/v1/policies/{refined_by}")).await;
+        let refined = service.refined(id).await;
         assert_eq!((&refined["refines"], &refined["status"]), (&local["id"], &json!("optimal")));
         assert_eq!(refined["cost"]["total"], 48.2);
     }
@@ -287,10 +281,7 @@ async fn a_batch_takes_one_place_and_lets_others_in_between() {
     items.push(json!({"demonstration": long_demonstration(), "heuristic": "paper"}));
     let batch = json!({"model": "figure-4", "items": items, "deadline_ms": 60_000});
     let waiting = tokio::spawn(service.client.post(service.url(BATCH)).json(&batch).send());
-    while service.measurement("etude_search_jobs").await < 1.0 {
-        assert!(!waiting.is_finished(), "the batch was refused");
-        tokio::task::yield_now().await;
-    }
+    service.until_searching().await;
     let request = example("figure-4/request.json");
     assert_eq!(service.post("/v1/policies", &request).await.0, 201);
     assert!(!waiting.is_finished(), "the batch was over before the single request");
@@ -308,8 +299,18 @@ async fn a_client_that_goes_away_leaves_nothing_of_its_batch() {
     service.until_searching().await;
     waiting.abort();
     service.until_idle().await;
-    assert_eq!(service.get("/v1/policies").await.1["items"], json!([]));
-    assert_eq!(items(&service, &json!({"model": "figure-4", "items": [quick]})).await.len(), 1);
+    // Its place is given back a moment after its search has ended.
+    let batch = json!({"model": "figure-4", "items": [quick]});
+    let again = async || {
+        let (status, answer) = service.post(BATCH, &batch).await;
+        assert!([200, 503].contains(&status), "{answer}");
+        (status == 200).then_some(answer)
+    };
+    let answer = until("a place for the next batch", again).await;
+    let ids: Vec<&Value> = answer["items"].as_array().unwrap().iter().map(|policy| &policy["id"]).collect();
+    let (_, list) = service.get("/v1/policies").await;
+    let listed: Vec<&Value> = list["items"].as_array().unwrap().iter().map(|policy| &policy["id"]).collect();
+    assert_eq!((ids.len(), listed), (1, ids), "nothing is left of the first");
 }
 
 #[tokio::test]

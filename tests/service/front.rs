@@ -1,10 +1,10 @@
 //! What stands before the contract: hosts, web pages, slow and silent clients, and places for connections.
 
 use std::net::SocketAddr;
-use std::time::Duration;
 
 use crate::harness::process::Process;
 use crate::harness::service::{Service, answer, example, long_way, to_and_fro};
+use crate::harness::waiting::{until, within};
 use futures_util::future::join_all;
 use reqwest::Method;
 use serde_json::{Value, json};
@@ -12,9 +12,6 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
 use tokio_tungstenite::tungstenite;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
-
-/// Longer than anything here takes; a test that waits for this fails.
-const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Room of the smallest budget of memory: see `Memory::new`.
 const BASE_BYTES: u64 = 64 << 20;
@@ -29,7 +26,7 @@ async fn talk(address: SocketAddr, text: &str) -> String {
 async fn read_to_end(stream: &mut TcpStream) -> String {
     let mut answer = Vec::new();
     // A connection may be closed with something unread.
-    let _ = tokio::time::timeout(PATIENCE, stream.read_to_end(&mut answer)).await.unwrap();
+    let _ = within("the end of the connection", stream.read_to_end(&mut answer)).await;
     String::from_utf8_lossy(&answer).into_owned()
 }
 
@@ -259,7 +256,7 @@ async fn read_until(stream: &mut TcpStream, end: &str) -> String {
             answer.push(byte.unwrap_or_else(|error| panic!("{error}: {}", String::from_utf8_lossy(&answer))));
         }
     };
-    tokio::time::timeout(PATIENCE, reading).await.unwrap();
+    within(&format!("{end:?}"), reading).await;
     String::from_utf8(answer).unwrap()
 }
 
@@ -346,18 +343,15 @@ async fn bodies_that_do_not_fit_into_the_memory_are_refused_and_others_are_not()
         answer(request.body(large.clone()).send().await.unwrap()).await
     };
     // Until both were read.
-    while service.measurement("etude_memory_held_bytes").await < f64::from(4 << 20) {
-        tokio::task::yield_now().await;
-    }
+    let are_held = async || (service.measurement("etude_memory_held_bytes").await >= f64::from(4 << 20)).then_some(());
+    until("memory for both", are_held).await;
     let (status, problem) = send().await;
     assert_eq!((status, &problem["type"]), (503, &json!("/problems/busy")));
     assert!(problem["detail"].as_str().unwrap().contains("ETUDE_MAX_MEMORY"), "{problem}");
     assert_eq!(service.post("/v1/policies", &example("figure-4/request.json")).await.0, 201, "what is small fits");
     // What they held is given back.
     drop(held);
-    while send().await.0 != 400 {
-        tokio::task::yield_now().await;
-    }
+    until("the memory of both", async || (send().await.0 == 400).then_some(())).await;
     // What comes out of a body counts as what is sent.
     let bomb = zstd::bulk::compress(&vec![b' '; 6 << 20], 1).unwrap();
     let request = service.client.post(service.url("/v1/policies")).header("content-type", "application/json");
@@ -398,12 +392,8 @@ async fn who_does_not_read_an_answer_is_closed_and_gives_its_memory_back() {
     // Operators see what is going on, and small answers are given.
     assert_eq!(service.get("/metrics").await.0, 200);
     assert_eq!(service.get("/v1/policies").await.0, 200);
-    let again = async {
-        while service.get(&path).await.0 != 200 {
-            tokio::task::yield_now().await;
-        }
-    };
-    tokio::time::timeout(PATIENCE, again).await.expect("it is closed");
+    let is_there = async || (service.get(&path).await.0 == 200).then_some(());
+    until("the memory of the unread answer", is_there).await;
     assert!(read_to_end(&mut unread).await.len() < n_bytes, "the answer was cut off");
 }
 
@@ -492,12 +482,11 @@ async fn where_nobody_makes_room_a_newcomer_is_told_so() {
     // An address that has few places gets one as soon as there is one, and is seen by operators.
     drop(streams.pop());
     let request = "GET /metrics HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n";
-    let metrics = loop {
+    let measured = async || {
         let answer = told(connect_from("127.0.0.2", service.address).await, request).await;
-        if status(&answer) == 200 {
-            break answer;
-        }
+        (status(&answer) == 200).then_some(answer)
     };
+    let metrics = until("a place", measured).await;
     for name in ["\netude_connections ", "\netude_connections_refused_total "] {
         assert!(metrics.contains(name), "{metrics}");
     }
@@ -522,13 +511,15 @@ async fn streams_leave_places_for_requests() {
     assert_eq!(status(&read_until(&mut other, "}").await), 503);
     // Its place is given back, and taken along by the next.
     drop(streams.pop());
-    loop {
+    let upgraded = async || {
         other.write_all(upgrade.as_bytes()).await.unwrap();
         if read_until(&mut other, "\r\n\r\n").await.contains(" 101 ") {
-            break;
+            return Some(());
         }
         read_until(&mut other, "}").await;
-    }
+        None
+    };
+    until("the place of a stream", upgraded).await;
 }
 
 #[tokio::test]
@@ -557,13 +548,11 @@ async fn a_service_with_few_files_serves_on_refuses_and_says_so() {
     process.has_logged(&["connections are refused"]).await;
     drop((silent, busy));
     let learner = reqwest::Client::builder().no_proxy().build().unwrap();
-    loop {
+    let put = async || {
         let request = learner.put(format!("http://{address}/v1/learners/gold")).json(&json!({"attributes": ["x"]}));
-        // Until those who went away are gone.
-        if request.send().await.is_ok_and(|answer| answer.status() == 201) {
-            break;
-        }
-    }
+        request.send().await.is_ok_and(|answer| answer.status() == 201).then_some(())
+    };
+    until("places of those who went away", put).await;
     process.kill();
 }
 

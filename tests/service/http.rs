@@ -4,6 +4,7 @@ use std::io::{Read, Write};
 use std::net::{Shutdown, TcpStream};
 
 use crate::harness::service::{Service, answer, example};
+use crate::harness::waiting::within;
 use reqwest::Method;
 use reqwest::header::{ALLOW, CONTENT_TYPE, LOCATION, RETRY_AFTER};
 use serde_json::{Value, json};
@@ -595,10 +596,7 @@ async fn a_small_request_in_a_world_searched_lazily_leaves_the_service_awake() {
     // Only for the case that nothing else ends it.
     let request = json!({"model": "lazy", "demonstration": seen, "deadline_ms": 20_000});
     let waiting = tokio::spawn(service.client.post(service.url("/v1/policies")).json(&request).send());
-    while service.measurement("etude_search_jobs").await < 1.0 {
-        assert!(!waiting.is_finished(), "nothing else was answered while it was searched");
-        tokio::task::yield_now().await;
-    }
+    service.until_searching().await;
     assert_eq!(service.get("/livez").await.0, 200);
     assert_eq!(service.measurement("etude_search_jobs").await, 1.0, "it is still being searched");
 
@@ -653,17 +651,6 @@ async fn a_deadline_gives_the_best_mapping_so_far_and_a_bound() {
     assert_eq!(policy["steps"].as_array().unwrap().last().unwrap()["observation"], 19_999);
 }
 
-/// Reads a policy until it is refined.
-async fn refined(service: &Service, id: &str) -> Value {
-    loop {
-        let (_, policy) = service.get(&format!("/v1/policies/{id}")).await;
-        if let Some(refined_by) = policy["refined_by"].as_str() {
-            return service.get(&format!("/v1/policies/{refined_by}")).await.1;
-        }
-        tokio::task::yield_now().await;
-    }
-}
-
 #[tokio::test]
 async fn a_policy_with_a_lookahead_is_local_and_is_refined_in_the_background() {
     let service = Service::start(&[]).await;
@@ -674,7 +661,7 @@ async fn a_policy_with_a_lookahead_is_local_and_is_refined_in_the_background() {
     assert_eq!((status, &local["status"], &local["lookahead"]), (201, &json!("local"), &json!(1)));
     assert_eq!((&local["lower_bound"], &local["refined_by"]), (&Value::Null, &Value::Null));
     assert!(local["cost"]["total"].as_f64().unwrap() > 48.2);
-    let refined = refined(&service, local["id"].as_str().unwrap()).await;
+    let refined = service.refined(local["id"].as_str().unwrap()).await;
     assert_eq!((&refined["refines"], &refined["status"]), (&local["id"], &json!("optimal")));
     assert_eq!((&refined["cost"]["total"], &refined["lookahead"]), (&json!(48.2), &Value::Null));
     let (_, list) = service.get("/v1/policies").await;
@@ -710,10 +697,7 @@ async fn a_client_that_does_not_finish_its_request_finds_its_connection_closed()
         stream.write_all(begun.as_bytes()).await.unwrap();
         let mut answer = String::new();
         // Ends with the connection, which this side leaves open.
-        tokio::time::timeout(std::time::Duration::from_secs(30), stream.read_to_string(&mut answer))
-            .await
-            .unwrap()
-            .unwrap();
+        within("the end of the connection", stream.read_to_string(&mut answer)).await.unwrap();
         assert_eq!(answer.starts_with("HTTP/1.1 200"), begun.ends_with("\r\n\r\n"), "{answer}");
     }
 }

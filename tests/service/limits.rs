@@ -3,6 +3,7 @@
 use std::time::Instant;
 
 use crate::harness::service::{Service, answer, example, flags, long_way, to_and_fro};
+use crate::harness::waiting::until;
 use etude::memory::SMALL_BYTES;
 use etude::service::{Caller, Client, Etude, ModelText, Name, Registered, ServiceError};
 use etude_core::model::Format;
@@ -83,9 +84,8 @@ async fn a_deadline_counts_while_a_cold_model_is_compiled_which_goes_on_for_the_
     assert_eq!((status, &problem["type"]), (503, &json!("/problems/busy")));
     assert!(problem["detail"].as_str().unwrap().contains("still being compiled"), "{problem}");
     // Whoever comes again without waiting finds it ready in the end.
-    while service.post("/v1/policies", &request).await.0 != 201 {
-        tokio::task::yield_now().await;
-    }
+    let is_ready = async || (service.post("/v1/policies", &request).await.0 == 201).then_some(());
+    until("the compiled model", is_ready).await;
 }
 
 #[tokio::test]
@@ -127,9 +127,8 @@ async fn a_small_request_is_answered_while_any_number_of_hard_ones_run() {
     let hard: Vec<_> = (0..40)
         .map(|_| tokio::spawn(service.client.post(service.url("/v1/policies")).json(&hard_request(20_000)).send()))
         .collect();
-    while service.measurement("etude_search_jobs").await < 10.0 {
-        tokio::task::yield_now().await;
-    }
+    let are_running = async || (service.measurement("etude_search_jobs").await >= 10.0).then_some(());
+    until("the begin of ten searches", are_running).await;
     assert_eq!(service.post("/v1/policies", &example("figure-4/request.json")).await.0, 201);
     // Neither does one that another thread takes over wait for all of them.
     let mut large = example("figure-4/request.json");

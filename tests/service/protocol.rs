@@ -1,16 +1,14 @@
 //! The transcript in the description of the stream protocol, replayed.
 
 use std::collections::BTreeMap;
-use std::time::Duration;
 
 use crate::harness::service::Service;
+use crate::harness::waiting::within;
 use futures_util::{SinkExt, StreamExt};
 use serde_json::{Value, json};
 use tokio_tungstenite::tungstenite::Message;
 
 const PAGE: &str = include_str!("../../src/stream/protocol.md");
-
-const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Strings such as `$session` stand for whatever came first in their place.
 #[derive(Default)]
@@ -64,7 +62,7 @@ async fn the_transcript_of_the_protocol_happens_as_written() {
                 socket.send(Message::text(frame.to_string())).await.unwrap();
             }
             "<" => {
-                let message = tokio::time::timeout(PATIENCE, socket.next()).await.unwrap().unwrap().unwrap();
+                let message = within("a message", socket.next()).await.unwrap().unwrap();
                 let came: Value = serde_json::from_str(message.to_text().unwrap()).unwrap();
                 let told = placeholders.fill(&serde_json::from_str(rest).unwrap(), &came);
                 assert_eq!(came, told, "after {n_frames} frames");
@@ -72,7 +70,7 @@ async fn the_transcript_of_the_protocol_happens_as_written() {
             _ => match rest.strip_prefix("closed with ") {
                 None => socket = connect().await,
                 Some(code) => {
-                    let message = tokio::time::timeout(PATIENCE, socket.next()).await.unwrap().unwrap().unwrap();
+                    let message = within("a message", socket.next()).await.unwrap().unwrap();
                     let Message::Close(Some(close)) = message else { panic!("{message:?}") };
                     assert_eq!(u16::from(close.code).to_string(), code);
                 }

@@ -1,10 +1,11 @@
 //! The stream protocol, from outside, over both transports.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use crate::harness::process::Process;
 use crate::harness::service::{Service, answer, example, flags, long_way, to_and_fro};
+use crate::harness::waiting::{until, within};
 use etude::service::{Caller, Etude};
 use etude::stream::{Closed, Incoming, Outgoing, Receiver, Sender, queue};
 use etude_core::document::Place;
@@ -24,9 +25,6 @@ use tokio_tungstenite::tungstenite::protocol::frame::Frame;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
-
-/// Longer than anything here takes; a test that waits for this fails.
-const PATIENCE: Duration = Duration::from_mins(2);
 
 const NDJSON: &str = "application/x-ndjson";
 
@@ -73,7 +71,7 @@ impl Client {
     }
 
     async fn next(&mut self) -> Message {
-        tokio::time::timeout(PATIENCE, self.socket.next()).await.unwrap().unwrap().unwrap()
+        within("a message", self.socket.next()).await.unwrap().unwrap()
     }
 
     async fn receive(&mut self) -> Value {
@@ -187,18 +185,7 @@ async fn a_local_policy_is_refined_after_the_stream() {
     client.send(json!({"type": "end", "seq": 16})).await;
     let done = client.receive_until("done").await.pop().unwrap();
     assert_eq!(done["status"], "local");
-    let path = format!("/v1/policies/{}", done["policy_id"].as_str().unwrap());
-    let refined_by = async {
-        loop {
-            let (_, local) = service.get(&path).await;
-            if let Some(refined_by) = local["refined_by"].as_str() {
-                return refined_by.to_owned();
-            }
-            tokio::task::yield_now().await;
-        }
-    };
-    let refined_by = tokio::time::timeout(PATIENCE, refined_by).await.unwrap();
-    let (_, refined) = service.get(&format!("/v1/policies/{refined_by}")).await;
+    let refined = service.refined(done["policy_id"].as_str().unwrap()).await;
     assert_eq!((&refined["refines"], &refined["status"]), (&done["policy_id"], &json!("optimal")));
     assert_eq!(refined["weights"]["gold"], 1.5);
     assert!(refined["cost"]["total"].as_f64() < done["cost"]["total"].as_f64());
@@ -210,7 +197,7 @@ async fn lines_go_both_ways_at_the_same_time() {
     let (lines, body) = mpsc::channel::<Result<String, std::io::Error>>(1);
     let body = Body::wrap_stream(tokio_stream::wrappers::ReceiverStream::new(body));
     let request = service.client.post(service.url("/v1/stream")).header("content-type", NDJSON).body(body);
-    let response = tokio::time::timeout(PATIENCE, request.send()).await.unwrap().unwrap();
+    let response = within("an answer", request.send()).await.unwrap();
     assert_eq!(response.headers()["content-type"], "application/x-ndjson");
     let mut answer = response.bytes_stream();
     let mut buffer = String::new();
@@ -221,7 +208,7 @@ async fn lines_go_both_ways_at_the_same_time() {
                 buffer = rest.to_owned();
                 return Some(frame);
             }
-            let chunk = tokio::time::timeout(PATIENCE, answer.next()).await.unwrap()?;
+            let chunk = within("more of the answer", answer.next()).await?;
             buffer.push_str(std::str::from_utf8(&chunk.unwrap()).unwrap());
         }
     };
@@ -250,7 +237,7 @@ async fn lines_go_both_ways_at_the_same_time() {
 async fn lines_are_not_compressed() {
     let service = Service::start(&[]).await;
     let request = service.client.post(service.url("/v1/stream")).header("content-encoding", "gzip").body("\u{1f}");
-    let response = tokio::time::timeout(PATIENCE, request.send()).await.unwrap().unwrap();
+    let response = within("an answer", request.send()).await.unwrap();
     assert_eq!(
         (response.status().as_u16(), &response.headers()["accept-encoding"]),
         (415, &"identity".parse().unwrap())
@@ -446,30 +433,6 @@ async fn a_cut_connection_and_a_restarted_server_lose_and_double_nothing() {
     assert_eq!(client.closed().await, 1000);
 }
 
-/// As sessions were stored once: weights without the names of their attributes.
-#[tokio::test]
-async fn a_session_of_an_earlier_version_is_resumed_with_its_weights() {
-    use sqlx::{ConnectOptions, Connection};
-    let (service, _) = figure_4().await;
-    let mut client = Client::connect(&service).await;
-    let session = client.open(json!({"type": "open", "model": "figure-4", "weights": {"x": 2.5}})).await;
-    let (_, stored) = service.get(&format!("/v1/sessions/{session}")).await;
-    assert_eq!(stored["weights"]["x"], 2.5);
-    drop(client);
-    let path = service.directory.path().join("etude.db");
-    let mut database = sqlx::sqlite::SqliteConnectOptions::new().filename(path).connect().await.unwrap();
-    let n_attributes = stored["weights"].as_object().unwrap().len();
-    let weights: Vec<f64> = std::iter::once(2.5).chain(std::iter::repeat_n(1.5, n_attributes - 1)).collect();
-    let update = sqlx::query("UPDATE sessions SET weights = $1").bind(json!(weights).to_string());
-    update.execute(&mut database).await.unwrap();
-    database.close().await.unwrap();
-    assert_eq!(service.get(&format!("/v1/sessions/{session}")).await.1["weights"], Value::Null);
-    let mut client = Client::connect(&service).await;
-    client.send(json!({"type": "resume", "session": session})).await;
-    let opened = client.receive().await;
-    assert_eq!((&opened["weights"]["x"], &opened["weights"]["outside"]), (&json!(2.5), &json!(1.5)));
-}
-
 #[tokio::test]
 async fn a_session_that_is_resumed_elsewhere_is_taken_over() {
     let (service, demonstration) = figure_4().await;
@@ -629,12 +592,26 @@ async fn a_client_that_never_reads_is_closed_and_its_session_is_free_again() {
     service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
     let mut stuck = Client::connect_narrowly(&service).await;
     let session = stuck.open(json!({"type": "open", "model": "figure-4", "lookahead": 1})).await;
-    tokio::time::timeout(PATIENCE, send_and_never_read(&mut stuck)).await.unwrap();
+    within("the end of a connection", send_and_never_read(&mut stuck)).await;
     let mut reader = Client::connect(&service).await;
     reader.send(json!({"type": "resume", "session": session})).await;
     let opened = reader.receive().await;
     assert!(opened["received"].as_u64().unwrap() >= 800, "{opened}");
     drop(stuck);
+}
+
+/// Whether both ends of a connection on this machine have something to send for which the other has no room: whether neither is read.
+fn are_both_stuck(one_port: u16, other_port: u16) -> bool {
+    let sockets = std::fs::read_to_string("/proc/net/tcp").unwrap();
+    // Addresses in hexadecimal, the state, the queues, and the timer, of which 4 is that of probes of a window without room.
+    let is_stuck = |from: u16, to: u16| {
+        sockets.lines().map(|line| line.split_whitespace().collect::<Vec<_>>()).any(|fields| {
+            fields[1].ends_with(&format!(":{from:04X}"))
+                && fields[2].ends_with(&format!(":{to:04X}"))
+                && fields[5].starts_with("04:")
+        })
+    };
+    is_stuck(one_port, other_port) && is_stuck(other_port, one_port)
 }
 
 #[tokio::test]
@@ -643,10 +620,14 @@ async fn a_client_that_never_reads_holds_up_nobody() {
     service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
     let demonstration = example("figure-4/demonstration.json");
     let mut stuck = Client::connect_narrowly(&service).await;
+    let port = stuck.socket.get_ref().local_addr().unwrap().port();
     stuck.open(json!({"type": "open", "model": "figure-4", "lookahead": 1})).await;
-    // Long enough for the service to wait for this client. Where it is not, the others have less to be held up by.
-    let sent = tokio::time::timeout(Duration::from_secs(2), send_and_never_read(&mut stuck)).await;
-    assert!(sent.is_err(), "it is waited for");
+    let sending = send_and_never_read(&mut stuck);
+    let are_stuck = async || are_both_stuck(service.address.port(), port).then_some(());
+    tokio::select! {
+        () = sending => panic!("it is waited for"),
+        () = until("a service and a client that wait for each other", are_stuck) => {}
+    }
     for _ in 0..3 {
         let mut other = Client::connect(&service).await;
         other.open(json!({"type": "open", "model": "figure-4"})).await;
@@ -668,7 +649,7 @@ async fn a_client_that_sends_pings_and_never_reads_is_closed() {
         let stream = client.socket.get_mut();
         while stream.write_all(&ping).await.is_ok() {}
     };
-    tokio::time::timeout(PATIENCE, sending).await.unwrap();
+    within("the end of a connection", sending).await;
 }
 
 /// A hundred thousand observations and more, without a look at the answer, on a connection of its own.
@@ -697,10 +678,10 @@ async fn who_sends_all_lines_before_reading_any_finds_the_connection_closed() {
             seq += states.len();
         }
     };
-    tokio::time::timeout(PATIENCE, sending).await.unwrap();
+    within("the end of a connection", sending).await;
     let mut all = Vec::new();
     // What has come is there; then nothing more comes.
-    let _ = tokio::time::timeout(PATIENCE, answer.read_to_end(&mut all)).await.unwrap();
+    let _ = within("the end of the answer", answer.read_to_end(&mut all)).await;
     assert!(String::from_utf8_lossy(&all).contains("\"received\""));
     // Its place is free.
     Client::connect(&service).await.open(json!({"type": "open", "model": "figure-4"})).await;
@@ -794,12 +775,7 @@ async fn idle_sessions_expire() {
     let (service, _) = figure_4().await;
     let session = Client::connect(&service).await.open(json!({"type": "open", "model": "figure-4"})).await;
     let service = Service::start_in(service.stop().await, &["--session-idle-timeout", "100ms"]).await;
-    let expired = async {
-        while service.get(&format!("/v1/sessions/{session}")).await.1["status"] != "expired" {
-            tokio::task::yield_now().await;
-        }
-    };
-    tokio::time::timeout(PATIENCE, expired).await.unwrap();
+    service.until_status(&format!("/v1/sessions/{session}"), "expired").await;
     let mut client = Client::connect(&service).await;
     assert_eq!(client.receive().await["problem"]["type"], "/problems/idle");
     assert_eq!(client.closed().await, 1008);
@@ -1148,7 +1124,7 @@ impl Wire {
 
     async fn receive_until(&mut self, kind: &str) -> Value {
         loop {
-            let came = tokio::time::timeout(PATIENCE, self.from_server.recv()).await.unwrap();
+            let came = within("a frame", self.from_server.recv()).await;
             let Some(Outgoing::Frame(text)) = came.map(|queued| queued.item) else { panic!("an end before {kind}") };
             let frame: Value = serde_json::from_str(&text).unwrap();
             if frame["type"] == kind {
@@ -1235,7 +1211,7 @@ async fn pings_are_answered_while_the_service_searches() {
     // Who vanishes now ends the search, so that another has its turn, and a shutdown waits for neither.
     drop(client);
     let request = json!({"model": "cave", "demonstration": [{"x": 0}]});
-    let other = tokio::time::timeout(PATIENCE, service.post("/v1/policies", &request)).await.unwrap();
+    let other = within("an answer", service.post("/v1/policies", &request)).await;
     assert_eq!(other.0, 201);
-    tokio::time::timeout(PATIENCE, service.stop()).await.unwrap();
+    within("the end of the service", service.stop()).await;
 }

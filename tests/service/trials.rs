@@ -181,9 +181,7 @@ async fn a_learner_that_cannot_be_read_keeps_no_other_from_learning() {
     assert_eq!(reward(&service, &broken, 1.0).await.0, 200);
     let trial = make_trial(&service).await;
     assert_eq!(reward(&service, &trial, 1.0).await.0, 200);
-    while service.get(&path_of(&trial)).await.1["status"] != "learned" {
-        tokio::task::yield_now().await;
-    }
+    service.until_status(&path_of(&trial), "learned").await;
     assert_eq!(service.get(&path_of(&broken)).await.1["status"], "rewarded");
 }
 
@@ -225,13 +223,7 @@ async fn the_periodic_learner_folds_all_that_is_pending() {
     let service = start(&["--learn-every", "20ms"]).await;
     let trial = make_trial(&service).await;
     reward(&service, &trial, 5.0).await;
-    let learned = loop {
-        let (_, trial) = service.get(&path_of(&trial)).await;
-        if trial["status"] == "learned" {
-            break trial;
-        }
-        tokio::task::yield_now().await;
-    };
+    let learned = service.until_status(&path_of(&trial), "learned").await;
     assert_eq!(learned["learned_version"], 1);
     let (_, weights) = service.get("/v1/learners/gold/weights").await;
     assert_eq!((&weights["version"], &weights["expected_reward"]), (&json!(1), &json!(5.0)));
@@ -258,13 +250,7 @@ async fn a_failed_trial_takes_no_reward_and_an_expired_one_does() {
     assert_eq!(kind(&late), (409, "/problems/already-rewarded"));
     assert_eq!(pointers(&service.post(&fail, &json!({"reason": 7, "why": 1})).await.1), ["/why", "/reason"]);
 
-    loop {
-        let (_, trial) = service.get(&path_of(&expiring)).await;
-        if trial["status"] == "expired" {
-            break;
-        }
-        tokio::task::yield_now().await;
-    }
+    service.until_status(&path_of(&expiring), "expired").await;
     let (_, list) = service.get("/v1/learners/hasty/trials?status=expired").await;
     assert_eq!(list["items"][0]["id"], expiring["id"]);
     let (status, late) = reward(&service, &expiring, 3.0).await;
@@ -426,12 +412,7 @@ async fn draws_and_weights_go_on_after_a_restart() {
     let service = Service::start_in(directory, &["--learn-every", "5ms"]).await;
     assert_eq!(make_trial(&service).await["number"], 3);
     assert_eq!(service.get(&path_of(&pending)).await.1["status"], "active");
-    loop {
-        // What was pending before the restart is learned after it.
-        let (_, weights) = service.get("/v1/learners/gold/weights").await;
-        if weights["trials"] == 1 {
-            break;
-        }
-        tokio::task::yield_now().await;
-    }
+    // What was pending before the restart is learned after it.
+    service.until_status(&path_of(&first), "learned").await;
+    assert_eq!(service.get("/v1/learners/gold/weights").await.1["trials"], 1);
 }
