@@ -10,7 +10,7 @@ CREATE TABLE service (
     models_generation  INTEGER NOT NULL  -- counts registrations and deletions of models
 ) STRICT;
 
-INSERT INTO service (id, last_alive_ms, models_generation) VALUES (1, NULL, 0);
+INSERT INTO service (id, last_alive_ms, models_generation) VALUES (1, NULL, 1);
 
 -- Models, by the name that a client gave them. `hash` is SHA-256 of the canonical text of the definition.
 CREATE TABLE models (

@@ -220,8 +220,7 @@ impl ModelNames {
 }
 
 impl Etude {
-    /// As [`Self::mapper`], without a look at the database if no model was registered or deleted since the last one. The
-    /// database is this process's alone, as far as models go.
+    /// As [`Self::mapper`], without a look at the database if no model was registered or deleted since the last one.
     pub(super) async fn known_mapper(
         &self,
         name: &str,
@@ -236,14 +235,16 @@ impl Etude {
         }
         // On the heap, as every request would carry along what only the first one for a model needs.
         let (hash, mapper) = Box::pin(self.mapper(name, pointer, Some(place), deadline)).await?;
-        let key = ModelKey { hash: hash.clone(), is_lazy: mapper.model().is_lazy() };
-        self.model_names.keys.insert(name.to_owned(), (generation, key));
+        if let Some(generation) = generation {
+            let key = ModelKey { hash: hash.clone(), is_lazy: mapper.model().is_lazy() };
+            self.model_names.keys.insert(name.to_owned(), (generation, key));
+        }
         Ok((hash, mapper))
     }
 
     /// The mapper of the model called `name`, and the hash of that, if both are known without waiting for anything.
     pub(super) fn mapper_at_hand(&self, name: &str) -> Option<(String, Arc<Mapper>)> {
-        let generation = self.store.models_generation();
+        let generation = self.store.models_generation()?;
         let (_, key) = self.model_names.keys.get(name).filter(|(known, _)| *known == generation)?;
         let mapper = self.compiler.cache.get(&key)?;
         Some((key.hash, mapper))

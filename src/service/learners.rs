@@ -4,7 +4,7 @@ use jiff::Timestamp;
 
 use super::hash::hash_of;
 use super::{Etude, Name, Registered, ServiceError, as_stored};
-use crate::store::{LearnerRow, NewLearner, Page, PutLearner, StoreError, WeightsRow};
+use crate::store::{Deletion, Fold, LearnerRow, NewLearner, Page, Registration, StoreError, WeightsRow};
 use etude_core::document;
 use etude_core::learning::{Distribution, Learner, LearnerDocument};
 
@@ -101,10 +101,10 @@ impl Etude {
             initial: learner.initial().clone(),
             created_at: as_stored(now),
         };
-        let (registered, row) = match self.store.put_learner(new).await? {
-            PutLearner::Created(row) => (Registered::New, row),
-            PutLearner::Unchanged(row) => (Registered::Already, row),
-            PutLearner::Conflict { existing_hash } => {
+        let (registered, row) = match self.store.register_learner(new).await? {
+            Registration::Created(row) => (Registered::New, row),
+            Registration::Unchanged(row) => (Registered::Already, row),
+            Registration::Conflict { existing_hash } => {
                 return Err(ServiceError::Conflict { kind: "learner", name: name.to_string(), existing_hash });
             }
         };
@@ -136,10 +136,10 @@ impl Etude {
     ///
     /// If there is none.
     pub async fn delete_learner(&self, name: &Name) -> Result<(), ServiceError> {
-        let deleted = self.store.delete_learner(name.as_str()).await?;
-        let sequence = deleted.ok_or_else(|| unknown(name.as_str(), None))?;
-        self.trial_numbers.forget(sequence);
-        Ok(())
+        match self.store.delete_learner(name.as_str()).await? {
+            Deletion::Deleted => Ok(()),
+            Deletion::Unknown => Err(unknown(name.as_str(), None)),
+        }
     }
 
     /// The last version of a learner's weights, or the one given.
@@ -199,7 +199,7 @@ impl Etude {
         }
         let folded =
             WeightsRow { version: weights.version + 1, reward_order, distribution, updated_at: as_stored(now) };
-        if !self.store.add_weights(sequence, folded.clone()).await? {
+        if self.store.fold_rewards(sequence, folded.clone()).await? == Fold::Outdated {
             // Deleted meanwhile, or another process has learned; what that made is as good.
             let Ready { learner, weights, .. } = self.ready(name, None).await?;
             return Ok(weights_answer(name, &learner, weights));

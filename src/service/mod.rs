@@ -58,7 +58,6 @@ use etude_core::model::Limits;
 use models::Uploads;
 use owners::Owners;
 use refiner::Refiner;
-use trials::TrialNumbers;
 
 /// How the service is set up.
 #[derive(Clone, Debug)]
@@ -222,7 +221,6 @@ pub struct Etude {
     n_search_threads: usize,
     limits: Limits,
     uploads: Uploads,
-    trial_numbers: TrialNumbers,
     /// Held while rewards are folded.
     learning: tokio::sync::Mutex<()>,
 }
@@ -264,7 +262,6 @@ impl Etude {
             n_search_threads: settings.pool.n_threads.max(1),
             limits: settings.limits,
             uploads: Uploads::default(),
-            trial_numbers: TrialNumbers::default(),
             learning: tokio::sync::Mutex::new(()),
         }
     }

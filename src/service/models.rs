@@ -14,8 +14,8 @@ use super::pool::Places;
 use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::store::{
-    ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, PutModel, Store,
-    StoreError, StoredDefinition,
+    Deletion, ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, Registration,
+    Store, StoreError, StoredDefinition,
 };
 use etude_core::attribute::AttributeDocument;
 use etude_core::interrupt::{Interrupt, Interrupted};
@@ -288,10 +288,10 @@ impl Etude {
             (None, Some(pieces)) => NewDefinition::Pieces(pieces),
             (None, None) => return Err(PoolError::Busy.into()),
         };
-        let (registered, summary) = match self.store.put_model(NewModel { summary, definition }).await? {
-            PutModel::Created(summary) => (Registered::New, summary),
-            PutModel::Unchanged(summary) => (Registered::Already, summary),
-            PutModel::Conflict { existing_hash } => return Err(conflict(name, existing_hash)),
+        let (registered, summary) = match self.store.register_model(NewModel { summary, definition }).await? {
+            Registration::Created(summary) => (Registered::New, summary),
+            Registration::Unchanged(summary) => (Registered::Already, summary),
+            Registration::Conflict { existing_hash } => return Err(conflict(name, existing_hash)),
         };
         self.compiler.put(key, &Arc::new(mapper)).await;
         Ok((registered, summary))
@@ -356,7 +356,10 @@ impl Etude {
     ///
     /// If there is none.
     pub async fn delete_model(&self, name: &Name) -> Result<(), ServiceError> {
-        if self.store.delete_model(name.as_str()).await? { Ok(()) } else { Err(unknown(name.as_str(), None)) }
+        match self.store.delete_model(name.as_str()).await? {
+            Deletion::Deleted => Ok(()),
+            Deletion::Unknown => Err(unknown(name.as_str(), None)),
+        }
     }
 }
 

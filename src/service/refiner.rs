@@ -25,7 +25,7 @@ use super::policies::{
 };
 use super::{Etude, PoolError, ServiceError};
 use crate::memory::Memory;
-use crate::store::{MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError};
+use crate::store::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError};
 use etude_core::document;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
 use etude_core::mapping::{Cost, Mapper, Policy, Settings, Stamp, Status};
@@ -110,10 +110,10 @@ impl Etude {
         let policy_id = refinement.policy_id.clone();
         *begun = Some(policy_id.clone());
         let may_begin = self.store.begin_refinement(&policy_id).await;
-        if !matches!(may_begin, Ok(true)) {
+        if !matches!(may_begin, Ok(Attempt::Begun)) {
             *begun = None;
         }
-        if !may_begin? {
+        if may_begin? == Attempt::GivenUp {
             tracing::error!(
                 policy_id,
                 "not refined: the process has ended each of the {MAX_ATTEMPTS} times that it was tried"
@@ -340,7 +340,7 @@ mod tests {
         let id = made(&etude, &request()).await;
         for n in 1..=MAX_ATTEMPTS {
             // As if the process had ended then.
-            assert!(etude.store.begin_refinement(&id).await.unwrap());
+            assert_eq!(etude.store.begin_refinement(&id).await.unwrap(), Attempt::Begun);
             assert_eq!(etude.store.n_attempts(&id).await, Some(n));
         }
         let mut after = 0;

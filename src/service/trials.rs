@@ -1,19 +1,16 @@
 //! Trials: drawn, mapped, rewarded.
 
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
 use jiff::Timestamp;
-use rustc_hash::FxHashMap;
 use serde_json::value::RawValue;
 use uuid::Uuid;
 
 use super::learners::{Ready, unknown};
 use super::policies::{self, Named, Searched};
-use super::{Caller, Etude, Name, ServiceError, as_stored};
+use super::{Caller, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::memory::Held;
-use crate::store::{FailTrial, NewReward, NewTrial, Page, PutReward, Store, StoreError, TrialRow, TrialStatus};
+use crate::store::{FailureAnswer, NewReward, NewTrial, Opened, Page, RewardAnswer, StoreError, TrialRow, TrialStatus};
 use etude_core::attribute::{Schema, Weights};
 use etude_core::document::{Faults, Path, Place, Range};
 use etude_core::interrupt::Interrupt;
@@ -59,7 +56,7 @@ impl Etude {
         let place = place.with_patience(deadline);
         let Named { model_hash, mapper, .. } = self.find(&envelope, faults, &place, deadline).await?;
 
-        let numbers = self.trial_numbers.of(sequence, &self.store).await?;
+        let numbers = self.store.trial_numbers(sequence).await?;
         let id = Uuid::now_v7().to_string();
         let (policy_id, weights_version) = (Uuid::now_v7().to_string(), weights.version);
         let stamp = Stamp {
@@ -86,7 +83,7 @@ impl Etude {
                 if !faults.is_empty() {
                     return None;
                 }
-                let number = numbers.fetch_add(1, Ordering::Relaxed) + 1;
+                let number = numbers.take();
                 let weights = learner.draw(&weights.distribution, number);
                 let all = learner.weights_for(schema, &weights).ok();
                 drawn = Some((number, policies::write(&learner.by_attribute(weights))));
@@ -123,8 +120,10 @@ impl Etude {
             lease_expires_at,
         };
         let is_refined = new.refinement.is_some();
-        if !self.store.add_trial(new).await? {
-            return Err(unknown(&name, None));
+        match self.store.open_trial(new).await? {
+            Opened::Yes => {}
+            Opened::NoLearner => return Err(unknown(&name, None)),
+            Opened::NumberTaken => return Err(PoolError::Busy.into()),
         }
         if is_refined {
             self.refiner.wake();
@@ -150,8 +149,8 @@ impl Etude {
     /// Draws a trial for a policy that is still in the making. The caller stores it.
     pub(super) async fn draw(&self, ready: &Ready, schema: &Schema, now: Timestamp) -> Result<Draw, ServiceError> {
         let Ready { sequence, learner, weights, .. } = ready;
-        let numbers = self.trial_numbers.of(*sequence, &self.store).await?;
-        let number = numbers.fetch_add(1, Ordering::Relaxed) + 1;
+        let numbers = self.store.trial_numbers(*sequence).await?;
+        let number = numbers.take();
         let drawn = learner.draw(&weights.distribution, number);
         let missing = |missing: etude_core::learning::MissingAttributes| Faults::one("/learner", missing.to_string());
         let all = learner.weights_for(schema, &drawn).map_err(missing)?;
@@ -227,17 +226,17 @@ impl Etude {
     /// If there is no such trial, or it has another reward or has failed.
     pub async fn accept_reward(&self, id: &str, reward: f64, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
         let new = NewReward { trial: id.to_owned(), reward, accepted_at: now };
-        let row = match self.store.put_reward(new).await? {
-            PutReward::Accepted(row) => {
+        let row = match self.store.accept_reward(new).await? {
+            RewardAnswer::Accepted(row) => {
                 metrics::counter!("etude_rewards_total").increment(1);
                 row
             }
-            PutReward::Unchanged(row) => row,
-            PutReward::Conflict { existing } => {
+            RewardAnswer::Unchanged(row) => row,
+            RewardAnswer::Conflict { existing } => {
                 return Err(ServiceError::AlreadyRewarded { trial: id.to_owned(), existing });
             }
-            PutReward::Failed => return Err(ServiceError::TrialFailed { trial: id.to_owned() }),
-            PutReward::Unknown => return Err(unknown_trial(id)),
+            RewardAnswer::Failed => return Err(ServiceError::TrialFailed { trial: id.to_owned() }),
+            RewardAnswer::Unknown => return Err(unknown_trial(id)),
         };
         Ok(TrialAnswer { status: row.status(now), row, policy: None, held: None })
     }
@@ -263,10 +262,12 @@ impl Etude {
         });
         let reason = faults.check(reason)?;
         match self.store.fail_trial(id, reason).await? {
-            FailTrial::Failed(row) => Ok(TrialAnswer { status: row.status(now), row, policy: None, held: None }),
-            FailTrial::Conflict { .. } => Err(ServiceError::TrialFailed { trial: id.to_owned() }),
-            FailTrial::Rewarded { existing } => Err(ServiceError::AlreadyRewarded { trial: id.to_owned(), existing }),
-            FailTrial::Unknown => Err(unknown_trial(id)),
+            FailureAnswer::Failed(row) => Ok(TrialAnswer { status: row.status(now), row, policy: None, held: None }),
+            FailureAnswer::Conflict { .. } => Err(ServiceError::TrialFailed { trial: id.to_owned() }),
+            FailureAnswer::Rewarded { existing } => {
+                Err(ServiceError::AlreadyRewarded { trial: id.to_owned(), existing })
+            }
+            FailureAnswer::Unknown => Err(unknown_trial(id)),
         }
     }
 }
@@ -279,32 +280,6 @@ pub(super) struct Draw {
 
 /// Every field of a request for a trial.
 const TRIAL_FIELDS: [&str; 4] = ["model", "demonstration", "start", "lookahead"];
-
-/// Numbers of trials, by learner. Kept in memory: a number that was given out but whose trial did not become durable was
-/// never seen outside, and may be given again after a restart.
-#[derive(Debug, Default)]
-pub(super) struct TrialNumbers {
-    last: Mutex<FxHashMap<i64, Arc<AtomicU64>>>,
-}
-
-impl TrialNumbers {
-    /// The last number given out by the learner with this sequence number.
-    pub(super) async fn of(&self, learner: i64, store: &Store) -> Result<Arc<AtomicU64>, StoreError> {
-        let known = self.last.lock().unwrap_or_else(PoisonError::into_inner).get(&learner).cloned();
-        if let Some(last) = known {
-            return Ok(last);
-        }
-        let stored = store.last_trial_number(learner).await?;
-        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
-        // Another request may have been faster, and have given out a number already.
-        Ok(Arc::clone(last.entry(learner).or_insert_with(|| Arc::new(AtomicU64::new(stored)))))
-    }
-
-    /// Forgets a learner that was deleted.
-    pub(super) fn forget(&self, learner: i64) {
-        self.last.lock().unwrap_or_else(PoisonError::into_inner).remove(&learner);
-    }
-}
 
 fn unknown_trial(id: &str) -> ServiceError {
     ServiceError::Unknown { kind: "trial", name: id.to_owned(), pointer: None }

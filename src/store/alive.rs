@@ -7,26 +7,34 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
-use sqlx::SqliteConnection;
 
+use super::writer::{Verb, Writing};
 use super::{StoreError, as_integer};
 
-/// A sign of life.
+/// Notes a sign of life.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Alive {
+pub(super) struct NoteAlive {
     /// When.
     pub(super) now: Timestamp,
     /// Signs of life come at least so often. Twice as long without any is time in which there was none to be given.
     pub(super) every: Duration,
 }
 
-/// Notes a sign of life, once everything has arrived in its table. `was_interrupted` if it is the first one since the service
-/// was started, or since something could not be written.
-pub(super) async fn note(
-    connection: &mut SqliteConnection,
-    Alive { now, every }: Alive,
-    was_interrupted: bool,
-) -> Result<(), StoreError> {
+impl Verb for NoteAlive {
+    type Answer = ();
+
+    const READS_OBSERVATIONS: bool = true;
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(), StoreError> {
+        note(writing, *self).await
+    }
+}
+
+/// Notes a sign of life, once everything has arrived in its table. The first one since the service was started, or since something
+/// could not be written, ends a time without service in any case.
+pub(super) async fn note(writing: &mut Writing<'_>, NoteAlive { now, every }: NoteAlive) -> Result<(), StoreError> {
+    let connection = &mut *writing.connection;
+    writing.effects.has_noted_life = true;
     let now_ms = now.as_millisecond();
     // What came for a session is a sign of life too.
     let query = sqlx::query_scalar(
@@ -37,7 +45,7 @@ pub(super) async fn note(
     let last_ms: Option<i64> = query.fetch_one(&mut *connection).await?;
     let gap_ms = last_ms.map_or(0, |last_ms| now_ms.saturating_sub(last_ms));
     let usual_ms = as_integer(u64::try_from(every.as_millis()).unwrap_or(u64::MAX)).saturating_mul(2);
-    if gap_ms > 0 && (was_interrupted || gap_ms > usual_ms) {
+    if gap_ms > 0 && (writing.was_interrupted || gap_ms > usual_ms) {
         let moved = sqlx::query(
             "UPDATE sessions SET active_at_ms = MIN(active_at_ms + $1, $2) WHERE status = 'open' AND active_at_ms < $2",
         );
@@ -58,7 +66,7 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::store::{ExpiredSession, NewObservations, NewSession, Store};
+    use crate::store::{ExpiredSession, NewObservations, NewSession, Opened, Owner, Store};
 
     const IDLE: Duration = Duration::from_hours(1);
     const EVERY: Duration = Duration::from_mins(6);
@@ -94,13 +102,20 @@ mod tests {
             trial: None,
             created_at: at(minute),
         };
-        assert!(store.open_session(session).await.unwrap());
+        assert_eq!(store.open_session(session).await.unwrap(), Opened::Yes);
     }
 
     async fn observe(store: &Store, id: &str, minute: i64) {
         let states = "[1,2,3]".to_owned();
-        let new = NewObservations { session_id: id.to_owned(), seq: 0, n_states: 3, states, at: at(minute) };
-        assert!(store.add_observations(new).await.unwrap());
+        let new = NewObservations {
+            session_id: id.to_owned(),
+            owner: Owner::FIRST,
+            seq: 0,
+            n_states: 3,
+            states,
+            at: at(minute),
+        };
+        assert_eq!(store.append_observations(new).await.unwrap(), Ok(()));
     }
 
     /// The sessions that expire at this minute.

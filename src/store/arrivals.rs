@@ -15,11 +15,12 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fmt::Write;
 
+use jiff::Timestamp;
 use serde::Deserialize;
 use serde_json::value::RawValue;
 use sqlx::SqliteConnection;
 
-use super::sessions::{self, NewObservations};
+use super::sessions::{self, NewObservations, OpenSession, Owner, SessionRefusal};
 use super::{StoreError, corrupt};
 
 /// Arrivals over this are settled with the next commit. Beyond it there is little left to be gained, and the commit that
@@ -29,8 +30,9 @@ const MAX_BYTES: usize = 1 << 20;
 /// What the writer knows of open sessions and of the table `arrivals`.
 #[derive(Debug, Default)]
 pub(super) struct Arrivals {
-    /// How many observations open sessions have, those in `arrivals` included. Whoever has some there is among them.
-    n_observations: HashMap<String, u32>,
+    /// Open sessions, by id: who owns them and how many observations they have, those in `arrivals` included. Whoever has some there is
+    /// among them.
+    open: HashMap<String, OpenSession>,
     /// Size of the table.
     n_bytes: usize,
     /// SQLite's number for what others have written. `None` if nothing is known, also not about what the table holds.
@@ -40,9 +42,9 @@ pub(super) struct Arrivals {
 /// Observations that come next in their sessions.
 #[derive(Debug)]
 pub(super) struct Accepted {
-    /// For each of the group, whether its session was open and it came next.
-    pub(super) is_next: Vec<bool>,
-    /// The row for those that did; `None` if none did.
+    /// For each of the group, whether it is accepted.
+    pub(super) answers: Vec<Result<(), SessionRefusal>>,
+    /// The row for those that are; `None` if none did.
     row: Option<String>,
 }
 
@@ -75,26 +77,27 @@ impl Arrivals {
         Ok(())
     }
 
-    /// Takes those of `group` that come next in open sessions.
+    /// Takes those of `group` that come next in open sessions, from their owners.
     pub(super) async fn accept(
         &mut self,
         connection: &mut SqliteConnection,
         group: &[&NewObservations],
     ) -> Result<Accepted, StoreError> {
         let unknown: HashSet<_> = group.iter().map(|new| &new.session_id).collect();
-        let unknown: Vec<_> = unknown.into_iter().filter(|id| !self.n_observations.contains_key(*id)).collect();
+        let unknown: Vec<_> = unknown.into_iter().filter(|id| !self.open.contains_key(*id)).collect();
         if !unknown.is_empty() {
             let ids = serde_json::to_string(&unknown).map_err(corrupt("sessions", "id"))?;
-            self.n_observations.extend(sessions::count_open(connection, &ids).await?);
+            self.open.extend(sessions::find_open(connection, &ids).await?);
         }
         let mut row = String::new();
-        let mut is_next = Vec::with_capacity(group.len());
+        let mut answers = Vec::with_capacity(group.len());
         for new in group {
-            let expected = self.n_observations.get_mut(&new.session_id).filter(|expected| **expected == new.seq);
-            is_next.push(expected.is_some());
-            let Some(expected) = expected else { continue };
-            *expected += new.n_states;
-            let NewObservations { session_id, seq, n_states, states, at } = new;
+            let answer = self.accept_one(new);
+            answers.push(answer);
+            if answer.is_err() {
+                continue;
+            }
+            let NewObservations { session_id, seq, n_states, states, at, .. } = new;
             let id = serde_json::to_string(session_id).map_err(corrupt("sessions", "id"))?;
             let separator = if row.is_empty() { '[' } else { ',' };
             let written = write!(row, "{separator}[{id},{seq},{n_states},{states},{}]", at.as_millisecond());
@@ -103,7 +106,19 @@ impl Arrivals {
         if !row.is_empty() {
             row.push(']');
         }
-        Ok(Accepted { is_next, row: Some(row).filter(|row| !row.is_empty()) })
+        Ok(Accepted { answers, row: Some(row).filter(|row| !row.is_empty()) })
+    }
+
+    fn accept_one(&mut self, new: &NewObservations) -> Result<(), SessionRefusal> {
+        let session = self.open.get_mut(&new.session_id).ok_or(SessionRefusal::NotOpen)?;
+        if session.owner != new.owner {
+            return Err(SessionRefusal::Superseded);
+        }
+        if session.n_observations != new.seq {
+            return Err(SessionRefusal::NotNext);
+        }
+        session.n_observations += new.n_states;
+        Ok(())
     }
 
     /// Adds the row of what was accepted, outside of a transaction: one statement, which is durable when this returns. Says
@@ -145,7 +160,7 @@ impl Arrivals {
         let rows: Vec<String> = query.fetch_all(&mut *connection).await?;
         if !rows.is_empty() {
             let settled = together(&rows)?;
-            let settled: Vec<&NewObservations> = settled.values().collect();
+            let settled: Vec<&Arrived> = settled.values().collect();
             let was_next = sessions::add(connection, &settled).await?;
             for (new, _) in settled.iter().zip(was_next).filter(|(_, was_next)| !was_next) {
                 refused(&new.session_id, new.seq);
@@ -161,24 +176,29 @@ impl Arrivals {
 
     /// A session was opened.
     pub(super) fn opened(&mut self, session_id: &str) {
+        self.taken(session_id, Owner::FIRST, 0);
+    }
+
+    /// A session has a new owner, once everything was settled.
+    pub(super) fn taken(&mut self, session_id: &str, owner: Owner, n_observations: u32) {
         if self.is_known() {
-            self.n_observations.insert(session_id.to_owned(), 0);
+            self.open.insert(session_id.to_owned(), OpenSession { owner, n_observations });
         }
     }
 
     /// A session was ended, once everything was settled.
     pub(super) fn ended(&mut self, session_id: &str) {
-        self.n_observations.remove(session_id);
+        self.open.remove(session_id);
     }
 
     /// Some sessions have expired, once everything was settled.
     pub(super) fn expired(&mut self) {
-        self.n_observations.clear();
+        self.open.clear();
     }
 }
 
 /// What has arrived and is not settled, by session.
-pub(super) async fn read(reader: &mut SqliteConnection) -> Result<BTreeMap<String, NewObservations>, StoreError> {
+pub(super) async fn read(reader: &mut SqliteConnection) -> Result<BTreeMap<String, Arrived>, StoreError> {
     let query = sqlx::query_scalar("SELECT observations FROM arrivals ORDER BY sequence");
     together(&query.fetch_all(reader).await?)
 }
@@ -188,14 +208,25 @@ async fn data_version(connection: &mut SqliteConnection) -> Result<i64, StoreErr
     Ok(sqlx::query_scalar("SELECT data_version FROM pragma_data_version").fetch_one(connection).await?)
 }
 
+/// Observations of a session that have arrived.
+#[derive(Debug)]
+pub(super) struct Arrived {
+    pub(super) session_id: String,
+    pub(super) seq: u32,
+    pub(super) n_states: u32,
+    /// JSON: an array of states.
+    pub(super) states: String,
+    pub(super) at: Timestamp,
+}
+
 /// An item of a row of `arrivals`.
 #[derive(Deserialize)]
 struct Arrival<'r>(String, u32, u32, #[serde(borrow)] &'r RawValue, i64);
 
 /// Reads rows, and puts what belongs to the same session together, in order.
-fn together(rows: &[String]) -> Result<BTreeMap<String, NewObservations>, StoreError> {
+fn together(rows: &[String]) -> Result<BTreeMap<String, Arrived>, StoreError> {
     const TABLE: &str = "arrivals";
-    let mut by_session = BTreeMap::<String, NewObservations>::new();
+    let mut by_session = BTreeMap::<String, Arrived>::new();
     for row in rows {
         let arrivals: Vec<Arrival<'_>> = serde_json::from_str(row).map_err(corrupt(TABLE, "observations"))?;
         for Arrival(session_id, seq, n_states, states, at_ms) in arrivals {
@@ -213,7 +244,7 @@ fn together(rows: &[String]) -> Result<BTreeMap<String, NewObservations>, StoreE
                 }
                 None => {
                     let states = states.to_owned();
-                    by_session.insert(session_id.clone(), NewObservations { session_id, seq, n_states, states, at });
+                    by_session.insert(session_id.clone(), Arrived { session_id, seq, n_states, states, at });
                 }
             }
         }
@@ -234,7 +265,7 @@ mod tests {
     use proptest::prelude::*;
     use tokio_util::task::TaskTracker;
 
-    use crate::store::{NewObservations, NewSession, Store};
+    use crate::store::{NewObservations, NewSession, Opened, Owner, Store};
 
     fn session(id: &str) -> NewSession {
         NewSession {
@@ -254,6 +285,7 @@ mod tests {
     fn observations(id: &str, seq: u32, states: &[u32]) -> NewObservations {
         NewObservations {
             session_id: id.to_owned(),
+            owner: Owner::FIRST,
             seq,
             n_states: u32::try_from(states.len()).unwrap(),
             states: serde_json::to_string(states).unwrap(),
@@ -300,7 +332,7 @@ mod tests {
                 let ids = ["a", "b"];
                 for (store, id) in stores.iter().zip(ids) {
                     store.note_alive(Timestamp::UNIX_EPOCH, Duration::MAX).await.unwrap();
-                    assert!(store.open_session(session(id)).await.unwrap());
+                    assert_eq!(store.open_session(session(id)).await.unwrap(), Opened::Yes);
                 }
                 let mut expected = [Vec::new(), Vec::new()];
                 let mut is_open = true;
@@ -311,7 +343,7 @@ mod tests {
                         Action::Add { n_states, off_by } => {
                             let seq = n_expected.saturating_add_signed(off_by);
                             let states: Vec<u32> = (seq..seq + n_states).collect();
-                            let was_next = store.add_observations(observations(id, seq, &states)).await.unwrap();
+                            let was_next = store.append_observations(observations(id, seq, &states)).await.unwrap().is_ok();
                             prop_assert_eq!(was_next, is_open && seq == n_expected);
                             if was_next {
                                 expected.extend(states);
@@ -342,7 +374,7 @@ mod tests {
                     let expected = if is_open { expected.as_slice() } else { &[] };
                     prop_assert_eq!(&stored(&store, id).await, expected);
                     let seq = u32::try_from(expected.len()).unwrap();
-                    let was_next = store.add_observations(observations(id, seq, &[seq])).await.unwrap();
+                    let was_next = store.append_observations(observations(id, seq, &[seq])).await.unwrap().is_ok();
                     prop_assert_eq!(was_next, is_open);
                 }
                 Ok(())

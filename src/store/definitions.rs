@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! begin -> piece, piece, ..            each in a transaction of its own: nobody waits for long
-//!       -> put_model                   makes them a model's, all at once
+//!       -> register_model                   makes them a model's, all at once
 //!       -> dropped, or the model deleted: the sweeper removes the pieces, some at a time
 //!       -> the program killed: a service that starts removes them
 //! ```
@@ -17,7 +17,7 @@ use sqlx::{Sqlite, SqliteConnection};
 use tokio::sync::mpsc;
 use tokio_util::task::TaskTracker;
 
-use super::writer::{Write, Writer, Written};
+use super::writer::{MAX_LARGE_BYTES, Verb, Writer, Writing};
 use super::{Store, StoreError, corrupt};
 
 /// Most text of a piece, in bytes. What is written at once is a fraction of it.
@@ -78,9 +78,9 @@ async fn sweep(writer: &Writer, id: i64) -> Result<(), StoreError> {
     /// How long to wait where nothing can be written, as on a full disk, which may be full of this.
     const PAUSE: Duration = Duration::from_secs(5);
     loop {
-        match writer.write(Write::SweepDefinition(id)).await {
-            Ok(Written::Done(true)) => return Ok(()),
-            Ok(_) => {}
+        match writer.write(SweepDefinition(id)).await {
+            Ok(Swept::All) => return Ok(()),
+            Ok(Swept::Some) => {}
             Err(StoreError::Closed) => return Err(StoreError::Closed),
             Err(StoreError::Unavailable(_)) => tokio::select! {
                 () = tokio::time::sleep(PAUSE) => {}
@@ -118,10 +118,8 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn begin_pieces(&self) -> Result<NewPieces, StoreError> {
-        match self.writer.write(Write::BeginDefinition).await? {
-            Written::BeginDefinition(id) => Ok(NewPieces { id, n_pieces: 0, sweeper: self.sweeper.clone() }),
-            _ => Err(StoreError::Closed),
-        }
+        let id = self.writer.write(BeginDefinition).await?;
+        Ok(NewPieces { id, n_pieces: 0, sweeper: self.sweeper.clone() })
     }
 
     /// Stores the next piece of a definition: text of at most [`PIECE_BYTES`].
@@ -135,7 +133,7 @@ impl Store {
         let piece = compressed.map_err(corrupt("definition_pieces", "piece"))?;
         let (definition_id, seq) = (definition.id, definition.n_pieces);
         definition.n_pieces += 1;
-        self.writer.write(Write::AddPiece { definition_id, seq, piece }).await.map(drop)
+        self.writer.write(AddPiece { definition_id, seq, piece }).await
     }
 
     /// The text of the piece `seq` of the definition `definition_id`; `None` after the last one.
@@ -161,24 +159,44 @@ impl Store {
     }
 }
 
-pub(super) async fn begin(connection: &mut SqliteConnection) -> Result<i64, StoreError> {
-    let inserted = sqlx::query("INSERT INTO definitions DEFAULT VALUES").execute(connection).await?;
-    Ok(inserted.last_insert_rowid())
+/// Begins a definition, and gives its id.
+#[derive(Debug)]
+struct BeginDefinition;
+
+impl Verb for BeginDefinition {
+    type Answer = i64;
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<i64, StoreError> {
+        let inserted = sqlx::query("INSERT INTO definitions DEFAULT VALUES").execute(&mut *writing.connection).await?;
+        Ok(inserted.last_insert_rowid())
+    }
 }
 
-pub(super) async fn add_piece(
-    connection: &mut SqliteConnection,
+/// Stores a piece of a definition.
+#[derive(Debug)]
+struct AddPiece {
     definition_id: i64,
     seq: i64,
-    piece: &[u8],
-) -> Result<(), StoreError> {
-    sqlx::query("INSERT INTO definition_pieces (definition_id, seq, piece) VALUES ($1, $2, $3)")
-        .bind(definition_id)
-        .bind(seq)
-        .bind(piece)
-        .execute(connection)
-        .await?;
-    Ok(())
+    /// Compressed.
+    piece: Vec<u8>,
+}
+
+impl Verb for AddPiece {
+    type Answer = ();
+
+    fn n_bytes(&self) -> usize {
+        self.piece.len()
+    }
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(), StoreError> {
+        sqlx::query("INSERT INTO definition_pieces (definition_id, seq, piece) VALUES ($1, $2, $3)")
+            .bind(self.definition_id)
+            .bind(self.seq)
+            .bind(&self.piece)
+            .execute(&mut *writing.connection)
+            .await?;
+        Ok(())
+    }
 }
 
 fn is_a_models<'q>(definition_id: i64) -> QueryScalar<'q, Sqlite, bool, SqliteArguments> {
@@ -198,24 +216,43 @@ pub(super) async fn is_whole(
     Ok(query.bind(definition_id).bind(n_pieces).fetch_one(connection).await?)
 }
 
-/// Removes some pieces of a definition, unless it is a model's. Says whether nothing is left to be done.
-pub(super) async fn sweep_some(connection: &mut SqliteConnection, definition_id: i64) -> Result<bool, StoreError> {
-    if is_a_models(definition_id).fetch_one(&mut *connection).await? {
-        return Ok(true);
+/// Removes some pieces of a definition, unless it is a model's.
+#[derive(Debug)]
+struct SweepDefinition(i64);
+
+/// What was removed of a definition.
+#[derive(Debug)]
+enum Swept {
+    /// Some of its pieces.
+    Some,
+    /// All that is to be removed.
+    All,
+}
+
+impl Verb for SweepDefinition {
+    type Answer = Swept;
+
+    /// Several pieces. As they are large, this comes behind those that were sent before.
+    fn n_bytes(&self) -> usize {
+        MAX_LARGE_BYTES
     }
-    let removed = sqlx::query(
-        "DELETE FROM definition_pieces WHERE definition_id = $1 AND seq IN
-             (SELECT seq FROM definition_pieces WHERE definition_id = $1 ORDER BY seq DESC LIMIT $2)",
-    )
-    .bind(definition_id)
-    .bind(N_SWEPT_AT_ONCE)
-    .execute(&mut *connection)
-    .await?;
-    if removed.rows_affected() > 0 {
-        return Ok(false);
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Swept, StoreError> {
+        let Self(id) = *self;
+        if is_a_models(id).fetch_one(&mut *writing.connection).await? {
+            return Ok(Swept::All);
+        }
+        let removed = sqlx::query(
+            "DELETE FROM definition_pieces WHERE definition_id = $1 AND seq IN
+                 (SELECT seq FROM definition_pieces WHERE definition_id = $1 ORDER BY seq DESC LIMIT $2)",
+        );
+        let removed = removed.bind(id).bind(N_SWEPT_AT_ONCE).execute(&mut *writing.connection).await?;
+        if removed.rows_affected() > 0 {
+            return Ok(Swept::Some);
+        }
+        sqlx::query("DELETE FROM definitions WHERE id = $1").bind(id).execute(&mut *writing.connection).await?;
+        Ok(Swept::All)
     }
-    sqlx::query("DELETE FROM definitions WHERE id = $1").bind(definition_id).execute(connection).await?;
-    Ok(true)
 }
 
 #[cfg(test)]
@@ -227,7 +264,7 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::store::{ModelSize, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
+    use crate::store::{Deletion, ModelSize, ModelSummary, NewDefinition, NewModel, Registration, StoredDefinition};
 
     async fn open(directory: &Path) -> (Store, TaskTracker) {
         let tasks = TaskTracker::new();
@@ -294,12 +331,12 @@ mod tests {
         let (store, tasks) = open(directory.path()).await;
         let pieces = stored(&store, &["one, ", "two, ", "three"]).await;
         assert!(store.model("m").await.unwrap().is_none());
-        let put = store.put_model(model("m", pieces)).await.unwrap();
-        assert!(matches!(put, PutModel::Created(_)));
+        let put = store.register_model(model("m", pieces)).await.unwrap();
+        assert!(matches!(put, Registration::Created(_)));
         assert_eq!(text(&store, "m").await.unwrap(), "one, two, three");
         // The same again keeps what is there, and nothing else.
         let again = stored(&store, &["one, two, three"]).await;
-        assert!(matches!(store.put_model(model("m", again)).await.unwrap(), PutModel::Unchanged(_)));
+        assert!(matches!(store.register_model(model("m", again)).await.unwrap(), Registration::Unchanged(_)));
         until_counts_are(&store, (1, 3)).await;
         close(store, tasks).await;
         let (store, tasks) = open(directory.path()).await;
@@ -312,7 +349,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let (store, tasks) = open(directory.path()).await;
         let kept = stored(&store, &["kept"]).await;
-        store.put_model(model("kept", kept)).await.unwrap();
+        store.register_model(model("kept", kept)).await.unwrap();
         let many: Vec<String> = (0..20).map(|n| n.to_string()).collect();
         let many: Vec<&str> = many.iter().map(String::as_str).collect();
         // A killed program drops nothing.
@@ -336,10 +373,8 @@ mod tests {
         let (store, tasks) = open(directory.path()).await;
         let kept = stored(&store, &[]).await;
         let dropped = stored(&store, &["one, "]).await;
-        let write = |definition_id, seq| {
-            let write = Write::AddPiece { definition_id, seq, piece: vec![0; 1 << 20] };
-            Box::pin(store.writer.write(write))
-        };
+        let write =
+            |definition_id, seq| Box::pin(store.writer.write(AddPiece { definition_id, seq, piece: vec![0; 1 << 20] }));
         let mut others = [write(kept.id, 0), write(kept.id, 1)];
         for other in &mut others {
             assert!(futures_util::poll!(other).is_pending());
@@ -363,13 +398,13 @@ mod tests {
         }
         store.add_piece(&mut continued, b"three".to_vec()).await.unwrap();
         for pieces in [continued, all_lost] {
-            let put = store.put_model(model("m", pieces)).await;
+            let put = store.register_model(model("m", pieces)).await;
             assert!(matches!(put, Err(StoreError::Lost)), "{put:?}");
         }
         assert!(store.model("m").await.unwrap().is_none());
         // Sent once more, it goes through.
         let again = stored(&store, &["one, ", "three"]).await;
-        assert!(matches!(store.put_model(model("m", again)).await.unwrap(), PutModel::Created(_)));
+        assert!(matches!(store.register_model(model("m", again)).await.unwrap(), Registration::Created(_)));
         close(store, tasks).await;
     }
 
@@ -378,7 +413,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let (store, tasks) = open(directory.path()).await;
         let pieces = stored(&store, &["all"]).await;
-        store.put_model(model("m", pieces)).await.unwrap();
+        store.register_model(model("m", pieces)).await.unwrap();
         sqlx::query("DELETE FROM definition_pieces").execute(&writing(directory.path()).await).await.unwrap();
         assert!(matches!(text(&store, "m").await, Err(StoreError::Corrupt { .. })));
         close(store, tasks).await;
@@ -391,11 +426,11 @@ mod tests {
         drop(stored(&store, &["unfinished"]).await);
         until_counts_are(&store, (0, 0)).await;
         let deleted = stored(&store, &["one, ", "two"]).await;
-        store.put_model(model("m", deleted)).await.unwrap();
+        store.register_model(model("m", deleted)).await.unwrap();
         let StoredDefinition::Pieces(id) = store.model("m").await.unwrap().unwrap().definition else {
             panic!("pieces")
         };
-        assert!(store.delete_model("m").await.unwrap());
+        assert_eq!(store.delete_model("m").await.unwrap(), Deletion::Deleted);
         until_counts_are(&store, (0, 0)).await;
         // Whoever still reads it is told, instead of taking a part for the whole.
         assert!(matches!(store.piece(id, 1).await, Err(StoreError::Removed)));

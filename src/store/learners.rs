@@ -6,8 +6,8 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
 use super::page::{Rest, Rows};
-use super::writer::{Write, Written};
-use super::{Page, Store, StoreError, as_integer, corrupt, count, page, timestamp};
+use super::writer::{Verb, Writing};
+use super::{Deletion, Page, Registration, Store, StoreError, as_integer, corrupt, count, page, timestamp};
 use etude_core::attribute::ByAttribute;
 use etude_core::learning::Distribution;
 
@@ -41,20 +41,6 @@ pub struct LearnerRow {
     pub created_at: Timestamp,
 }
 
-/// What became of a registration.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum PutLearner {
-    /// It is new.
-    Created(LearnerRow),
-    /// The same content was there already, under the same name.
-    Unchanged(LearnerRow),
-    /// Other content is there under this name; it was left alone.
-    Conflict {
-        /// The hash of what is there.
-        existing_hash: String,
-    },
-}
-
 /// A version of a learner's distribution.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WeightsRow {
@@ -79,43 +65,56 @@ pub struct RewardRow {
     pub reward: f64,
 }
 
+/// What became of a version of a learner's weights.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Fold {
+    /// It is the learner's last version now.
+    Added,
+    /// It does not follow the last version: another one was added meanwhile, or the learner is gone.
+    Outdated,
+}
+
+/// Deletes a learner, and gives its sequence number.
+#[derive(Debug)]
+struct DeleteLearner(String);
+
+/// Adds a version of a learner's weights.
+#[derive(Debug)]
+struct FoldRewards {
+    learner: i64,
+    weights: WeightsRow,
+}
+
 impl Store {
     /// Registers a learner, unless its name is taken.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn put_learner(&self, learner: NewLearner) -> Result<PutLearner, StoreError> {
-        match self.writer.write(Write::PutLearner(learner)).await? {
-            Written::PutLearner(put) => Ok(put),
-            _ => Err(StoreError::Closed),
-        }
+    pub async fn register_learner(&self, learner: NewLearner) -> Result<Registration<LearnerRow>, StoreError> {
+        self.writer.write(learner).await
     }
 
-    /// Deletes a learner with its weights, trials and rewards. Gives the sequence number of the deleted one, if there was
-    /// one.
+    /// Deletes a learner with its weights, trials and rewards.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn delete_learner(&self, name: &str) -> Result<Option<i64>, StoreError> {
-        match self.writer.write(Write::DeleteLearner(name.to_owned())).await? {
-            Written::DeleteLearner(deleted) => Ok(deleted),
-            _ => Err(StoreError::Closed),
-        }
+    pub async fn delete_learner(&self, name: &str) -> Result<Deletion, StoreError> {
+        let Some(learner) = self.writer.write(DeleteLearner(name.to_owned())).await? else {
+            return Ok(Deletion::Unknown);
+        };
+        self.trial_numbers.forget(learner);
+        Ok(Deletion::Deleted)
     }
 
-    /// Adds the version that follows the learner's last one. Says whether it did: not if that version is there already, or
-    /// the learner is gone.
+    /// Adds the version of a learner's weights into which the rewards that follow the last version are folded.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn add_weights(&self, learner: i64, weights: WeightsRow) -> Result<bool, StoreError> {
-        match self.writer.write(Write::AddWeights { learner, weights }).await? {
-            Written::AddWeights(added) => Ok(added),
-            _ => Err(StoreError::Closed),
-        }
+    pub async fn fold_rewards(&self, learner: i64, weights: WeightsRow) -> Result<Fold, StoreError> {
+        self.writer.write(FoldRewards { learner, weights }).await
     }
 
     /// The learner called `name`.
@@ -260,59 +259,71 @@ fn read_weights(row: &SqliteRow) -> Result<WeightsRow, StoreError> {
     })
 }
 
-pub(super) async fn put(connection: &mut SqliteConnection, learner: &NewLearner) -> Result<PutLearner, StoreError> {
-    let inserted = sqlx::query(
-        "INSERT INTO learners (name, hash, definition, created_at_ms) VALUES ($1, $2, $3, $4)
-         ON CONFLICT (name) DO NOTHING",
-    )
-    .bind(&learner.name)
-    .bind(&learner.hash)
-    .bind(&learner.definition)
-    .bind(learner.created_at.as_millisecond())
-    .execute(&mut *connection)
-    .await?;
-    let query = sqlx::query("SELECT * FROM learners WHERE name = $1").bind(&learner.name);
-    let row = read_learner(&query.fetch_one(&mut *connection).await?)?;
-    if inserted.rows_affected() == 1 {
-        let first = WeightsRow {
-            version: 0,
-            reward_order: 0,
-            distribution: learner.initial.clone(),
-            updated_at: learner.created_at,
-        };
-        insert_weights(connection, row.sequence, &first).await?;
-        return Ok(PutLearner::Created(row));
+impl Verb for NewLearner {
+    type Answer = Registration<LearnerRow>;
+
+    fn n_bytes(&self) -> usize {
+        self.definition.len()
     }
-    Ok(if row.hash == learner.hash {
-        PutLearner::Unchanged(row)
-    } else {
-        PutLearner::Conflict { existing_hash: row.hash }
-    })
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Registration<LearnerRow>, StoreError> {
+        let connection = &mut *writing.connection;
+        let inserted = sqlx::query(
+            "INSERT INTO learners (name, hash, definition, created_at_ms) VALUES ($1, $2, $3, $4)
+             ON CONFLICT (name) DO NOTHING",
+        )
+        .bind(&self.name)
+        .bind(&self.hash)
+        .bind(&self.definition)
+        .bind(self.created_at.as_millisecond())
+        .execute(&mut *connection)
+        .await?;
+        let query = sqlx::query("SELECT * FROM learners WHERE name = $1").bind(&self.name);
+        let row = read_learner(&query.fetch_one(&mut *connection).await?)?;
+        if inserted.rows_affected() == 1 {
+            let distribution = self.initial.clone();
+            let first = WeightsRow { version: 0, reward_order: 0, distribution, updated_at: self.created_at };
+            insert_weights(connection, row.sequence, &first).await?;
+            return Ok(Registration::Created(row));
+        }
+        Ok(if row.hash == self.hash {
+            Registration::Unchanged(row)
+        } else {
+            Registration::Conflict { existing_hash: row.hash }
+        })
+    }
 }
 
-pub(super) async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<Option<i64>, StoreError> {
-    let query = sqlx::query_scalar("DELETE FROM learners WHERE name = $1 RETURNING sequence").bind(name);
-    Ok(query.fetch_optional(connection).await?)
+impl Verb for DeleteLearner {
+    type Answer = Option<i64>;
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Option<i64>, StoreError> {
+        let query = sqlx::query_scalar("DELETE FROM learners WHERE name = $1 RETURNING sequence").bind(&self.0);
+        Ok(query.fetch_optional(&mut *writing.connection).await?)
+    }
 }
 
-pub(super) async fn add_weights(
-    connection: &mut SqliteConnection,
-    learner: i64,
-    weights: &WeightsRow,
-) -> Result<bool, StoreError> {
-    let query = sqlx::query_scalar("SELECT MAX(version) FROM weights WHERE learner = $1").bind(learner);
-    let last: Option<i64> = query.fetch_one(&mut *connection).await?;
-    // Without a version, the learner is gone.
-    if last.map(|last| last + 1) != Some(as_integer(weights.version)) {
-        return Ok(false);
+impl Verb for FoldRewards {
+    type Answer = Fold;
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Fold, StoreError> {
+        let Self { learner, weights } = self;
+        writing.known.pending.remove(learner);
+        let connection = &mut *writing.connection;
+        let query = sqlx::query_scalar("SELECT MAX(version) FROM weights WHERE learner = $1").bind(learner);
+        let last: Option<i64> = query.fetch_one(&mut *connection).await?;
+        // Without a version, the learner is gone.
+        if last.map(|last| last + 1) != Some(as_integer(weights.version)) {
+            return Ok(Fold::Outdated);
+        }
+        insert_weights(connection, *learner, weights).await?;
+        let folded = sqlx::query(
+            "UPDATE learners SET has_pending = EXISTS (SELECT 1 FROM rewards WHERE learner = $1 AND reward_order > $2)
+             WHERE sequence = $1",
+        );
+        folded.bind(learner).bind(as_integer(weights.reward_order)).execute(connection).await?;
+        Ok(Fold::Added)
     }
-    insert_weights(connection, learner, weights).await?;
-    let folded = sqlx::query(
-        "UPDATE learners SET has_pending = EXISTS (SELECT 1 FROM rewards WHERE learner = $1 AND reward_order > $2)
-         WHERE sequence = $1",
-    );
-    folded.bind(learner).bind(as_integer(weights.reward_order)).execute(connection).await?;
-    Ok(true)
 }
 
 /// Marks learners (JSON: an array of sequence numbers) as having rewards to fold.
@@ -349,112 +360,4 @@ async fn insert_weights(
 }
 
 #[cfg(test)]
-mod tests {
-    use sqlx::AssertSqlSafe;
-    use tokio_util::task::TaskTracker;
-
-    use super::*;
-    use crate::store::{NewReward, NewTrial, PutReward};
-
-    fn new_learner(name: &str) -> NewLearner {
-        let initial = Distribution { mean: vec![1.0], sd: vec![1.0], expected_reward: None };
-        NewLearner {
-            name: name.to_owned(),
-            hash: "0".to_owned(),
-            definition: "{}".to_owned(),
-            initial,
-            created_at: Timestamp::UNIX_EPOCH,
-        }
-    }
-
-    async fn learner(store: &Store, name: &str) -> i64 {
-        let PutLearner::Created(row) = store.put_learner(new_learner(name)).await.unwrap() else { panic!("it is new") };
-        row.sequence
-    }
-
-    async fn reward(store: &Store, learner: i64, number: u64) {
-        let id = format!("{learner}-{number}");
-        let trial = NewTrial {
-            id: id.clone(),
-            learner,
-            number,
-            weights: "{\"x\":1.0}".to_owned(),
-            weights_version: 0,
-            policy_id: id.clone(),
-            policy: None,
-            refinement: None,
-            created_at: Timestamp::UNIX_EPOCH,
-            lease_expires_at: Timestamp::UNIX_EPOCH,
-        };
-        assert!(store.add_trial(trial).await.unwrap());
-        let put = store.put_reward(NewReward { trial: id, reward: 1.0, accepted_at: Timestamp::UNIX_EPOCH }).await;
-        assert!(matches!(put.unwrap(), PutReward::Accepted(_)));
-    }
-
-    async fn fold(store: &Store, learner: i64, version: u64, reward_order: u64) {
-        let distribution = Distribution { mean: vec![1.0], sd: vec![1.0], expected_reward: None };
-        let weights = WeightsRow { version, reward_order, distribution, updated_at: Timestamp::UNIX_EPOCH };
-        assert!(store.add_weights(learner, weights).await.unwrap());
-    }
-
-    #[tokio::test]
-    async fn a_learner_is_behind_from_its_first_reward_to_the_fold_of_the_last_one() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("etude.db");
-        let store = Store::open(&path, &TaskTracker::new()).await.unwrap();
-        let (a, b) = (learner(&store, "a").await, learner(&store, "b").await);
-        assert_eq!(store.learners_behind().await.unwrap(), Vec::<String>::new());
-        reward(&store, a, 1).await;
-        reward(&store, b, 1).await;
-        reward(&store, b, 2).await;
-        assert_eq!(store.learners_behind().await.unwrap(), ["a", "b"]);
-        // A reward has come since the fold was begun.
-        fold(&store, a, 1, 1).await;
-        fold(&store, b, 1, 1).await;
-        assert_eq!(store.learners_behind().await.unwrap(), ["b"]);
-        fold(&store, b, 2, 2).await;
-        assert_eq!(store.learners_behind().await.unwrap(), Vec::<String>::new());
-        // After an error, nothing is known of who is marked.
-        reward(&store, b, 3).await;
-        assert!(store.add_trial(NewTrial { id: format!("{a}-1"), ..repeated(a) }).await.is_err(), "its id is taken");
-        fold(&store, b, 3, 3).await;
-        reward(&store, b, 4).await;
-        drop(store);
-        let store = Store::open(&path, &TaskTracker::new()).await.unwrap();
-        assert_eq!(store.learners_behind().await.unwrap(), ["b"]);
-        reward(&store, b, 5).await;
-        fold(&store, b, 4, 5).await;
-        assert_eq!(store.learners_behind().await.unwrap(), Vec::<String>::new());
-    }
-
-    fn repeated(learner: i64) -> NewTrial {
-        NewTrial {
-            id: String::new(),
-            learner,
-            number: 99,
-            weights: "{}".to_owned(),
-            weights_version: 0,
-            policy_id: String::new(),
-            policy: None,
-            refinement: None,
-            created_at: Timestamp::UNIX_EPOCH,
-            lease_expires_at: Timestamp::UNIX_EPOCH,
-        }
-    }
-
-    /// However many there are, the index only has those that are behind.
-    #[tokio::test]
-    async fn who_is_behind_is_looked_up_in_an_index_that_nobody_else_is_in() {
-        let directory = tempfile::tempdir().unwrap();
-        let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
-        let plan = sqlx::query(AssertSqlSafe(format!("EXPLAIN QUERY PLAN {BEHIND}")));
-        let plan = plan.fetch_all(&mut *store.reader().await.unwrap()).await.unwrap();
-        let plan: Vec<String> = plan.iter().map(|row| row.get("detail")).collect();
-        assert_eq!(plan, ["SCAN learners USING INDEX learners_with_pending"]);
-        let index: String = sqlx::query_scalar("SELECT sql FROM sqlite_schema WHERE name = 'learners_with_pending'")
-            .fetch_one(&mut *store.reader().await.unwrap())
-            .await
-            .unwrap();
-        assert!(index.ends_with("WHERE has_pending = 1"), "{index}");
-    }
-}
+mod tests;

@@ -1,7 +1,7 @@
 //! All SQL: what is durable, in SQLite.
 //!
 //! ```text
-//! service --Write--> two lines --> writer (one task, one connection): groups what is small and waits, and some of what is large
+//! service --verbs--> two lines --> writer (one task, one connection): groups what is small and waits, and some of what is large
 //!    |                                BEGIN IMMEDIATE .. COMMIT (WAL, synchronous = FULL), then answers every waiter
 //!    |                                observations: one row a group in `arrivals`, settled in their table later
 //!    +------ reads ----------------> pool of readers (query_only), one of which copies the log to the database now and then
@@ -31,26 +31,31 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use alive::Alive;
+use alive::NoteAlive;
 use database::{Database, Locking, Readers};
 use definitions::Sweeper;
 pub use definitions::{NewPieces, PIECE_BYTES};
 pub use error::{StoreError, Unavailable};
 use jiff::Timestamp;
-pub use learners::{LearnerRow, NewLearner, PutLearner, RewardRow, WeightsRow};
-pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewDefinition, NewModel, PutModel, StoredDefinition};
+pub use learners::{Fold, LearnerRow, NewLearner, RewardRow, WeightsRow};
+pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewDefinition, NewModel, StoredDefinition};
 pub use page::Page;
 pub use policies::{NewPolicy, PolicySummaryRow, pack_steps};
-pub use refinements::{MAX_ATTEMPTS, NewRefinement, RefinementEnd};
+pub use refinements::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd};
 pub use sessions::{
-    ExpiredSession, MAX_EXPIRED_AT_ONCE, NewObservations, NewSession, SessionEnd, SessionRow, SessionStatus,
+    ExpiredSession, MAX_EXPIRED_AT_ONCE, NewObservations, NewSession, Owner, SessionEnd, SessionRefusal, SessionRow,
+    SessionStatus, Taken,
 };
 
 use sqlx::Sqlite;
 use sqlx::pool::PoolConnection;
 use tokio_util::task::TaskTracker;
-pub use trials::{AcceptedReward, FailTrial, Failure, NewReward, NewTrial, PutReward, TrialRow, TrialStatus};
-use writer::{Write, Writer};
+use trials::TrialNumbers;
+pub use trials::{
+    AcceptedReward, Failure, FailureAnswer, NewReward, NewTrial, NextNumber, Opened, RewardAnswer, TrialRow,
+    TrialStatus,
+};
+use writer::Writer;
 
 /// The durable state of the service.
 #[derive(Debug)]
@@ -58,6 +63,7 @@ pub struct Store {
     readers: Arc<Readers>,
     writer: Writer,
     sweeper: Sweeper,
+    trial_numbers: TrialNumbers,
     tasks: TaskTracker,
     /// What the last check found, and when.
     checked: tokio::sync::Mutex<Option<(Instant, Result<(), Unavailable>)>>,
@@ -121,7 +127,14 @@ impl Store {
 
     fn of(readers: Arc<Readers>, writer: Writer, tasks: &TaskTracker) -> Self {
         let sweeper = Sweeper::start(writer.clone(), tasks);
-        Self { readers, writer, sweeper, tasks: tasks.clone(), checked: tokio::sync::Mutex::default() }
+        Self {
+            readers,
+            writer,
+            sweeper,
+            trial_numbers: TrialNumbers::default(),
+            tasks: tasks.clone(),
+            checked: tokio::sync::Mutex::default(),
+        }
     }
 
     /// Takes no more reads or writes. Once the writer has ended, all that was written stands in a single file.
@@ -136,8 +149,8 @@ impl Store {
         self.readers.one().await
     }
 
-    /// Counts up whenever a model was registered or deleted, before whoever did so is told.
-    pub(crate) fn models_generation(&self) -> u64 {
+    /// Another one whenever a model was registered or deleted, before whoever did so is told; `None` if that is not known now.
+    pub(crate) fn models_generation(&self) -> Option<u64> {
         self.writer.models_generation()
     }
 
@@ -148,7 +161,7 @@ impl Store {
     ///
     /// If it cannot be written.
     pub async fn note_alive(&self, now: Timestamp, every: Duration) -> Result<(), StoreError> {
-        self.writer.write(Write::Alive(Alive { now, every })).await.map(drop)
+        self.writer.write(NoteAlive { now, every }).await
     }
 
     /// Whether something can be written, as [`Self::note_alive`] is; tried at most once a second, and known within two.
@@ -173,6 +186,29 @@ impl Store {
         *checked = Some((Instant::now(), found));
         Ok(found?)
     }
+}
+
+/// What became of a registration.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Registration<T> {
+    /// It is new.
+    Created(T),
+    /// The same content was there already, under the same name.
+    Unchanged(T),
+    /// Other content is there under this name; it was left alone.
+    Conflict {
+        /// The hash of what is there.
+        existing_hash: String,
+    },
+}
+
+/// What became of a deletion.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Deletion {
+    /// It is gone.
+    Deleted,
+    /// There was nothing of this name.
+    Unknown,
 }
 
 /// How often it is tried whether something can be written. Each time costs a sync of the disk.

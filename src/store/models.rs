@@ -7,8 +7,8 @@ use sqlx::sqlite::SqliteRow;
 
 use super::definitions::{self, NewPieces};
 use super::page::Rows;
-use super::writer::{Write, Written};
-use super::{Page, Store, StoreError, as_integer, corrupt, count, page, timestamp};
+use super::writer::{MAX_LARGE_BYTES, Verb, Writing};
+use super::{Deletion, Page, Registration, Store, StoreError, as_integer, corrupt, count, page, timestamp};
 use etude_core::attribute::AttributeDocument;
 use etude_core::model::ActionDocument;
 
@@ -85,27 +85,15 @@ pub enum StoredDefinition {
     Pieces(i64),
 }
 
-/// What became of a deletion.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum DeleteModel {
-    /// There is no such model.
-    Unknown,
-    /// It is deleted; of a definition in pieces, the id.
-    Deleted(Option<i64>),
-}
+/// Deletes a model.
+#[derive(Debug)]
+struct DeleteModel(String);
 
-/// What became of a registration.
-#[derive(Clone, Debug, PartialEq)]
-pub enum PutModel {
-    /// It is new.
-    Created(ModelSummary),
-    /// The same content was there already, under the same name.
-    Unchanged(ModelSummary),
-    /// Other content is there under this name; it was left alone.
-    Conflict {
-        /// The hash of what is there.
-        existing_hash: String,
-    },
+/// A model that was deleted.
+#[derive(Debug)]
+struct DeletedModel {
+    /// Of a definition in pieces.
+    definition_id: Option<i64>,
 }
 
 impl Store {
@@ -114,29 +102,23 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn put_model(&self, model: NewModel) -> Result<PutModel, StoreError> {
-        match self.writer.write(Write::PutModel(model)).await? {
-            Written::PutModel(put) => Ok(put),
-            _ => Err(StoreError::Closed),
-        }
+    pub async fn register_model(&self, model: NewModel) -> Result<Registration<ModelSummary>, StoreError> {
+        self.writer.write(model).await
     }
 
-    /// Deletes a model. Says whether there was one.
+    /// Deletes a model.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn delete_model(&self, name: &str) -> Result<bool, StoreError> {
-        match self.writer.write(Write::DeleteModel(name.to_owned())).await? {
-            Written::DeleteModel(DeleteModel::Unknown) => Ok(false),
-            Written::DeleteModel(DeleteModel::Deleted(definition_id)) => {
-                if let Some(id) = definition_id {
-                    self.sweeper.sweep(id);
-                }
-                Ok(true)
-            }
-            _ => Err(StoreError::Closed),
+    pub async fn delete_model(&self, name: &str) -> Result<Deletion, StoreError> {
+        let Some(deleted) = self.writer.write(DeleteModel(name.to_owned())).await? else {
+            return Ok(Deletion::Unknown);
+        };
+        if let Some(id) = deleted.definition_id {
+            self.sweeper.sweep(id);
         }
+        Ok(Deletion::Deleted)
     }
 
     /// The model called `name`.
@@ -238,7 +220,57 @@ fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
     })
 }
 
-pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> Result<PutModel, StoreError> {
+impl Verb for NewModel {
+    type Answer = Registration<ModelSummary>;
+
+    fn n_bytes(&self) -> usize {
+        match &self.definition {
+            NewDefinition::Text(text) => text.len(),
+            // It may have as many labels, which are stored once more.
+            NewDefinition::Pieces(_) => MAX_LARGE_BYTES,
+        }
+    }
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Registration<ModelSummary>, StoreError> {
+        let registration = register(writing.connection, self).await?;
+        if let Registration::Created(_) = registration {
+            note_change(writing).await?;
+        }
+        Ok(registration)
+    }
+}
+
+impl Verb for DeleteModel {
+    type Answer = Option<DeletedModel>;
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Option<DeletedModel>, StoreError> {
+        let query = sqlx::query_scalar("DELETE FROM models WHERE name = $1 RETURNING definition_id").bind(&self.0);
+        let deleted = query.fetch_optional(&mut *writing.connection).await?;
+        if deleted.is_some() {
+            note_change(writing).await?;
+        }
+        Ok(deleted.map(|definition_id| DeletedModel { definition_id }))
+    }
+}
+
+/// Counts a registration or deletion.
+async fn note_change(writing: &mut Writing<'_>) -> Result<(), StoreError> {
+    let query = "UPDATE service SET models_generation = models_generation + 1 RETURNING models_generation";
+    let row = sqlx::query(query).fetch_one(&mut *writing.connection).await?;
+    writing.effects.models_generation = Some(count(&row, "service", "models_generation")?);
+    Ok(())
+}
+
+/// Changes with every registration and deletion of a model.
+pub(super) async fn generation(connection: &mut SqliteConnection) -> Result<u64, StoreError> {
+    let row = sqlx::query("SELECT models_generation FROM service").fetch_one(connection).await?;
+    count(&row, "service", "models_generation")
+}
+
+async fn register(
+    connection: &mut SqliteConnection,
+    model: &NewModel,
+) -> Result<Registration<ModelSummary>, StoreError> {
     let NewModel { summary, definition } = model;
     let (text, definition_id) = match definition {
         NewDefinition::Text(text) => (text.as_str(), None),
@@ -270,7 +302,7 @@ pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> 
             // Takes the insertion back.
             return Err(StoreError::Lost);
         }
-        return Ok(PutModel::Created(summary.clone()));
+        return Ok(Registration::Created(summary.clone()));
     }
     let query = sqlx::query(
         "SELECT name, hash, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms
@@ -279,14 +311,8 @@ pub(super) async fn put(connection: &mut SqliteConnection, model: &NewModel) -> 
     let query = query.bind(&summary.name);
     let existing = read_summary(&query.fetch_one(connection).await?)?;
     Ok(if existing.hash == summary.hash {
-        PutModel::Unchanged(existing)
+        Registration::Unchanged(existing)
     } else {
-        PutModel::Conflict { existing_hash: existing.hash }
+        Registration::Conflict { existing_hash: existing.hash }
     })
-}
-
-pub(super) async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<DeleteModel, StoreError> {
-    let query = sqlx::query_scalar("DELETE FROM models WHERE name = $1 RETURNING definition_id").bind(name);
-    let deleted: Option<Option<i64>> = query.fetch_optional(connection).await?;
-    Ok(deleted.map_or(DeleteModel::Unknown, DeleteModel::Deleted))
 }

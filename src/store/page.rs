@@ -192,7 +192,7 @@ mod tests {
                 n_unsafe: 0,
                 created_at: now,
             };
-            store.put_model(NewModel { summary, definition: NewDefinition::Text(String::new()) }).await.unwrap();
+            store.register_model(NewModel { summary, definition: NewDefinition::Text(String::new()) }).await.unwrap();
             let learner = NewLearner {
                 name: n.to_string(),
                 hash: String::new(),
@@ -200,7 +200,7 @@ mod tests {
                 initial: Distribution { mean: Vec::new(), sd: Vec::new(), expected_reward: None },
                 created_at: now,
             };
-            store.put_learner(learner).await.unwrap();
+            store.register_learner(learner).await.unwrap();
         }
         let number = |after: Option<String>| after.map_or(0, |after| after.parse().unwrap());
         assert_eq!(n_items(async |after| store.policies(number(after), 1000).await).await, [2, 2, 1]);

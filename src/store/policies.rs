@@ -11,7 +11,6 @@ use sqlx::{AssertSqlSafe, Row, SqlSafeStr, SqlStr, SqliteConnection};
 
 use super::page::{Rest, Rows};
 use super::refinements::NewRefinement;
-use super::writer::Write;
 use super::{Page, Store, StoreError, as_integer};
 use crate::memory::{Held, Memory};
 use etude_core::mapping::{ShortSteps, StoredPolicy};
@@ -33,6 +32,21 @@ impl NewPolicy {
     /// How much there is to be written.
     pub(super) fn n_bytes(&self) -> usize {
         self.summary.len() + self.steps.len()
+    }
+}
+
+/// Adds policies, all of them or none, and notes those that are to be refined.
+#[derive(Debug)]
+pub(super) struct AddPolicies {
+    pub(super) policies: Vec<NewPolicy>,
+    pub(super) refinements: Vec<NewRefinement>,
+}
+
+impl AddPolicies {
+    /// How many bytes there are to be written.
+    pub(super) fn n_bytes(&self) -> usize {
+        let policies = self.policies.iter().map(NewPolicy::n_bytes);
+        policies.chain(self.refinements.iter().map(NewRefinement::n_bytes)).sum()
     }
 }
 
@@ -58,7 +72,7 @@ impl Store {
         policies: Vec<NewPolicy>,
         refinements: Vec<NewRefinement>,
     ) -> Result<(), StoreError> {
-        self.writer.write(Write::AddPolicies(policies, refinements)).await.map(drop)
+        self.writer.add_policies(AddPolicies { policies, refinements }).await
     }
 
     /// The policy with this id, as it was answered: JSON.

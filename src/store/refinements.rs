@@ -3,7 +3,7 @@
 use sqlx::{Row, SqliteConnection};
 
 use super::policies::{self, NewPolicy};
-use super::writer::{Write, Written};
+use super::writer::{Verb, Writing};
 use super::{Store, StoreError};
 
 /// How often a refinement is taken up. What has ended the process, or was ended with it, so many times would do so for ever.
@@ -38,6 +38,23 @@ pub struct RefinementEnd {
     pub refined: Option<NewPolicy>,
 }
 
+/// Whether a refinement may be attempted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Attempt {
+    /// It may, and this attempt is counted.
+    Begun,
+    /// There were [`MAX_ATTEMPTS`] already, or it does not wait any more. Nothing of it is left.
+    GivenUp,
+}
+
+/// Counts one more attempt at the refinement of this policy.
+#[derive(Debug)]
+struct BeginRefinement(String);
+
+/// Takes an attempt at the refinement of this policy back.
+#[derive(Debug)]
+struct ReturnRefinement(String);
+
 impl Store {
     /// The refinement that has waited longest of those after the sequence number `after`, with its own.
     ///
@@ -59,17 +76,13 @@ impl Store {
         Ok(Some((row.try_get("sequence")?, refinement)))
     }
 
-    /// Begins another attempt at a refinement: durable, so that it counts whatever becomes of the process. Says whether there may be
-    /// one; if there were [`MAX_ATTEMPTS`] already, the refinement is removed.
+    /// Begins another attempt at a refinement: durable, so that it counts whatever becomes of the process.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn begin_refinement(&self, policy_id: &str) -> Result<bool, StoreError> {
-        match self.writer.write(Write::BeginRefinement(policy_id.to_owned())).await? {
-            Written::Done(has_begun) => Ok(has_begun),
-            _ => Err(StoreError::Closed),
-        }
+    pub async fn begin_refinement(&self, policy_id: &str) -> Result<Attempt, StoreError> {
+        self.writer.write(BeginRefinement(policy_id.to_owned())).await
     }
 
     /// Takes an attempt back, which has ended for reasons that are not its own.
@@ -78,7 +91,7 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn return_refinement(&self, policy_id: &str) -> Result<(), StoreError> {
-        self.writer.write(Write::ReturnRefinement(policy_id.to_owned())).await.map(drop)
+        self.writer.write(ReturnRefinement(policy_id.to_owned())).await
     }
 
     /// How often the refinement of this policy was taken up, if it waits.
@@ -94,7 +107,7 @@ impl Store {
     ///
     /// If the database failed; then nothing was stored.
     pub async fn end_refinement(&self, end: RefinementEnd) -> Result<(), StoreError> {
-        self.writer.write(Write::EndRefinement(Box::new(end))).await.map(drop)
+        self.writer.write(end).await
     }
 }
 
@@ -109,28 +122,48 @@ pub(super) async fn add(connection: &mut SqliteConnection, refinement: &NewRefin
     Ok(())
 }
 
-pub(super) async fn end(connection: &mut SqliteConnection, end: &RefinementEnd) -> Result<(), StoreError> {
-    let deleted = sqlx::query("DELETE FROM refinements WHERE policy_id = $1").bind(&end.policy_id);
-    let was_waiting = deleted.execute(&mut *connection).await?.rows_affected() > 0;
-    let (true, Some(refined)) = (was_waiting, &end.refined) else { return Ok(()) };
-    policies::add(connection, refined).await?;
-    let linked = sqlx::query("UPDATE policies SET refined_by = $2 WHERE id = $1");
-    linked.bind(&end.policy_id).bind(&refined.id).execute(connection).await?;
-    Ok(())
-}
+impl Verb for RefinementEnd {
+    type Answer = ();
 
-pub(super) async fn begin(connection: &mut SqliteConnection, policy_id: &str) -> Result<bool, StoreError> {
-    let begun = sqlx::query("UPDATE refinements SET attempts = attempts + 1 WHERE policy_id = $1 AND attempts < $2");
-    let begun = begun.bind(policy_id).bind(MAX_ATTEMPTS).execute(&mut *connection).await?;
-    if begun.rows_affected() == 0 {
-        sqlx::query("DELETE FROM refinements WHERE policy_id = $1").bind(policy_id).execute(connection).await?;
-        return Ok(false);
+    fn n_bytes(&self) -> usize {
+        self.refined.as_ref().map_or(0, NewPolicy::n_bytes)
     }
-    Ok(true)
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(), StoreError> {
+        let connection = &mut *writing.connection;
+        let deleted = sqlx::query("DELETE FROM refinements WHERE policy_id = $1").bind(&self.policy_id);
+        let was_waiting = deleted.execute(&mut *connection).await?.rows_affected() > 0;
+        let (true, Some(refined)) = (was_waiting, &self.refined) else { return Ok(()) };
+        policies::add(connection, refined).await?;
+        let linked = sqlx::query("UPDATE policies SET refined_by = $2 WHERE id = $1");
+        linked.bind(&self.policy_id).bind(&refined.id).execute(connection).await?;
+        Ok(())
+    }
 }
 
-pub(super) async fn give_back(connection: &mut SqliteConnection, policy_id: &str) -> Result<(), StoreError> {
-    let returned = sqlx::query("UPDATE refinements SET attempts = attempts - 1 WHERE policy_id = $1 AND attempts > 0");
-    returned.bind(policy_id).execute(connection).await?;
-    Ok(())
+impl Verb for BeginRefinement {
+    type Answer = Attempt;
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Attempt, StoreError> {
+        let Self(policy_id) = self;
+        let begun =
+            sqlx::query("UPDATE refinements SET attempts = attempts + 1 WHERE policy_id = $1 AND attempts < $2");
+        let begun = begun.bind(policy_id).bind(MAX_ATTEMPTS).execute(&mut *writing.connection).await?;
+        if begun.rows_affected() > 0 {
+            return Ok(Attempt::Begun);
+        }
+        let deleted = sqlx::query("DELETE FROM refinements WHERE policy_id = $1").bind(policy_id);
+        deleted.execute(&mut *writing.connection).await?;
+        Ok(Attempt::GivenUp)
+    }
+}
+
+impl Verb for ReturnRefinement {
+    type Answer = ();
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(), StoreError> {
+        let returned = "UPDATE refinements SET attempts = attempts - 1 WHERE policy_id = $1 AND attempts > 0";
+        sqlx::query(returned).bind(&self.0).execute(&mut *writing.connection).await?;
+        Ok(())
+    }
 }

@@ -22,7 +22,9 @@ use super::owners::{Ownership, TakenOver};
 use super::policies::{MAX_INLINE_BYTES, Named};
 use super::{Caller, Etude, PoolError, ServiceError};
 use crate::memory::Held;
-use crate::store::{MAX_EXPIRED_AT_ONCE, NewSession, Page, SessionRow, SessionStatus, StoreError};
+use crate::store::{
+    MAX_EXPIRED_AT_ONCE, NewSession, Opened, Owner, Page, SessionRefusal, SessionRow, SessionStatus, StoreError, Taken,
+};
 use etude_core::attribute::{ByAttribute, Schema, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, time_until_finish};
@@ -75,6 +77,16 @@ impl From<ServiceError> for SessionError {
 impl From<TakenOver> for SessionError {
     fn from(TakenOver: TakenOver) -> Self {
         Self::TakenOver
+    }
+}
+
+impl From<SessionRefusal> for SessionError {
+    fn from(refusal: SessionRefusal) -> Self {
+        match refusal {
+            SessionRefusal::Superseded => Self::TakenOver,
+            // Whoever drives a session knows what comes next, unless somebody else has added to it.
+            SessionRefusal::NotOpen | SessionRefusal::NotNext => Self::NotOpen,
+        }
     }
 }
 
@@ -154,10 +166,13 @@ impl Etude {
                 created_at: now,
             })
             .await?;
-        if !opened {
-            // Deleted in between.
-            let name = source.learner.unwrap_or_default();
-            return Err(ServiceError::Unknown { kind: "learner", name, pointer: Some("/learner") }.into());
+        match opened {
+            Opened::Yes => {}
+            Opened::NoLearner => {
+                let name = source.learner.unwrap_or_default();
+                return Err(ServiceError::Unknown { kind: "learner", name, pointer: Some("/learner") }.into());
+            }
+            Opened::NumberTaken => return Err(PoolError::Busy.into()),
         }
         let online = OnlineMapping::new(&mapper, weights.clone(), start, lookahead);
         let online = Some(online);
@@ -175,6 +190,7 @@ impl Etude {
             online,
             held: self.memory.try_take(0).map_err(ServiceError::from)?,
             client: caller.client,
+            owner: Owner::FIRST,
             ownership,
         })
     }
@@ -197,12 +213,13 @@ impl Etude {
     }
 
     async fn resume_owned(&self, id: &str, ownership: Ownership, caller: Caller) -> Result<Resumed, SessionError> {
-        // Behind whatever is still to be written for the owner before. It may be done already.
-        let _is_open = self.store.touch_session_behind_all(id, caller.now).await?;
-        let row = self.session(id).await?;
-        if row.status == SessionStatus::Expired {
-            return Err(SessionError::NotOpen);
-        }
+        // What is still to be written for the owner before is refused from now on.
+        let row = match self.store.take_session(id, caller.now).await? {
+            Taken::Open(row) => row,
+            Taken::Ended(row) if row.status == SessionStatus::Done => row,
+            Taken::Ended(_) => return Err(SessionError::NotOpen),
+            Taken::Unknown => return Err(unknown(id).into()),
+        };
         // Nobody says how long it may take.
         let deadline = caller.arrived.checked_add(time_until_finish(self.time_limits.default_deadline));
         let place = self.pool.admit_when_needed(caller.client).with_patience(deadline);
@@ -229,6 +246,7 @@ impl Etude {
             mapper,
             held: self.memory.try_take(0).map_err(ServiceError::from)?,
             client: caller.client,
+            owner: row.owner,
             ownership,
         };
         let mut steps = CommittedSteps::default();
@@ -304,8 +322,7 @@ impl Etude {
     ///
     /// If there is none.
     pub async fn session(&self, id: &str) -> Result<SessionRow, ServiceError> {
-        let unknown = || ServiceError::Unknown { kind: "session", name: id.to_owned(), pointer: None };
-        self.store.session(id).await?.ok_or_else(unknown)
+        self.store.session(id).await?.ok_or_else(|| unknown(id))
     }
 
     /// At most `limit` sessions in the order in which they were opened, from the first after the sequence number `after`.
@@ -370,6 +387,10 @@ impl Etude {
 
 /// Looking for idle sessions more often than this would only keep the disk busy.
 const MIN_CHECK_INTERVAL: Duration = Duration::from_millis(50);
+
+fn unknown(id: &str) -> ServiceError {
+    ServiceError::Unknown { kind: "session", name: id.to_owned(), pointer: None }
+}
 
 /// The weights of the session `id`, as they are stored, in the order of the model's attributes.
 fn weights_in_order(weights: &ByAttribute<f64>, schema: &Schema, id: &str) -> Result<Weights, SessionError> {

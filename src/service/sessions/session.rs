@@ -14,7 +14,7 @@ use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::service::owners::Ownership;
 use crate::service::policies::{PolicyText, as_micros, report, take_beyond_small, write_policy};
 use crate::service::{Client, Etude, PoolError, ServiceError};
-use crate::store::{AcceptedReward, NewObservations, NewRefinement, SessionEnd, TrialRow};
+use crate::store::{AcceptedReward, NewObservations, NewRefinement, Owner, SessionEnd, TrialRow};
 use etude_core::attribute::{ByAttribute, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, Uninterrupted};
@@ -46,6 +46,9 @@ pub struct Session {
     pub(super) held: Held,
     /// Who drives it.
     pub(super) client: Client,
+    /// Which owner this is. The store accepts nothing from one that was superseded.
+    pub(super) owner: Owner,
+    /// Tells of newer owners in this process, and keeps them from coming in between.
     pub(super) ownership: Ownership,
 }
 
@@ -221,9 +224,7 @@ impl Session {
         let n_known = (self.n_received - seq) as usize;
         let new = items.get(n_known..).unwrap_or_default();
         if new.is_empty() {
-            if !etude.store.touch_session(&self.id, now).await? {
-                return Err(SessionError::NotOpen);
-            }
+            etude.store.touch_session(&self.id, self.owner, now).await??;
             return Ok(Received::Mapped(CommittedSteps::default()));
         }
         if self.n_received as usize + new.len() > Demonstration::MAX_OBSERVATIONS {
@@ -242,8 +243,9 @@ impl Session {
         let observations = faults.check(observations.into_iter().collect::<Option<Vec<_>>>())?;
         #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
         let n_states = new.len() as u32;
-        let adding = etude.store.add_observations(NewObservations {
+        let appending = etude.store.append_observations(NewObservations {
             session_id: self.id.clone(),
+            owner: self.owner,
             seq: self.n_received,
             n_states,
             states: serde_json::to_string(new).map_err(ServiceError::Write)?,
@@ -257,10 +259,8 @@ impl Session {
             }
         };
         // In this order: the disk is at work before the mapping begins.
-        let (added, mapped) = tokio::join!(biased; adding, mapping);
-        if !added? {
-            return Err(SessionError::NotOpen);
-        }
+        let (appended, mapped) = tokio::join!(biased; appending, mapping);
+        appended??;
         self.n_received += n_states;
         mapped
     }
@@ -370,10 +370,8 @@ impl Session {
         };
         let ((mut steps, policy, row, refinement), texts_held) = etude.pool.run_patiently(self.client, job).await??;
         let is_refined = refinement.is_some();
-        let end = SessionEnd { session_id: self.id.clone(), policy: row.at(now), refinement };
-        if !etude.store.end_session(end).await? {
-            return Err(SessionError::NotOpen);
-        }
+        let end = SessionEnd { session_id: self.id.clone(), owner: self.owner, policy: row.at(now), refinement };
+        etude.store.end_session(end).await??;
         if is_refined {
             etude.refiner.wake();
         }

@@ -1,17 +1,18 @@
 //! The table of trials, and the log of rewards as it is written.
 
-use std::collections::{BTreeMap, BTreeSet};
+mod numbers;
+mod verbs;
 
 use jiff::Timestamp;
-use rustc_hash::{FxHashMap, FxHashSet};
 use sqlx::sqlite::SqliteRow;
-use sqlx::{AssertSqlSafe, QueryBuilder, Row, SqliteConnection};
+use sqlx::{AssertSqlSafe, Row};
 
 use super::page::{Rest, Rows};
-use super::writer::{Write, Written};
-use super::{
-    NewPolicy, NewRefinement, Page, Store, StoreError, as_integer, count, learners, policies, refinements, timestamp,
-};
+use super::{NewPolicy, NewRefinement, Page, Store, StoreError, as_integer, count, timestamp};
+pub use numbers::NextNumber;
+pub(super) use numbers::TrialNumbers;
+use verbs::FailTrial;
+pub(super) use verbs::{accept_all, open};
 
 /// A trial to be stored.
 #[derive(Clone, Debug)]
@@ -153,9 +154,20 @@ impl TrialRow {
     }
 }
 
+/// What became of a trial, or of a session that explores one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Opened {
+    /// It is open.
+    Yes,
+    /// The learner is gone.
+    NoLearner,
+    /// Another trial of the learner has its number: it was drawn for nothing. The next numbers come after those that are stored.
+    NumberTaken,
+}
+
 /// What became of a reward.
 #[derive(Clone, Debug, PartialEq)]
-pub enum PutReward {
+pub enum RewardAnswer {
     /// It is the trial's now.
     Accepted(TrialRow),
     /// It was the trial's already.
@@ -173,7 +185,7 @@ pub enum PutReward {
 
 /// What became of an attempt to end a trial without a reward.
 #[derive(Clone, Debug, PartialEq)]
-pub enum FailTrial {
+pub enum FailureAnswer {
     /// It has failed, now or before for the same reason.
     Failed(TrialRow),
     /// It had failed for another reason, which was left alone.
@@ -191,16 +203,32 @@ pub enum FailTrial {
 }
 
 impl Store {
-    /// Stores a trial and its policy. Says whether it did: not if the learner is gone.
+    /// Numbers for the next trials of a learner, which no stored trial has.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn add_trial(&self, trial: NewTrial) -> Result<bool, StoreError> {
-        match self.writer.write(Write::AddTrial(Box::new(trial))).await? {
-            Written::AddTrial(added) => Ok(added),
-            _ => Err(StoreError::Closed),
+    pub async fn trial_numbers(&self, learner: i64) -> Result<NextNumber, StoreError> {
+        if let Some(known) = self.trial_numbers.known(learner) {
+            return Ok(known);
         }
+        let query = sqlx::query("SELECT COALESCE(MAX(number), 0) AS number FROM trials WHERE learner = $1");
+        let row = query.bind(learner).fetch_one(&mut *self.reader().await?).await?;
+        Ok(self.trial_numbers.after(learner, count(&row, "trials", "number")?))
+    }
+
+    /// Stores a trial and its policy.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn open_trial(&self, trial: NewTrial) -> Result<Opened, StoreError> {
+        let learner = trial.learner;
+        let opened = self.writer.write(trial).await?;
+        if opened == Opened::NumberTaken {
+            self.trial_numbers.forget(learner);
+        }
+        Ok(opened)
     }
 
     /// Accepts a reward, unless the trial has one.
@@ -208,11 +236,8 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn put_reward(&self, reward: NewReward) -> Result<PutReward, StoreError> {
-        match self.writer.write(Write::PutReward(reward)).await? {
-            Written::PutReward(put) => Ok(*put),
-            _ => Err(StoreError::Closed),
-        }
+    pub async fn accept_reward(&self, reward: NewReward) -> Result<RewardAnswer, StoreError> {
+        self.writer.accept_reward(reward).await
     }
 
     /// Ends a trial without a reward.
@@ -220,11 +245,8 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn fail_trial(&self, id: &str, reason: Option<String>) -> Result<FailTrial, StoreError> {
-        match self.writer.write(Write::FailTrial { id: id.to_owned(), reason }).await? {
-            Written::FailTrial(failed) => Ok(*failed),
-            _ => Err(StoreError::Closed),
-        }
+    pub async fn fail_trial(&self, id: &str, reason: Option<String>) -> Result<FailureAnswer, StoreError> {
+        self.writer.write(FailTrial { id: id.to_owned(), reason }).await
     }
 
     /// The trial with this id.
@@ -262,16 +284,6 @@ impl Store {
             .page(rows, limit, Rest::IsNone)
             .await
     }
-
-    /// The largest number of a trial of a learner; 0 if there is none.
-    ///
-    /// # Errors
-    ///
-    /// If the database failed.
-    pub async fn last_trial_number(&self, learner: i64) -> Result<u64, StoreError> {
-        let query = sqlx::query("SELECT COALESCE(MAX(number), 0) AS number FROM trials WHERE learner = $1");
-        count(&query.bind(learner).fetch_one(&mut *self.reader().await?).await?, "trials", "number")
-    }
 }
 
 const SELECT: &str = "
@@ -306,141 +318,4 @@ fn read_trial(row: &SqliteRow) -> Result<TrialRow, StoreError> {
         reward,
         learned_version: learned.is_some().then(|| count(row, "weights", "learned_version")).transpose()?,
     })
-}
-
-pub(super) async fn add(connection: &mut SqliteConnection, trial: &NewTrial) -> Result<bool, StoreError> {
-    let inserted = sqlx::query(
-        "INSERT INTO trials
-             (id, learner, number, weights, weights_version, policy_id, lease_expires_at_ms, created_at_ms)
-         SELECT $1, sequence, $3, $4, $5, $6, $7, $8 FROM learners WHERE sequence = $2",
-    )
-    .bind(&trial.id)
-    .bind(trial.learner)
-    .bind(as_integer(trial.number))
-    .bind(&trial.weights)
-    .bind(as_integer(trial.weights_version))
-    .bind(&trial.policy_id)
-    .bind(trial.lease_expires_at.as_millisecond())
-    .bind(trial.created_at.as_millisecond())
-    .execute(&mut *connection)
-    .await?;
-    if inserted.rows_affected() == 0 {
-        return Ok(false);
-    }
-    if let Some(policy) = &trial.policy {
-        policies::add(connection, policy).await?;
-    }
-    if let Some(refinement) = &trial.refinement {
-        refinements::add(connection, refinement).await?;
-    }
-    Ok(true)
-}
-
-pub(super) async fn fail(
-    connection: &mut SqliteConnection,
-    id: &str,
-    reason: Option<&str>,
-) -> Result<FailTrial, StoreError> {
-    let query = sqlx::query(AssertSqlSafe(format!("{SELECT} {FROM} WHERE t.id = $1"))).bind(id);
-    let Some(row) = query.fetch_optional(&mut *connection).await? else { return Ok(FailTrial::Unknown) };
-    let mut trial = read_trial(&row)?;
-    if let Some(AcceptedReward { reward, .. }) = trial.reward {
-        return Ok(FailTrial::Rewarded { existing: reward });
-    }
-    match trial.failed {
-        Some(Failure { reason: existing }) if existing.as_deref() != reason => {
-            return Ok(FailTrial::Conflict { existing });
-        }
-        Some(_) => {}
-        None => {
-            let query = sqlx::query("UPDATE trials SET is_failed = 1, fail_reason = $2 WHERE sequence = $1");
-            query.bind(trial.sequence).bind(reason).execute(connection).await?;
-        }
-    }
-    trial.failed = Some(Failure { reason: reason.map(str::to_owned) });
-    Ok(FailTrial::Failed(trial))
-}
-
-/// Accepts rewards, in order. Takes two statements, however many there are, and another one if a learner is not yet among those that
-/// are marked as having rewards to fold, `pending`.
-pub(super) async fn reward_all(
-    connection: &mut SqliteConnection,
-    rewards: &[&NewReward],
-    pending: &mut FxHashSet<i64>,
-) -> Result<Vec<PutReward>, StoreError> {
-    let mut read = read_rewarded(connection, rewards).await?;
-    let mut accepted = Vec::with_capacity(rewards.len());
-    let mut put = Vec::with_capacity(rewards.len());
-    for new in rewards {
-        let Some(found) = read.trials.get_mut(new.trial.as_str()) else {
-            put.push(PutReward::Unknown);
-            continue;
-        };
-        put.push(match (&found.row.failed, found.row.reward) {
-            (Some(_), _) => PutReward::Failed,
-            (None, Some(AcceptedReward { reward, .. })) if reward == new.reward => {
-                PutReward::Unchanged(found.row.clone())
-            }
-            (None, Some(AcceptedReward { reward, .. })) => PutReward::Conflict { existing: reward },
-            (None, None) => {
-                let last = read.last_orders.entry(found.learner).or_insert(0);
-                *last += 1;
-                found.row.reward = Some(AcceptedReward { reward: new.reward, reward_order: *last });
-                accepted.push((found.learner, *last, found.row.sequence, new));
-                PutReward::Accepted(found.row.clone())
-            }
-        });
-    }
-    if !accepted.is_empty() {
-        let new: BTreeSet<i64> =
-            accepted.iter().map(|(learner, ..)| *learner).filter(|id| !pending.contains(id)).collect();
-        if !new.is_empty() {
-            let ids = serde_json::to_string(&new).map_err(super::corrupt("learners", "sequence"))?;
-            learners::mark_pending(connection, &ids).await?;
-            pending.extend(new);
-        }
-        let mut insert =
-            QueryBuilder::new("INSERT INTO rewards (learner, reward_order, trial, reward, accepted_at_ms) ");
-        insert.push_values(accepted, |mut row, (learner, order, trial, new)| {
-            row.push_bind(learner).push_bind(as_integer(order)).push_bind(trial).push_bind(new.reward);
-            row.push_bind(new.accepted_at.as_millisecond());
-        });
-        insert.build().execute(connection).await?;
-    }
-    Ok(put)
-}
-
-/// The trials that rewards are for, as they are before any of these.
-struct Rewarded {
-    trials: FxHashMap<String, Found>,
-    /// By learner, the order of the last reward.
-    last_orders: BTreeMap<i64, u64>,
-}
-
-struct Found {
-    learner: i64,
-    row: TrialRow,
-}
-
-async fn read_rewarded(connection: &mut SqliteConnection, rewards: &[&NewReward]) -> Result<Rewarded, StoreError> {
-    let ids: Vec<&str> = rewards.iter().map(|new| new.trial.as_str()).collect();
-    let ids = serde_json::to_string(&ids).map_err(super::corrupt("trials", "id"))?;
-    // `CROSS JOIN` makes SQLite look trials up by id, rather than ids up by trial.
-    let query = sqlx::query(AssertSqlSafe(format!(
-        "{SELECT}, t.learner,
-             (SELECT MAX(last.reward_order) FROM rewards last WHERE last.learner = t.learner) AS last_order
-         FROM json_each($1) wanted CROSS JOIN trials t ON t.id = wanted.value
-             JOIN learners l ON l.sequence = t.learner LEFT JOIN rewards r ON r.trial = t.sequence"
-    )));
-    let mut read = Rewarded { trials: FxHashMap::default(), last_orders: BTreeMap::new() };
-    for row in query.bind(ids).fetch_all(connection).await? {
-        let learner = row.try_get("learner")?;
-        let last: Option<i64> = row.try_get("last_order")?;
-        if last.is_some() {
-            read.last_orders.insert(learner, count(&row, "rewards", "last_order")?);
-        }
-        let row = read_trial(&row)?;
-        read.trials.insert(row.id.clone(), Found { learner, row });
-    }
-    Ok(read)
 }

@@ -1,21 +1,24 @@
 //! The tables of sessions and their observations.
 
-use std::collections::{BTreeMap, HashSet};
+mod verbs;
+
+use std::collections::BTreeMap;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use serde_json::Value;
+use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
 
-use super::alive::Alive;
+use super::alive::NoteAlive;
+use super::arrivals::{self, Arrived};
 use super::page::{Rest, Rows};
 use super::policies::NewPolicy;
 use super::refinements::NewRefinement;
-use super::trials::{self, NewTrial};
-use super::writer::{Line, Write, Written};
-use super::{Page, Store, StoreError, arrivals, as_integer, corrupt, count, policies, refinements, timestamp};
+use super::trials::{NewTrial, Opened};
+use super::{Page, Store, StoreError, corrupt, timestamp};
 use etude_core::attribute::ByAttribute;
+use verbs::{ExpireSessions, TakeSession, TouchSession};
+pub(super) use verbs::{OpenSession, SettleObservations, add, find_open};
 
 /// How far a session has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,6 +47,40 @@ impl SessionStatus {
     }
 }
 
+/// Who drives a session: whoever opened it, or has resumed it since. Only the newest one may add to it or end it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Owner(u32);
+
+impl Owner {
+    /// Whoever opens a session.
+    pub const FIRST: Self = Self(1);
+}
+
+/// Why nothing was done to a session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SessionRefusal {
+    /// There is none that is open.
+    #[error("the session is not open")]
+    NotOpen,
+    /// Another one has resumed it since.
+    #[error("the session has a newer owner")]
+    Superseded,
+    /// The observations do not come next.
+    #[error("the observations do not come next")]
+    NotNext,
+}
+
+/// What there is to resume.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Taken {
+    /// The session is open, and its row names the new owner.
+    Open(SessionRow),
+    /// It is done or has expired, and has no owner any more.
+    Ended(SessionRow),
+    /// There is none.
+    Unknown,
+}
+
 /// A session, without its observations.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SessionRow {
@@ -69,6 +106,8 @@ pub struct SessionRow {
     pub trial_id: Option<String>,
     /// How far it has come.
     pub status: SessionStatus,
+    /// Who opened it or has resumed it last.
+    pub owner: Owner,
     /// How many observations are stored.
     pub n_observations: u32,
     /// Its policy, if it is done.
@@ -109,6 +148,8 @@ pub struct NewSession {
 pub struct NewObservations {
     /// The session.
     pub session_id: String,
+    /// Who adds them.
+    pub owner: Owner,
     /// Index of the first of them.
     pub seq: u32,
     /// How many there are.
@@ -124,6 +165,8 @@ pub struct NewObservations {
 pub struct SessionEnd {
     /// The session.
     pub session_id: String,
+    /// Who ends it.
+    pub owner: Owner,
     /// Its policy.
     pub policy: NewPolicy,
     /// What is to be done about its policy, if that is local.
@@ -145,51 +188,63 @@ pub struct ExpiredSession {
 pub const MAX_EXPIRED_AT_ONCE: usize = 256;
 
 impl Store {
-    /// Opens a session, and its trial if it explores. Says whether the trial's learner was there.
+    /// Opens a session, and its trial if it explores. Its owner is [`Owner::FIRST`].
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn open_session(&self, session: NewSession) -> Result<bool, StoreError> {
-        self.done(Write::OpenSession(Box::new(session))).await
+    pub async fn open_session(&self, session: NewSession) -> Result<Opened, StoreError> {
+        let trial = session.trial.as_ref().map(|trial| (trial.learner, trial.number));
+        let opened = self.writer.write(session).await?;
+        if let (Opened::NumberTaken, Some((learner, _))) = (opened, trial) {
+            self.trial_numbers.forget(learner);
+        }
+        Ok(opened)
     }
 
-    /// Adds observations to an open session, durably. Says whether it was open and they came next.
+    /// Makes whoever asks the owner of a session, if that is open; for this, something came for it at `at`. Nothing is accepted from
+    /// earlier owners from then on.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn add_observations(&self, observations: NewObservations) -> Result<bool, StoreError> {
-        self.done(Write::AddObservations(observations)).await
+    pub async fn take_session(&self, id: &str, at: Timestamp) -> Result<Taken, StoreError> {
+        self.writer.write(TakeSession { id: id.to_owned(), at }).await
     }
 
-    /// Notes that something came for a session at `at`. Says whether it is open.
+    /// Appends observations to an open session, durably.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn touch_session(&self, id: &str, at: Timestamp) -> Result<bool, StoreError> {
-        self.done(Write::TouchSession { id: id.to_owned(), at }).await
+    pub async fn append_observations(
+        &self,
+        observations: NewObservations,
+    ) -> Result<Result<(), SessionRefusal>, StoreError> {
+        self.writer.append(observations).await
     }
 
-    /// As [`Self::touch_session`], once all that was sent before is written, by whoever sent it and whatever its size.
+    /// Notes that something came for an open session at `at`.
     ///
     /// # Errors
     ///
-    /// Likewise.
-    pub async fn touch_session_behind_all(&self, id: &str, at: Timestamp) -> Result<bool, StoreError> {
-        let touch = |line| self.writer.write_in(line, Write::TouchSession { id: id.to_owned(), at });
-        let (small, large) = tokio::join!(touch(Line::Small), touch(Line::Large));
-        Ok([small?, large?].iter().all(|written| matches!(written, Written::Done(true))))
+    /// If the database failed.
+    pub async fn touch_session(
+        &self,
+        id: &str,
+        owner: Owner,
+        at: Timestamp,
+    ) -> Result<Result<(), SessionRefusal>, StoreError> {
+        self.writer.write(TouchSession { id: id.to_owned(), owner, at }).await
     }
 
-    /// Ends a session: stores its policy and links them. Says whether it was open.
+    /// Ends an open session: stores its policy and links them.
     ///
     /// # Errors
     ///
     /// If the database failed; then nothing was stored.
-    pub async fn end_session(&self, end: SessionEnd) -> Result<bool, StoreError> {
-        self.done(Write::EndSession(Box::new(end))).await
+    pub async fn end_session(&self, end: SessionEnd) -> Result<Result<(), SessionRefusal>, StoreError> {
+        self.writer.write(end).await
     }
 
     /// Ends open sessions that were last active longer than `idle` before `now`, and forgets their observations:
@@ -206,28 +261,18 @@ impl Store {
         every: Duration,
     ) -> Result<Vec<ExpiredSession>, StoreError> {
         let before = now.checked_sub(idle).unwrap_or(Timestamp::MIN);
-        match self.writer.write(Write::ExpireSessions { before, alive: Alive { now, every } }).await? {
-            Written::ExpireSessions(expired) => Ok(expired),
-            _ => Err(StoreError::Closed),
-        }
-    }
-
-    async fn done(&self, write: Write) -> Result<bool, StoreError> {
-        match self.writer.write(write).await? {
-            Written::Done(was_done) => Ok(was_done),
-            _ => Err(StoreError::Closed),
-        }
+        self.writer.write(ExpireSessions { before, alive: NoteAlive { now, every } }).await
     }
 
     /// Brings observations that have arrived to their table, whoever's they are. Where nothing can be written, gives them, by session.
-    async fn settle(&self) -> Result<BTreeMap<String, NewObservations>, StoreError> {
+    async fn settle(&self) -> Result<BTreeMap<String, Arrived>, StoreError> {
         let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM arrivals)");
         if !query.fetch_one(&mut *self.reader().await?).await? {
             return Ok(BTreeMap::new());
         }
-        match self.writer.write(Write::Settle).await {
+        match self.writer.write(SettleObservations).await {
             Err(StoreError::Unavailable(_)) => arrivals::read(&mut *self.reader().await?).await,
-            settled => settled.map(|_| BTreeMap::new()),
+            settled => settled.map(|()| BTreeMap::new()),
         }
     }
 
@@ -293,7 +338,7 @@ impl Store {
 
 impl SessionRow {
     /// With what has arrived for it, and is not settled yet.
-    fn with(mut self, arrived: &BTreeMap<String, NewObservations>) -> Self {
+    fn with(mut self, arrived: &BTreeMap<String, Arrived>) -> Self {
         // What was settled since it was read is in the row already.
         if let Some(new) = arrived.get(&self.id).filter(|new| new.seq == self.n_observations) {
             self.n_observations += new.n_states;
@@ -322,149 +367,10 @@ fn read_session(row: &SqliteRow) -> Result<SessionRow, StoreError> {
         weights_version: count("weights_version")?.map(u64::from),
         trial_id: row.try_get("trial_id")?,
         status: SessionStatus::named(status).ok_or_else(|| corrupt(TABLE, "status")(status.to_owned()))?,
+        owner: Owner(count("owner")?.unwrap_or(0)),
         n_observations: count("n_observations")?.unwrap_or(0),
         policy_id: row.try_get("policy_id")?,
         created_at: timestamp(TABLE, "created_at_ms", row.try_get("created_at_ms")?)?,
         active_at: timestamp(TABLE, "active_at_ms", row.try_get("active_at_ms")?)?,
     })
-}
-
-pub(super) async fn open(connection: &mut SqliteConnection, session: &NewSession) -> Result<bool, StoreError> {
-    if let Some(trial) = &session.trial
-        && !trials::add(connection, trial).await?
-    {
-        return Ok(false);
-    }
-    let created_at_ms = session.created_at.as_millisecond();
-    sqlx::query(
-        "INSERT INTO sessions
-             (id, model, model_hash, weights, lookahead, start, learner, weights_version, trial_id,
-              status, owner, n_observations, created_at_ms, active_at_ms)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', 1, 0, $10, $10)",
-    )
-    .bind(&session.id)
-    .bind(&session.model)
-    .bind(&session.model_hash)
-    .bind(serde_json::to_string(&session.weights).map_err(corrupt("sessions", "weights"))?)
-    .bind(session.lookahead)
-    .bind(session.start)
-    .bind(&session.learner)
-    .bind(session.weights_version.map(as_integer))
-    .bind(session.trial.as_ref().map(|trial| &trial.id))
-    .bind(created_at_ms)
-    .execute(connection)
-    .await?;
-    Ok(true)
-}
-
-/// The open ones among the sessions with these ids (JSON: an array), with how many observations their table has of each.
-pub(super) async fn count_open(connection: &mut SqliteConnection, ids: &str) -> Result<Vec<(String, u32)>, StoreError> {
-    let query = sqlx::query_as(
-        "SELECT id, n_observations FROM sessions WHERE status = 'open' AND id IN (SELECT value FROM json_each($1))",
-    );
-    Ok(query.bind(ids).fetch_all(connection).await?)
-}
-
-/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. Two
-/// statements, however many there are: each one costs the driver a change of threads.
-pub(super) async fn add(
-    connection: &mut SqliteConnection,
-    group: &[&NewObservations],
-) -> Result<Vec<bool>, StoreError> {
-    let rows = group
-        .iter()
-        .map(|new| serde_json::json!([new.session_id, new.seq, new.n_states, new.states, new.at.as_millisecond()]));
-    let rows = Value::Array(rows.collect()).to_string();
-    // Only what comes next, and only once, whatever is retried or raced.
-    let updated = sqlx::query_scalar::<_, String>(
-        "UPDATE sessions
-         SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 4)
-         FROM json_each($1) AS new
-         WHERE sessions.id = new.value ->> 0 AND status = 'open' AND n_observations = new.value ->> 1
-         RETURNING sessions.id",
-    )
-    .bind(&rows)
-    .fetch_all(&mut *connection)
-    .await?;
-    let updated: HashSet<String> = updated.into_iter().collect();
-    let is_updated: Vec<bool> = group.iter().map(|new| updated.contains(&new.session_id)).collect();
-    if updated.is_empty() {
-        return Ok(is_updated);
-    }
-    let rows = if updated.len() == group.len() {
-        rows
-    } else {
-        let rows = group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated);
-        let rows = rows.map(|(new, _)| serde_json::json!([new.session_id, new.seq, new.n_states, new.states]));
-        Value::Array(rows.collect()).to_string()
-    };
-    sqlx::query(
-        "INSERT INTO observations (session_id, seq, n_states, states)
-         SELECT value ->> 0, value ->> 1, value ->> 2, value ->> 3 FROM json_each($1)",
-    )
-    .bind(rows)
-    .execute(connection)
-    .await?;
-    Ok(is_updated)
-}
-
-/// Observations that came before but are not settled yet do not undo this.
-pub(super) async fn touch(connection: &mut SqliteConnection, id: &str, at: Timestamp) -> Result<bool, StoreError> {
-    let query =
-        sqlx::query("UPDATE sessions SET active_at_ms = MAX(active_at_ms, $2) WHERE id = $1 AND status = 'open'");
-    let updated = query.bind(id).bind(at.as_millisecond()).execute(connection).await?;
-    Ok(updated.rows_affected() > 0)
-}
-
-pub(super) async fn end(connection: &mut SqliteConnection, end: &SessionEnd) -> Result<bool, StoreError> {
-    let updated = sqlx::query(
-        "UPDATE sessions SET status = 'done', policy_id = $2, active_at_ms = $3 WHERE id = $1 AND status = 'open'",
-    )
-    .bind(&end.session_id)
-    .bind(&end.policy.id)
-    .bind(end.policy.created_at.as_millisecond())
-    .execute(&mut *connection)
-    .await?;
-    if updated.rows_affected() == 0 {
-        return Ok(false);
-    }
-    policies::add(connection, &end.policy).await?;
-    if let Some(refinement) = &end.refinement {
-        refinements::add(connection, refinement).await?;
-    }
-    Ok(true)
-}
-
-pub(super) async fn expire(
-    connection: &mut SqliteConnection,
-    before: Timestamp,
-) -> Result<Vec<ExpiredSession>, StoreError> {
-    let query = sqlx::query(
-        "SELECT id, active_at_ms, n_observations FROM sessions WHERE status = 'open' AND active_at_ms < $1
-         ORDER BY active_at_ms LIMIT $2",
-    );
-    let query = query.bind(before.as_millisecond()).bind(as_integer(MAX_EXPIRED_AT_ONCE as u64));
-    let read = |row: &SqliteRow| {
-        Ok(ExpiredSession {
-            id: row.try_get("id")?,
-            active_at: timestamp("sessions", "active_at_ms", row.try_get("active_at_ms")?)?,
-            n_observations: u32::try_from(count(row, "sessions", "n_observations")?).unwrap_or(u32::MAX),
-        })
-    };
-    let rows = query.fetch_all(&mut *connection).await?;
-    let expired = rows.iter().map(read).collect::<Result<Vec<_>, StoreError>>()?;
-    if expired.is_empty() {
-        return Ok(expired);
-    }
-    let ids: Vec<&str> = expired.iter().map(|session| session.id.as_str()).collect();
-    let ids = serde_json::to_string(&ids).map_err(corrupt("sessions", "id"))?;
-    sqlx::query("DELETE FROM observations WHERE session_id IN (SELECT value FROM json_each($1))")
-        .bind(&ids)
-        .execute(&mut *connection)
-        .await?;
-    sqlx::query("UPDATE sessions SET status = 'expired' WHERE id IN (SELECT value FROM json_each($1))")
-        .bind(&ids)
-        .execute(connection)
-        .await?;
-    Ok(expired)
 }

@@ -1,0 +1,278 @@
+//! How the tables of sessions and their observations are written.
+
+use std::collections::HashSet;
+
+use jiff::Timestamp;
+use serde_json::{Value, json};
+use sqlx::sqlite::SqliteRow;
+use sqlx::{Row, SqliteConnection};
+
+use super::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, Owner, SessionEnd, SessionRefusal, Taken, read_session};
+use crate::store::alive::{self, NoteAlive};
+use crate::store::arrivals::Arrived;
+use crate::store::policies::NewPolicy;
+use crate::store::refinements::NewRefinement;
+use crate::store::trials::{self, Opened};
+use crate::store::writer::{Verb, Writing};
+use crate::store::{StoreError, as_integer, corrupt, count, policies, refinements, timestamp};
+
+/// Brings observations that have arrived to their table.
+#[derive(Debug)]
+pub(in crate::store) struct SettleObservations;
+
+/// Makes whoever asks the owner of a session.
+#[derive(Debug)]
+pub(super) struct TakeSession {
+    pub(super) id: String,
+    pub(super) at: Timestamp,
+}
+
+/// Notes that something came for a session.
+#[derive(Debug)]
+pub(super) struct TouchSession {
+    pub(super) id: String,
+    pub(super) owner: Owner,
+    pub(super) at: Timestamp,
+}
+
+/// Expires some of the sessions that were last active before a time, after a sign of life.
+#[derive(Debug)]
+pub(super) struct ExpireSessions {
+    pub(super) before: Timestamp,
+    pub(super) alive: NoteAlive,
+}
+
+impl Verb for SettleObservations {
+    type Answer = ();
+
+    const READS_OBSERVATIONS: bool = true;
+
+    async fn apply(&self, _: &mut Writing<'_>) -> Result<(), StoreError> {
+        // Was done before.
+        Ok(())
+    }
+}
+
+impl Verb for NewSession {
+    type Answer = Opened;
+
+    fn n_bytes(&self) -> usize {
+        self.trial.as_ref().map_or(0, Verb::n_bytes)
+    }
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Opened, StoreError> {
+        if let Some(trial) = &self.trial {
+            let opened = trials::open(writing.connection, trial).await?;
+            if opened != Opened::Yes {
+                return Ok(opened);
+            }
+        }
+        insert(writing.connection, self).await?;
+        writing.known.arrivals.opened(&self.id);
+        Ok(Opened::Yes)
+    }
+}
+
+impl Verb for TakeSession {
+    type Answer = Taken;
+
+    const READS_OBSERVATIONS: bool = true;
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Taken, StoreError> {
+        let Self { id, at } = self;
+        let in_row = |error: StoreError| error.of_row("sessions", id);
+        let taken = sqlx::query(
+            "UPDATE sessions SET owner = owner + 1, active_at_ms = MAX(active_at_ms, $2)
+             WHERE id = $1 AND status = 'open' RETURNING *",
+        );
+        let taken = taken.bind(id).bind(at.as_millisecond()).fetch_optional(&mut *writing.connection).await?;
+        if let Some(row) = taken {
+            let session = read_session(&row).map_err(in_row)?;
+            writing.known.arrivals.taken(id, session.owner, session.n_observations);
+            return Ok(Taken::Open(session));
+        }
+        let query = sqlx::query("SELECT * FROM sessions WHERE id = $1").bind(id);
+        let row = query.fetch_optional(&mut *writing.connection).await?;
+        row.map_or(Ok(Taken::Unknown), |row| Ok(Taken::Ended(read_session(&row).map_err(in_row)?)))
+    }
+}
+
+impl Verb for TouchSession {
+    type Answer = Result<(), SessionRefusal>;
+
+    /// Observations that came before but are not settled yet do not undo it.
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Result<(), SessionRefusal>, StoreError> {
+        let Self { id, owner, at } = self;
+        let updated = sqlx::query(
+            "UPDATE sessions SET active_at_ms = MAX(active_at_ms, $3) WHERE id = $1 AND status = 'open' AND owner = $2",
+        );
+        let updated =
+            updated.bind(id).bind(owner.0).bind(at.as_millisecond()).execute(&mut *writing.connection).await?;
+        if updated.rows_affected() > 0 { Ok(Ok(())) } else { refusal(writing.connection, id).await.map(Err) }
+    }
+}
+
+impl Verb for SessionEnd {
+    type Answer = Result<(), SessionRefusal>;
+
+    const READS_OBSERVATIONS: bool = true;
+
+    fn n_bytes(&self) -> usize {
+        self.policy.n_bytes() + self.refinement.as_ref().map_or(0, NewRefinement::n_bytes)
+    }
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Result<(), SessionRefusal>, StoreError> {
+        let NewPolicy { id: policy_id, created_at, .. } = &self.policy;
+        let updated = sqlx::query(
+            "UPDATE sessions SET status = 'done', policy_id = $3, active_at_ms = $4
+             WHERE id = $1 AND status = 'open' AND owner = $2",
+        );
+        let updated =
+            updated.bind(&self.session_id).bind(self.owner.0).bind(policy_id).bind(created_at.as_millisecond());
+        if updated.execute(&mut *writing.connection).await?.rows_affected() == 0 {
+            return refusal(writing.connection, &self.session_id).await.map(Err);
+        }
+        writing.known.arrivals.ended(&self.session_id);
+        policies::add(writing.connection, &self.policy).await?;
+        if let Some(refinement) = &self.refinement {
+            refinements::add(writing.connection, refinement).await?;
+        }
+        Ok(Ok(()))
+    }
+}
+
+impl Verb for ExpireSessions {
+    type Answer = Vec<ExpiredSession>;
+
+    const READS_OBSERVATIONS: bool = true;
+
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Vec<ExpiredSession>, StoreError> {
+        alive::note(writing, self.alive).await?;
+        writing.known.arrivals.expired();
+        expire(writing.connection, self.before).await
+    }
+}
+
+/// Why nothing was done to a session by somebody who is not its owner, or of which there is none that is open.
+async fn refusal(connection: &mut SqliteConnection, id: &str) -> Result<SessionRefusal, StoreError> {
+    let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM sessions WHERE id = $1 AND status = 'open')");
+    let is_open = query.bind(id).fetch_one(connection).await?;
+    Ok(if is_open { SessionRefusal::Superseded } else { SessionRefusal::NotOpen })
+}
+
+async fn insert(connection: &mut SqliteConnection, session: &NewSession) -> Result<(), StoreError> {
+    let created_at_ms = session.created_at.as_millisecond();
+    sqlx::query(
+        "INSERT INTO sessions
+             (id, model, model_hash, weights, lookahead, start, learner, weights_version, trial_id,
+              status, owner, n_observations, created_at_ms, active_at_ms)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', $11, 0, $10, $10)",
+    )
+    .bind(&session.id)
+    .bind(&session.model)
+    .bind(&session.model_hash)
+    .bind(serde_json::to_string(&session.weights).map_err(corrupt("sessions", "weights"))?)
+    .bind(session.lookahead)
+    .bind(session.start)
+    .bind(&session.learner)
+    .bind(session.weights_version.map(as_integer))
+    .bind(session.trial.as_ref().map(|trial| &trial.id))
+    .bind(created_at_ms)
+    .bind(Owner::FIRST.0)
+    .execute(connection)
+    .await?;
+    Ok(())
+}
+
+/// What is known of an open session.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::store) struct OpenSession {
+    pub(in crate::store) owner: Owner,
+    pub(in crate::store) n_observations: u32,
+}
+
+/// The open ones among the sessions with these ids (JSON: an array), with how many observations their table has of each.
+pub(in crate::store) async fn find_open(
+    connection: &mut SqliteConnection,
+    ids: &str,
+) -> Result<Vec<(String, OpenSession)>, StoreError> {
+    let query = sqlx::query_as::<_, (String, u32, u32)>(
+        "SELECT id, owner, n_observations FROM sessions
+         WHERE status = 'open' AND id IN (SELECT value FROM json_each($1))",
+    );
+    let open = query.bind(ids).fetch_all(connection).await?.into_iter();
+    Ok(open.map(|(id, owner, n_observations)| (id, OpenSession { owner: Owner(owner), n_observations })).collect())
+}
+
+/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. Two
+/// statements, however many there are: each one costs the driver a change of threads.
+pub(in crate::store) async fn add(
+    connection: &mut SqliteConnection,
+    group: &[&Arrived],
+) -> Result<Vec<bool>, StoreError> {
+    let rows =
+        group.iter().map(|new| json!([new.session_id, new.seq, new.n_states, new.states, new.at.as_millisecond()]));
+    let rows = Value::Array(rows.collect()).to_string();
+    // Only what comes next, and only once, whatever is retried or raced.
+    let updated = sqlx::query_scalar::<_, String>(
+        "UPDATE sessions
+         SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 4)
+         FROM json_each($1) AS new
+         WHERE sessions.id = new.value ->> 0 AND status = 'open' AND n_observations = new.value ->> 1
+         RETURNING sessions.id",
+    )
+    .bind(&rows)
+    .fetch_all(&mut *connection)
+    .await?;
+    let updated: HashSet<String> = updated.into_iter().collect();
+    let is_updated: Vec<bool> = group.iter().map(|new| updated.contains(&new.session_id)).collect();
+    if updated.is_empty() {
+        return Ok(is_updated);
+    }
+    let rows = if updated.len() == group.len() {
+        rows
+    } else {
+        let rows = group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated);
+        let rows = rows.map(|(new, _)| json!([new.session_id, new.seq, new.n_states, new.states]));
+        Value::Array(rows.collect()).to_string()
+    };
+    sqlx::query(
+        "INSERT INTO observations (session_id, seq, n_states, states)
+         SELECT value ->> 0, value ->> 1, value ->> 2, value ->> 3 FROM json_each($1)",
+    )
+    .bind(rows)
+    .execute(connection)
+    .await?;
+    Ok(is_updated)
+}
+
+async fn expire(connection: &mut SqliteConnection, before: Timestamp) -> Result<Vec<ExpiredSession>, StoreError> {
+    let query = sqlx::query(
+        "SELECT id, active_at_ms, n_observations FROM sessions WHERE status = 'open' AND active_at_ms < $1
+         ORDER BY active_at_ms LIMIT $2",
+    );
+    let query = query.bind(before.as_millisecond()).bind(as_integer(MAX_EXPIRED_AT_ONCE as u64));
+    let read = |row: &SqliteRow| {
+        Ok(ExpiredSession {
+            id: row.try_get("id")?,
+            active_at: timestamp("sessions", "active_at_ms", row.try_get("active_at_ms")?)?,
+            n_observations: u32::try_from(count(row, "sessions", "n_observations")?).unwrap_or(u32::MAX),
+        })
+    };
+    let rows = query.fetch_all(&mut *connection).await?;
+    let expired = rows.iter().map(read).collect::<Result<Vec<_>, StoreError>>()?;
+    if expired.is_empty() {
+        return Ok(expired);
+    }
+    let ids: Vec<&str> = expired.iter().map(|session| session.id.as_str()).collect();
+    let ids = serde_json::to_string(&ids).map_err(corrupt("sessions", "id"))?;
+    sqlx::query("DELETE FROM observations WHERE session_id IN (SELECT value FROM json_each($1))")
+        .bind(&ids)
+        .execute(&mut *connection)
+        .await?;
+    sqlx::query("UPDATE sessions SET status = 'expired' WHERE id IN (SELECT value FROM json_each($1))")
+        .bind(&ids)
+        .execute(connection)
+        .await?;
+    Ok(expired)
+}

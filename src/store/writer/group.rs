@@ -1,0 +1,169 @@
+//! How a group of requests becomes durable: in one statement where that suffices, else in one transaction.
+
+use sqlx::{Connection, SqliteConnection};
+
+use super::Known;
+use super::verb::{Effects, Job, Writing};
+use crate::store::arrivals::Arrivals;
+use crate::store::sessions::SessionRefusal;
+use crate::store::{NewObservations, NewPolicy, StoreError, policies, refinements, trials};
+
+/// Applies `group`: durable when this returns.
+pub(super) async fn write(
+    connection: &mut SqliteConnection,
+    known: &mut Known,
+    group: &mut [Job],
+    was_interrupted: bool,
+) -> Result<Effects, StoreError> {
+    if append_at_once(connection, &mut known.arrivals, group).await? || add_policies_at_once(connection, group).await? {
+        return Ok(Effects::default());
+    }
+    transact(connection, known, group, was_interrupted).await
+}
+
+/// The observations in a group, in order.
+fn observations(group: &[Job]) -> Vec<&NewObservations> {
+    let new = |job| match job {
+        &Job::Observations(ref asked) => Some(&asked.request),
+        _ => None,
+    };
+    group.iter().filter_map(new).collect()
+}
+
+/// Appends observations in one statement, if there is nothing else in the group, all of them come next as far as is known, and nobody
+/// else has written meanwhile. Says whether it did; it has done nothing otherwise.
+async fn append_at_once(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &mut [Job],
+) -> Result<bool, StoreError> {
+    let news = observations(group);
+    if news.len() < group.len() || !arrivals.is_known() || arrivals.is_full() {
+        return Ok(false);
+    }
+    let accepted = arrivals.accept(connection, &news).await?;
+    if accepted.answers.iter().any(Result::is_err) || !arrivals.add_at_once(connection, &accepted).await? {
+        // That takes a closer look.
+        arrivals.forget();
+        return Ok(false);
+    }
+    answer_observations(group, accepted.answers);
+    Ok(true)
+}
+
+fn answer_observations(group: &mut [Job], answers: Vec<Result<(), SessionRefusal>>) {
+    let asked = group.iter_mut().filter_map(|job| match job {
+        Job::Observations(asked) => Some(asked),
+        _ => None,
+    });
+    for (asked, answer) in asked.zip(answers) {
+        asked.answer = Some(answer);
+    }
+}
+
+/// Adds policies in one statement, if there is nothing else in the group and they fit. Says whether it did; it has done nothing
+/// otherwise.
+async fn add_policies_at_once(connection: &mut SqliteConnection, group: &mut [Job]) -> Result<bool, StoreError> {
+    let is_all = |job: &Job| matches!(job, Job::Policies(asked) if asked.request.refinements.is_empty());
+    let was_added = group.iter().all(is_all) && policies::add_at_once(connection, &added_policies(group)).await?;
+    if was_added {
+        answer_policies(group);
+    }
+    Ok(was_added)
+}
+
+/// The policies that come by themselves in a group, in order.
+fn added_policies(group: &[Job]) -> Vec<&NewPolicy> {
+    let added = |job| match job {
+        &Job::Policies(ref asked) => asked.request.policies.as_slice(),
+        _ => &[],
+    };
+    group.iter().flat_map(added).collect()
+}
+
+fn answer_policies(group: &mut [Job]) {
+    for job in group {
+        if let Job::Policies(asked) = job {
+            asked.answer = Some(());
+        }
+    }
+}
+
+/// Applies `group` in one transaction: observations and policies first, rewards last, each all together. Nobody was answered yet, so that
+/// any order is one in which they may have come.
+async fn transact(
+    connection: &mut SqliteConnection,
+    known: &mut Known,
+    group: &mut [Job],
+    was_interrupted: bool,
+) -> Result<Effects, StoreError> {
+    let mut effects = Effects::default();
+    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    append(&mut transaction, &mut known.arrivals, group).await?;
+    policies::add_all(&mut transaction, &added_policies(group)).await?;
+    for job in &mut *group {
+        match job {
+            Job::Policies(asked) => {
+                for refinement in &asked.request.refinements {
+                    refinements::add(&mut transaction, refinement).await?;
+                }
+            }
+            Job::Other(verb) => {
+                let (connection, effects) = (&mut *transaction, &mut effects);
+                verb.apply(&mut Writing { connection, known, effects, was_interrupted }).await?;
+            }
+            Job::Observations(_) | Job::Reward(_) => {}
+        }
+    }
+    answer_policies(group);
+    accept_rewards(&mut transaction, known, group).await?;
+    transaction.commit().await?;
+    Ok(effects)
+}
+
+/// Appends the observations in `group`, and brings all to their table if somebody in it reads them.
+async fn append(
+    transaction: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &mut [Job],
+) -> Result<(), StoreError> {
+    let are_read = group.iter().any(|job| matches!(job, Job::Other(verb) if verb.reads_observations()));
+    let news = observations(group);
+    // Whoever has nothing to do with observations does not wait for them.
+    if !are_read && news.is_empty() {
+        return Ok(());
+    }
+    arrivals.check(transaction).await?;
+    if !arrivals.is_known() {
+        arrivals.settle(transaction).await?;
+    }
+    let accepted = arrivals.accept(transaction, &news).await?;
+    arrivals.add(transaction, &accepted).await?;
+    if are_read || arrivals.is_full() {
+        arrivals.settle(transaction).await?;
+    }
+    answer_observations(group, accepted.answers);
+    Ok(())
+}
+
+/// Accepts the rewards in `group`, in order.
+async fn accept_rewards(
+    transaction: &mut SqliteConnection,
+    known: &mut Known,
+    group: &mut [Job],
+) -> Result<(), StoreError> {
+    let asked = group.iter_mut().filter_map(|job| match job {
+        Job::Reward(asked) => Some(asked),
+        _ => None,
+    });
+    let mut asked: Vec<_> = asked.collect();
+    if asked.is_empty() {
+        return Ok(());
+    }
+    let rewards: Vec<_> = asked.iter().map(|asked| &asked.request).collect();
+    let answers = trials::accept_all(transaction, &rewards, &mut known.pending).await?;
+    for (asked, answer) in asked.iter_mut().zip(answers) {
+        asked.answer = Some(answer);
+    }
+    Ok(())
+}

@@ -1,0 +1,338 @@
+//! The one writer, which groups commits.
+//!
+//! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies it in one
+//! transaction, and answers all of it after the commit. Before it takes it, it lets everybody go on who is ready to and may bring it
+//! more: so groups grow with the load, and nobody waits for a clock. What is small waits in a line of its own, and a group has all of
+//! it, but of what is large only about as much as a disk writes in no time: so nobody waits behind what others have sent. Observations, which are most of it, only arrive with a commit,
+//! and are settled in their table later (`arrivals`). A group of nothing but observations, or nothing but policies, takes a single
+//! statement, as each costs the driver a change of threads.
+//!
+//! After an error nothing is known of the connection: a transaction may be open or not, whatever the driver has counted. So it is closed,
+//! and whoever writes next opens another. Nothing is acknowledged that is not in the file which has the database's name then.
+
+mod group;
+mod lines;
+#[cfg(test)]
+mod tests;
+mod verb;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use rustc_hash::FxHashSet;
+use sqlx::{Connection, SqliteConnection};
+use tokio::sync::mpsc::error::TrySendError;
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use super::arrivals::Arrivals;
+use super::database::{Database, Readers};
+use super::policies::AddPolicies;
+use super::sessions::SessionRefusal;
+use super::trials::{NewReward, RewardAnswer};
+use super::{NewObservations, StoreError, Unavailable, models};
+pub(super) use lines::MAX_LARGE_BYTES;
+use lines::{Lines, MAX_SMALL_BYTES};
+use verb::{Asked, Job};
+pub(super) use verb::{Verb, Writing};
+
+/// Most small requests in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
+const MAX_GROUP: usize = 256;
+
+/// How long those who ask wait to get in line.
+const LINE_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// What is written to the log between two checkpoints, roughly: as much as SQLite itself lets be written.
+const CHECKPOINT_BYTES: usize = 4 << 20;
+
+/// What a commit writes whatever it holds, roughly: four pages.
+const COMMIT_BYTES: usize = 16 << 10;
+
+/// The way to the writer.
+#[derive(Clone, Debug)]
+pub(super) struct Writer {
+    small: mpsc::Sender<Job>,
+    large: mpsc::Sender<Job>,
+    closing: CancellationToken,
+    models_generation: ModelsGeneration,
+}
+
+/// The generation of models that the database has, as far as is known: read by whoever opens a way to write, and forgotten with that.
+#[derive(Clone, Debug, Default)]
+struct ModelsGeneration(Arc<AtomicU64>);
+
+impl ModelsGeneration {
+    /// Stands for one that is not known. The database counts from 1.
+    const UNKNOWN: u64 = 0;
+
+    fn get(&self) -> Option<u64> {
+        Some(self.0.load(Ordering::Acquire)).filter(|generation| *generation != Self::UNKNOWN)
+    }
+
+    fn set(&self, generation: Option<u64>) {
+        self.0.store(generation.unwrap_or(Self::UNKNOWN), Ordering::Release);
+    }
+}
+
+impl Writer {
+    /// Starts the writer in `tasks`, with its way to the database if there is one yet, and ways to read beside it. It ends when it is
+    /// closed or dropped, and everything waiting has been written.
+    pub(super) fn start(
+        database: Database,
+        connection: Option<SqliteConnection>,
+        readers: Arc<Readers>,
+        tasks: &TaskTracker,
+    ) -> Self {
+        let (writer, lines) = Self::with_lines();
+        let open = Open {
+            database,
+            connection,
+            readers,
+            tasks: tasks.clone(),
+            n_logged_bytes: 0,
+            checkpoint: None,
+            known: Known::default(),
+            was_interrupted: true,
+            trouble: None,
+            models_generation: writer.models_generation.clone(),
+        };
+        tasks.spawn(open.run(lines));
+        writer
+    }
+
+    /// The way to no writer.
+    pub(super) fn none() -> Self {
+        let (writer, _) = Self::with_lines();
+        writer.close();
+        writer
+    }
+
+    /// The way to whoever takes what is in the lines.
+    fn with_lines() -> (Self, Lines) {
+        let closing = CancellationToken::new();
+        let (lines, [small, large]) = Lines::new(closing.clone());
+        (Self { small, large, closing, models_generation: ModelsGeneration::default() }, lines)
+    }
+
+    /// Another one whenever a model was registered or deleted, before whoever did so is told; `None` if that is not known now.
+    pub(super) fn models_generation(&self) -> Option<u64> {
+        self.models_generation.get()
+    }
+
+    /// Takes no more requests, and ends once everything waiting has been written.
+    pub(super) fn close(&self) {
+        self.closing.cancel();
+    }
+
+    /// Completes when no more requests are taken.
+    pub(super) async fn closed(&self) {
+        self.closing.cancelled().await;
+    }
+
+    /// Applies `verb`, and returns once that is on disk. Whoever goes away does not undo it; nor do those of the three that follow.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed; then nothing of `verb` was done.
+    pub(super) async fn write<V: Verb>(&self, verb: V) -> Result<V::Answer, StoreError> {
+        let (asked, answered) = Asked::new(verb);
+        self.send(Job::Other(Box::new(asked)), answered).await
+    }
+
+    /// Appends observations to an open session.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub(super) async fn append(&self, new: NewObservations) -> Result<Result<(), SessionRefusal>, StoreError> {
+        let (asked, answered) = Asked::new(new);
+        self.send(Job::Observations(asked), answered).await
+    }
+
+    /// Adds policies.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub(super) async fn add_policies(&self, added: AddPolicies) -> Result<(), StoreError> {
+        let (asked, answered) = Asked::new(added);
+        self.send(Job::Policies(asked), answered).await
+    }
+
+    /// Accepts a reward, unless its trial has one.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub(super) async fn accept_reward(&self, reward: NewReward) -> Result<RewardAnswer, StoreError> {
+        let (asked, answered) = Asked::new(reward);
+        self.send(Job::Reward(asked), answered).await
+    }
+
+    async fn send<A>(&self, job: Job, answered: oneshot::Receiver<Result<A, StoreError>>) -> Result<A, StoreError> {
+        let line = if job.n_bytes() > MAX_SMALL_BYTES { &self.large } else { &self.small };
+        match line.try_send(job) {
+            Ok(()) => {}
+            Err(TrySendError::Closed(_)) => return Err(StoreError::Closed),
+            Err(TrySendError::Full(job)) => match tokio::time::timeout(LINE_TIMEOUT, line.send(job)).await {
+                Ok(sent) => sent.map_err(|_| StoreError::Closed)?,
+                Err(_) => return Err(Unavailable::Slow.into()),
+            },
+        }
+        // The writer answers everything that it takes, unless it ends before.
+        answered.await.map_err(|_| StoreError::Closed)?
+    }
+}
+
+/// What the writer knows of the database without looking, as long as what it writes succeeds.
+#[derive(Debug, Default)]
+pub(super) struct Known {
+    pub(super) arrivals: Arrivals,
+    /// Learners that are marked as having rewards to fold.
+    pub(super) pending: FxHashSet<i64>,
+}
+
+/// The writer at work.
+struct Open {
+    database: Database,
+    /// `None` after an error, until something is to be written.
+    connection: Option<SqliteConnection>,
+    readers: Arc<Readers>,
+    tasks: TaskTracker,
+    /// Roughly, since the last checkpoint was begun.
+    n_logged_bytes: usize,
+    /// The last checkpoint.
+    checkpoint: Option<JoinHandle<()>>,
+    known: Known,
+    /// Whether no sign of life was written since the start, or since the database was unavailable.
+    was_interrupted: bool,
+    /// Why nothing could be written the last time, if that was so.
+    trouble: Option<Unavailable>,
+    models_generation: ModelsGeneration,
+}
+
+impl Open {
+    async fn run(mut self, mut lines: Lines) {
+        let mut group = Vec::with_capacity(MAX_GROUP);
+        loop {
+            // Whoever is ready to go on may have something for this group too.
+            tokio::task::yield_now().await;
+            if !lines.take(&mut group).await {
+                break;
+            }
+            match self.commit(&mut group).await {
+                Ok(()) => group.drain(..).for_each(|job| job.tell(Ok(()))),
+                Err(StoreError::Unavailable(unavailable)) => {
+                    // Each on its own would fare no better.
+                    group.drain(..).for_each(|job| job.tell(Err(unavailable.into())));
+                    // What has waited meanwhile has waited as long for the lock.
+                    if unavailable == Unavailable::Locked {
+                        lines.drain().for_each(|job| job.tell(Err(unavailable.into())));
+                    }
+                }
+                Err(_) if group.len() > 1 => {
+                    // One request must not spoil the others: each gets a transaction and an error of its own.
+                    for mut job in group.drain(..) {
+                        let committed = self.commit(std::slice::from_mut(&mut job)).await;
+                        job.tell(committed);
+                    }
+                }
+                Err(error) => {
+                    if let Some(job) = group.pop() {
+                        job.tell(Err(error));
+                    }
+                }
+            }
+        }
+        self.close().await;
+    }
+
+    /// Applies `group`. If it cannot be, what was known is forgotten, and the connection with it.
+    async fn commit(&mut self, group: &mut [Job]) -> Result<(), StoreError> {
+        if let Err(error) = self.try_commit(group).await {
+            return Err(self.failed(error).await);
+        }
+        self.n_logged_bytes += COMMIT_BYTES + group.iter().map(Job::n_bytes).sum::<usize>();
+        if self.n_logged_bytes >= CHECKPOINT_BYTES {
+            self.checkpoint();
+        }
+        if self.trouble.take().is_some() {
+            tracing::info!("the database takes writes again");
+        }
+        Ok(())
+    }
+
+    async fn try_commit(&mut self, group: &mut [Job]) -> Result<(), StoreError> {
+        let connection = match &mut self.connection {
+            Some(connection) => connection,
+            none => none.insert(self.database.connect().await?),
+        };
+        if self.models_generation.get().is_none() {
+            self.models_generation.set(Some(models::generation(connection).await?));
+        }
+        let effects = group::write(connection, &mut self.known, group, self.was_interrupted).await?;
+        self.database.check_written()?;
+        self.was_interrupted &= !effects.has_noted_life;
+        if effects.models_generation.is_some() {
+            self.models_generation.set(effects.models_generation);
+        }
+        Ok(())
+    }
+
+    /// Has the log copied to the database's file, beside the writing.
+    fn checkpoint(&mut self) {
+        if self.checkpoint.as_ref().is_none_or(JoinHandle::is_finished) {
+            self.n_logged_bytes = 0;
+            let readers = Arc::clone(&self.readers);
+            self.checkpoint = Some(self.tasks.spawn(async move {
+                if let Err(error) = readers.checkpoint().await {
+                    // A commit does it, once the log is long; and where nothing can be written, writers are told so.
+                    tracing::debug!(error = &error as &dyn std::error::Error, "the log was not copied");
+                }
+            }));
+        }
+    }
+
+    async fn failed(&mut self, error: StoreError) -> StoreError {
+        self.known = Known::default();
+        self.models_generation.set(None);
+        if let Some(connection) = self.connection.take() {
+            self.database.disconnect(connection).await;
+        }
+        let error = self.database.diagnose(error).await;
+        if let StoreError::Unavailable(unavailable) = error {
+            self.was_interrupted = true;
+            if self.trouble.replace(unavailable) != Some(unavailable) {
+                tracing::error!(error = &unavailable as &dyn std::error::Error, "nothing can be written for now");
+            }
+        }
+        error
+    }
+
+    async fn close(mut self) {
+        let Some(mut connection) = self.connection.take() else { return };
+        if !self.known.arrivals.is_empty()
+            && let Err(error) = settle(&mut connection, &mut self.known.arrivals).await
+        {
+            // They are durable where they are.
+            tracing::warn!(
+                error = &error as &dyn std::error::Error,
+                "observations were left for the next start to settle"
+            );
+        }
+        // Checkpoints the log, so that what is left behind is a single file.
+        if let Err(error) = connection.close().await {
+            tracing::warn!(error = &error as &dyn std::error::Error, "the database was not closed cleanly");
+        }
+    }
+}
+
+/// Brings what has arrived to its table.
+async fn settle(connection: &mut SqliteConnection, arrivals: &mut Arrivals) -> Result<(), StoreError> {
+    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
+    arrivals.settle(&mut transaction).await?;
+    Ok(transaction.commit().await?)
+}

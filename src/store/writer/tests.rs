@@ -1,0 +1,202 @@
+//! In which order things are written, and what becomes of those who wait.
+
+use std::fs;
+use std::path::Path;
+
+use futures_util::future::join_all;
+use futures_util::{FutureExt, poll};
+use jiff::Timestamp;
+use tokio::task::unconstrained;
+
+use super::lines::MAX_WAITING;
+use super::*;
+use crate::store::database::{Locking, N_READERS};
+use crate::store::policies::NewPolicy;
+use crate::store::sessions::SettleObservations;
+use crate::store::{NewObservations, NewSession, Opened, Owner, SessionEnd, Store, Taken};
+
+fn policy(id: &str, n_bytes: usize) -> AddPolicies {
+    let steps = vec![0; n_bytes];
+    let (id, summary) = (id.to_owned(), "{}".to_owned());
+    let policies = vec![NewPolicy { id, summary, steps, created_at: Timestamp::UNIX_EPOCH }];
+    AddPolicies { policies, refinements: Vec::new() }
+}
+
+async fn open(directory: &Path) -> Store {
+    Store::open(&directory.join("etude.db"), &TaskTracker::new()).await.unwrap()
+}
+
+/// Sizes of what is in the next group.
+async fn group(lines: &mut Lines) -> Vec<usize> {
+    let mut group = Vec::new();
+    lines.take(&mut group).await;
+    group.iter().map(|job| job.n_bytes() >> 10).collect()
+}
+
+#[tokio::test]
+async fn what_is_small_goes_first_and_of_what_is_large_each_has_its_turn() {
+    let (writer, mut lines) = Writer::with_lines();
+    let send = |n_kib: usize| Box::pin(writer.add_policies(policy("p", n_kib << 10)));
+    let mut sent: Vec<_> = [700, 800, 100, 200, 300, 5, 900, 1, 2].map(send).into();
+    for sent in &mut sent {
+        assert!(poll!(sent).is_pending());
+    }
+    assert_eq!(group(&mut lines).await, [1, 2, 700]);
+    let mut later = send(3);
+    assert!(poll!(&mut later).is_pending());
+    assert_eq!(group(&mut lines).await, [3, 800]);
+    assert_eq!(group(&mut lines).await, [100, 200, 300]);
+    writer.close();
+    assert_eq!(group(&mut lines).await, [5, 900], "what waits is still written");
+    assert!(!lines.take(&mut Vec::new()).await);
+    assert!(matches!(writer.add_policies(policy("p", 0)).await, Err(StoreError::Closed)));
+}
+
+#[tokio::test]
+async fn lines_end_with_those_who_might_bring_something() {
+    let (writer, mut lines) = Writer::with_lines();
+    let mut group = Vec::new();
+    let mut taken = Box::pin(lines.take(&mut group));
+    assert!(poll!(&mut taken).is_pending());
+    drop(writer);
+    assert!(!taken.await);
+}
+
+#[tokio::test(start_paused = true)]
+async fn who_does_not_get_in_line_for_long_is_told_so() {
+    let (writer, mut lines) = Writer::with_lines();
+    let waiting = (0..MAX_WAITING).map(|_| writer.write(SettleObservations));
+    let mut waiting = Box::pin(join_all(waiting));
+    assert!(poll!(&mut waiting).is_pending());
+    let one_more = writer.write(SettleObservations).await;
+    assert!(matches!(one_more, Err(StoreError::Unavailable(Unavailable::Slow))), "{one_more:?}");
+    assert!(poll!(&mut waiting).is_pending());
+    assert_eq!(lines.drain().count(), MAX_WAITING, "it is not written later");
+}
+
+#[tokio::test]
+async fn who_has_waited_behind_a_locked_database_does_not_wait_as_long_once_more() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("etude.db");
+    let mut database = Database::new(&path, Locking::None).unwrap();
+    let mut connection = database.connect().await.unwrap();
+    sqlx::query("PRAGMA busy_timeout = 1").execute(&mut connection).await.unwrap();
+    let mut other = Database::new(&path, Locking::None).unwrap().connect().await.unwrap();
+    let held = other.begin_with("BEGIN IMMEDIATE").await.unwrap();
+    let readers = database.readers().unwrap();
+    let writer = Writer::start(database, Some(connection), readers, &TaskTracker::new());
+    let sizes = [0; MAX_GROUP + 1].into_iter().chain([1 << 20; 2]);
+    let mut sent: Vec<_> = sizes.map(|n_bytes| Box::pin(writer.add_policies(policy("p", n_bytes)))).collect();
+    for sent in &mut sent {
+        assert!(poll!(sent).is_pending());
+    }
+    let is_locked =
+        |written: Result<(), StoreError>| matches!(written, Err(StoreError::Unavailable(Unavailable::Locked)));
+    assert!(is_locked(sent.remove(0).await));
+    assert!(sent.into_iter().all(|sent| unconstrained(sent).now_or_never().is_some_and(is_locked)));
+    held.rollback().await.unwrap();
+    writer.add_policies(policy("p", 0)).await.unwrap();
+}
+
+#[tokio::test]
+async fn what_an_owner_still_has_in_line_is_refused_once_another_has_resumed_the_session() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = open(directory.path()).await;
+    let session = NewSession {
+        id: "s".to_owned(),
+        model: "m".to_owned(),
+        model_hash: "0".to_owned(),
+        weights: [("x".into(), 1.0)].into_iter().collect(),
+        lookahead: None,
+        start: None,
+        learner: None,
+        weights_version: None,
+        trial: None,
+        created_at: Timestamp::UNIX_EPOCH,
+    };
+    assert_eq!(store.open_session(session).await.unwrap(), Opened::Yes);
+    let mut others: Vec<_> = ["a", "b", "c"].map(|id| Box::pin(store.writer.add_policies(policy(id, 1 << 20)))).into();
+    for other in &mut others {
+        assert!(poll!(other).is_pending());
+    }
+    let states = format!("[{}1]", " ".repeat(2 * MAX_SMALL_BYTES));
+    let at = Timestamp::UNIX_EPOCH;
+    let new = |owner| {
+        let states = states.clone();
+        NewObservations { session_id: "s".to_owned(), owner, seq: 0, n_states: 1, states, at }
+    };
+    let mut late = Box::pin(store.append_observations(new(Owner::FIRST)));
+    assert!(poll!(&mut late).is_pending(), "it is behind what is large");
+    let Taken::Open(taken) = store.take_session("s", at).await.unwrap() else { panic!("it is open") };
+    assert_eq!(taken.n_observations, 0);
+    assert_eq!(late.await.unwrap(), Err(SessionRefusal::Superseded));
+    assert_eq!(store.touch_session("s", Owner::FIRST, at).await.unwrap(), Err(SessionRefusal::Superseded));
+    assert_eq!(store.append_observations(new(taken.owner)).await.unwrap(), Ok(()));
+    assert_eq!(store.append_observations(new(Owner::FIRST)).await.unwrap(), Err(SessionRefusal::Superseded));
+    assert_eq!(store.session("s").await.unwrap().unwrap().n_observations, 1);
+}
+
+/// Another process stands for another server: what this one knows in memory must not count.
+#[tokio::test]
+async fn an_owner_that_another_process_has_superseded_adds_and_ends_nothing() {
+    let directory = tempfile::tempdir().unwrap();
+    let stores = [open(directory.path()).await, open(directory.path()).await];
+    let session = NewSession {
+        id: "s".to_owned(),
+        model: "m".to_owned(),
+        model_hash: "0".to_owned(),
+        weights: [("x".into(), 1.0)].into_iter().collect(),
+        lookahead: None,
+        start: None,
+        learner: None,
+        weights_version: None,
+        trial: None,
+        created_at: Timestamp::UNIX_EPOCH,
+    };
+    assert_eq!(stores[0].open_session(session).await.unwrap(), Opened::Yes);
+    let at = Timestamp::UNIX_EPOCH;
+    let new = |owner, seq| {
+        let states = "[1]".to_owned();
+        NewObservations { session_id: "s".to_owned(), owner, seq, n_states: 1, states, at }
+    };
+    assert_eq!(stores[0].append_observations(new(Owner::FIRST, 0)).await.unwrap(), Ok(()));
+    let Taken::Open(taken) = stores[1].take_session("s", at).await.unwrap() else { panic!("it is open") };
+    assert_eq!(taken.n_observations, 1);
+    assert_eq!(stores[0].append_observations(new(Owner::FIRST, 1)).await.unwrap(), Err(SessionRefusal::Superseded));
+    let policy = policy("p", 0).policies.remove(0);
+    let end = |owner| SessionEnd { session_id: "s".to_owned(), owner, policy: policy.clone(), refinement: None };
+    assert_eq!(stores[0].end_session(end(Owner::FIRST)).await.unwrap(), Err(SessionRefusal::Superseded));
+    assert_eq!(stores[1].append_observations(new(taken.owner, 1)).await.unwrap(), Ok(()));
+    assert_eq!(stores[1].end_session(end(taken.owner)).await.unwrap(), Ok(()));
+    assert_eq!(stores[0].append_observations(new(taken.owner, 2)).await.unwrap(), Err(SessionRefusal::NotOpen));
+}
+
+#[tokio::test]
+async fn a_commit_leaves_it_to_others_to_copy_the_log() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = open(directory.path()).await;
+    let n_bytes = || fs::metadata(directory.path().join("etude.db")).unwrap().len();
+    // As long as nobody else can.
+    let mut taken = Vec::new();
+    for _ in 0..N_READERS {
+        taken.push(store.reader().await.unwrap());
+    }
+    store.writer.add_policies(policy("a", CHECKPOINT_BYTES)).await.unwrap();
+    store.writer.add_policies(policy("b", 0)).await.unwrap();
+    assert!(n_bytes() < CHECKPOINT_BYTES as u64);
+    taken.clear();
+    while n_bytes() < CHECKPOINT_BYTES as u64 {
+        tokio::task::yield_now().await;
+    }
+}
+
+#[tokio::test]
+async fn copying_the_log_is_no_writing_by_others() {
+    let directory = tempfile::tempdir().unwrap();
+    let store = open(directory.path()).await;
+    let version = "SELECT data_version FROM pragma_data_version";
+    let mut connection = store.reader().await.unwrap();
+    let before: i64 = sqlx::query_scalar(version).fetch_one(&mut *connection).await.unwrap();
+    store.readers.checkpoint().await.unwrap();
+    assert_eq!(sqlx::query_scalar::<_, i64>(version).fetch_one(&mut *connection).await.unwrap(), before);
+}
