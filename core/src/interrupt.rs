@@ -2,7 +2,7 @@
 //!
 //! The core has no clock and no cancellation token of its own: it asks its caller, again and again, whether to go on. How
 //! much work lies between two questions is each computation's to choose, so that it takes milliseconds at most; a
-//! `Meter` counts it. What the answer rests on (a deadline, a vanished client, a shutdown) is the caller's affair.
+//! [`Meter`] counts it. What the answer rests on (a deadline, a vanished client, a shutdown) is the caller's affair.
 
 use std::time::Duration;
 
@@ -75,7 +75,7 @@ impl Interrupt for Uninterrupted {
 }
 
 /// Counts the work of a long computation, and asks its [`Interrupt`] once for every so many units of it.
-pub(crate) struct Meter<'i> {
+pub struct Meter<'i> {
     interrupt: &'i mut dyn Interrupt,
     /// Units of work between two questions.
     every: u64,
@@ -85,13 +85,13 @@ pub(crate) struct Meter<'i> {
 
 impl<'i> Meter<'i> {
     /// A meter that asks at the first unit of work, and then after `every` units.
-    pub(crate) fn new(interrupt: &'i mut dyn Interrupt, every: u64) -> Self {
+    pub fn new(interrupt: &'i mut dyn Interrupt, every: u64) -> Self {
         Self { interrupt, every, left: 0 }
     }
 
     /// Counts `units` of work that are about to be done, and says whether to go on.
     #[inline]
-    pub(crate) fn spend(&mut self, units: u64) -> Signal {
+    pub fn spend(&mut self, units: u64) -> Signal {
         if let Some(left) = self.left.checked_sub(units) {
             self.left = left;
             return Signal::Continue;
@@ -106,7 +106,7 @@ impl<'i> Meter<'i> {
     ///
     /// What the interrupt said, if that was not to continue.
     #[inline]
-    pub(crate) fn go_on(&mut self, units: u64) -> Result<(), Signal> {
+    pub fn go_on(&mut self, units: u64) -> Result<(), Signal> {
         match self.spend(units) {
             Signal::Continue => Ok(()),
             signal => Err(signal),
@@ -119,7 +119,7 @@ impl<'i> Meter<'i> {
     ///
     /// What the interrupt said, if that was not to continue.
     #[inline]
-    pub(crate) fn spend_or_stop(&mut self, units: u64) -> Result<(), Interrupted> {
+    pub fn spend_or_stop(&mut self, units: u64) -> Result<(), Interrupted> {
         match self.spend(units) {
             Signal::Continue => Ok(()),
             Signal::Finish => Err(Interrupted::OutOfTime),

@@ -49,9 +49,9 @@ impl Scene {
     fn new(name: &'static str, model: &str, demonstration: &str) -> Self {
         let parse = |text| serde_json::from_str::<Value>(text).expect("examples are JSON");
         let model = parse(model);
-        let Ok(Definition::Wumpus(cave)) = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted) else {
-            unreachable!("the examples of figures are caves");
-        };
+        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted);
+        let cave = definition.ok().and_then(|definition| definition.dynamics::<Cave>().cloned());
+        let cave = cave.expect("the examples of figures are caves");
         Self { name, model, demonstration: parse(demonstration), world: WumpusWorld::new(cave, Rewards::PAPER) }
     }
 

@@ -3,7 +3,7 @@
 use super::Demonstration;
 use super::distances::Distances;
 use crate::attribute::{ByAttribute, Weights};
-use crate::model::{CaveState, Model, Origin, Start, StateIdx};
+use crate::model::{Model, Origin, Start, StateIdx};
 
 /// A demonstration to be followed by a body, under given weights, from a given start.
 #[derive(Debug)]
@@ -11,10 +11,8 @@ pub struct Problem<'m> {
     pub(crate) model: &'m Model,
     pub(crate) demonstration: Demonstration,
     pub(crate) weights: Weights,
-    /// `s_0`.
+    /// `s_0`: its number in a search of this problem.
     pub(crate) start: StateIdx,
-    /// What `s_0` is, if it is a state without a number in a model that is searched lazily.
-    pub(crate) cave_start: Option<CaveState>,
     /// The row of `s_0`. Shape `[n_attributes]`.
     pub(crate) start_row: Vec<u32>,
     pub(crate) distances: Distances<'m>,
@@ -26,17 +24,18 @@ impl<'m> Problem<'m> {
     #[must_use]
     pub fn new(model: &'m Model, demonstration: Demonstration, weights: Weights, start: Option<Origin>) -> Self {
         let distances = Distances::new(model.schema(), model.states(), &demonstration, &weights);
-        let (start, cave_start) = match start {
-            None => (choose_start(model, |state| distances.distance(0, model.states().row(state))), None),
-            Some(Origin::State(state)) => (state, None),
-            // A search that finds its states numbers them from the start on.
-            Some(Origin::Cave(state)) => (0, Some(state)),
+        let row_of = |state| model.states().row(state).to_vec();
+        let (state, start_row) = match start {
+            None => {
+                let state = choose_start(model, |state| distances.distance(0, model.states().row(state)));
+                (state, row_of(state))
+            }
+            Some(Origin::State(state)) => (state, row_of(state)),
+            Some(Origin::Row(row)) => (0, row.0.to_vec()),
         };
-        let start_row = match (model.unexplored(), &cave_start) {
-            (Some(cave), Some(state)) => cave.row(state).collect(),
-            _ => model.states().row(start).to_vec(),
-        };
-        Self { model, demonstration, weights, start, cave_start, start_row, distances }
+        // A search that finds its states numbers them from the start on.
+        let start = if model.is_lazy() { 0 } else { state };
+        Self { model, demonstration, weights, start, start_row, distances }
     }
 
     /// The weights of the distance, by attribute.

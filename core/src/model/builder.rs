@@ -168,7 +168,7 @@ impl ModelBuilder {
         let mut unsafe_states: Vec<StateIdx> = self.unsafe_states.into_iter().collect();
         unsafe_states.sort_unstable();
         let states = States::new(self.domains, self.rows);
-        Ok(Definition::Table(Table::new(self.schema, self.actions, states, self.edges, start, unsafe_states)))
+        Ok(Definition::of(Table::new(self.schema, self.actions, states, self.edges, start, unsafe_states)))
     }
 
     /// The model, ready to be searched.

@@ -1,27 +1,31 @@
 //! What a client registers as a model.
 
+use std::any::Any;
 use std::cell::RefCell;
 use std::io::{self, BufRead};
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
 use super::action::ReadActions;
+use super::dynamics::{Description, Dynamics};
+use super::kinds::{self, DynamicsDocument};
 use super::reading::{Interruptible, Outline, RawStates, RawTransitions, Reader};
-use super::{ActionDocument, Cave, CompileError, Format, Limits, ReadError, TableDocument, WumpusDocument, table};
+use super::{ActionDocument, CompileError, Format, Limits, Model, ReadError};
 use crate::attribute::{AttributeDocument, Schema};
 use crate::document::{Faults, ParseError, Path, Place};
 use crate::interrupt::{Interrupt, Interrupted, Meter};
 
 /// What a client registers as a model: checked, with defaults filled in, not yet compiled.
 #[derive(Clone, Debug)]
-pub enum Definition {
-    /// States and transitions are listed.
-    Table(table::Table),
-    /// States and transitions follow from the rules of the wumpus world.
-    Wumpus(Cave),
-}
+pub struct Definition(Arc<dyn Dynamics>);
 
 impl Definition {
+    /// A definition with these dynamics.
+    pub(super) fn of(dynamics: impl Dynamics) -> Self {
+        Self(Arc::new(dynamics))
+    }
+
     /// Reads a model that is in memory as JSON values.
     ///
     /// # Errors
@@ -84,20 +88,21 @@ impl Definition {
 
     /// The attributes of a state.
     #[must_use]
-    pub fn schema(&self) -> Schema {
-        match self {
-            Self::Table(table) => table.schema().clone(),
-            Self::Wumpus(cave) => cave.schema(),
-        }
+    pub fn schema(&self) -> &Schema {
+        self.0.schema()
+    }
+
+    /// Its dynamics, if they are a `D`, such as a [`Cave`](super::Cave).
+    #[must_use]
+    pub fn dynamics<D: Any>(&self) -> Option<&D> {
+        let dynamics: &dyn Any = &*self.0;
+        dynamics.downcast_ref()
     }
 
     /// About how much memory compiling it takes at most, in bytes: for as many states as it can have within `limits`.
     #[must_use]
     pub fn compiling_bytes(&self, limits: Limits) -> u64 {
-        match self {
-            Self::Table(table) => table.compiling_bytes(),
-            Self::Wumpus(cave) => cave.compiling_bytes(limits),
-        }
+        self.0.compiling_bytes(limits)
     }
 
     /// Writes the definition as JSON in canonical form: defaults filled in, actions of transitions by name. Reading it gives
@@ -109,28 +114,8 @@ impl Definition {
     /// # Errors
     ///
     /// If `writer` failed.
-    pub fn write(&self, writer: impl io::Write) -> io::Result<()> {
-        #[derive(Serialize)]
-        struct Written<'d, D> {
-            #[serde(skip_serializing_if = "Option::is_none")]
-            attributes: Option<Vec<AttributeDocument>>,
-            actions: Vec<ActionDocument>,
-            dynamics: &'d D,
-        }
-        match self {
-            Self::Table(table) => {
-                let attributes = table.schema().attributes().iter().map(AttributeDocument::from).collect();
-                let actions = table.actions().iter().map(ActionDocument::from).collect();
-                let written = Written { attributes: Some(attributes), actions, dynamics: table };
-                serde_json::to_writer(writer, &written)?;
-            }
-            Self::Wumpus(cave) => {
-                let actions = cave.actions().iter().map(ActionDocument::from).collect();
-                let dynamics = DynamicsDocument::Wumpus(cave.document());
-                serde_json::to_writer(writer, &Written { attributes: None, actions, dynamics: &dynamics })?;
-            }
-        }
-        Ok(())
+    pub fn write(&self, mut writer: impl io::Write) -> io::Result<()> {
+        self.0.write(&mut writer)
     }
 
     /// The canonical text that [`Self::write`] writes.
@@ -146,63 +131,56 @@ impl Definition {
     }
 }
 
+impl Model {
+    /// Compiles `definition`. Where states follow from rules and are more than `limits` allow, the model is searched lazily.
+    ///
+    /// # Errors
+    ///
+    /// What `interrupt` said, if that was not to continue.
+    pub fn compile(
+        definition: &Definition,
+        limits: Limits,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Self, Interrupted> {
+        Arc::clone(&definition.0).compile(limits, interrupt)
+    }
+}
+
 /// How many values are read between two looks at the interrupt: less than a millisecond.
 const POLL_EVERY: u64 = 4096;
 
 fn of_outline(outline: Outline, limits: Limits, meter: &mut Meter<'_>) -> Result<Definition, ReadError> {
-    let Outline { root, line, states, transitions, faults: faults_of_lines } = outline;
-    let place = Place { value: &root, path: line.map_or(Path::Root, Path::Line) };
+    let line = outline.line;
+    let place = Place { value: &outline.root, path: line.map_or(Path::Root, Path::Line) };
     let mut faults = Faults::default();
-    let definition = read_definition(&place, (states, transitions), limits, meter, &mut faults)?;
-    faults.append(faults_of_lines);
-    Ok(faults.check(definition)?)
+    let dynamics = read_dynamics(&place, (outline.states, outline.transitions), limits, meter, &mut faults)?;
+    faults.append(outline.faults);
+    Ok(Definition(faults.check(dynamics)?))
 }
 
-fn read_definition(
+fn read_dynamics(
     place: &Place<'_, '_>,
-    lists: (Option<RawStates>, Option<RawTransitions>),
+    (states, transitions): (Option<RawStates>, Option<RawTransitions>),
     limits: Limits,
     meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Result<Option<Definition>, Interrupted> {
-    let Some(object) = place.object(&["attributes", "actions", "dynamics"], faults) else { return Ok(None) };
-    let dynamics = object.required("dynamics", faults);
+) -> Result<Option<Arc<dyn Dynamics>>, Interrupted> {
+    let Some(model) = place.object(&["attributes", "actions", "dynamics"], faults) else { return Ok(None) };
+    let dynamics = model.required("dynamics", faults);
     let kind = dynamics.and_then(|dynamics| dynamics.value.get("kind")).and_then(serde_json::Value::as_str);
-    match (dynamics, kind) {
-        (Some(dynamics), Some("table")) => {
-            let attributes = object.required("attributes", faults);
-            let attributes = attributes.and_then(|place| Schema::read(&place, faults));
-            let actions = object.required("actions", faults);
-            let actions = actions.and_then(|place| ReadActions::read(&place, table::DEFAULT_ACTION_COST, faults));
-            Ok(table::read(&dynamics, lists, attributes, actions, limits, meter, faults)?.map(Definition::Table))
-        }
-        (Some(dynamics), Some("wumpus")) => {
-            if let Some(place) = object.optional("attributes") {
-                faults.note(&place, "the attributes of a wumpus world are implied; leave this out");
-            }
-            let actions = match object.optional("actions") {
-                None => Some(None),
-                Some(place) => {
-                    let actions = ReadActions::read(&place, Cave::DEFAULT_ACTION_COST, faults);
-                    Cave::check_actions(&place, faults);
-                    actions.and_then(ReadActions::complete).map(Some)
-                }
-            };
-            let world = Cave::read(&dynamics, meter, faults)?;
-            Ok(world.zip(actions).map(|(cave, actions)| Definition::Wumpus(cave.with_actions(actions))))
-        }
-        (dynamics, _) => {
-            // What the rest is to be is not known, but what it cannot be in any case is.
-            object.optional("attributes").map(|place| Schema::read(&place, faults));
-            object.optional("actions").map(|place| ReadActions::read(&place, table::DEFAULT_ACTION_COST, faults));
-            if let Some(object) = dynamics.and_then(|dynamics| dynamics.open_object(faults))
-                && let Some(kind) = object.required("kind", faults)
-            {
-                kind.mismatch::<()>("one of \"table\", \"wumpus\"", faults);
-            }
-            Ok(None)
-        }
+    if let Some((dynamics, read)) = dynamics.zip(kind.and_then(kinds::reader)) {
+        let mut description = Description { model: &model, dynamics, states, transitions };
+        return read(&mut description, limits, meter, faults);
     }
+    // What the rest is to be is not known, but what it cannot be in any case is.
+    model.optional("attributes").map(|place| Schema::read(&place, faults));
+    model.optional("actions").map(|place| ReadActions::read(&place, 0.0, faults));
+    if let Some(dynamics) = dynamics.and_then(|dynamics| dynamics.open_object(faults))
+        && let Some(kind) = dynamics.required("kind", faults)
+    {
+        kind.mismatch::<()>(&format!("one of {}", kinds::names()), faults);
+    }
+    Ok(None)
 }
 
 /// A model, as it is written in JSON.
@@ -219,20 +197,6 @@ pub struct DefinitionDocument {
     pub actions: Option<Vec<ActionDocument>>,
     /// Which states there are, and how actions lead from one to another.
     pub dynamics: DynamicsDocument,
-}
-
-/// Which states there are, and how actions lead from one to another.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[serde(tag = "kind", rename_all = "lowercase")]
-#[cfg_attr(feature = "openapi", schema(as = Dynamics))]
-pub enum DynamicsDocument {
-    /// States and transitions are listed.
-    #[cfg_attr(feature = "openapi", schema(title = "TableDynamics"))]
-    Table(TableDocument),
-    /// They follow from the rules of the wumpus world.
-    #[cfg_attr(feature = "openapi", schema(title = "WumpusDynamics"))]
-    Wumpus(WumpusDocument),
 }
 
 #[cfg(test)]

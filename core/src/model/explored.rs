@@ -1,64 +1,129 @@
-//! The part of a cave that was come to.
+//! The part of an implicit graph that was found so far.
+//!
+//! ```text
+//! search --Space--> Explored { found: rows, transitions }     read at every step, the same for all dynamics
+//!                        |
+//!                        +--Frontier--> Numbered<D>           called once per state: its successors, and their numbers
+//! ```
+//!
+//! Searches are compiled once for all dynamics, whatever the type of their states. What depends on that type stands behind
+//! [`Frontier`], which is called once for each state that is explored, not for each successor.
+
+use std::fmt::Debug;
 
 use rustc_hash::FxHashMap;
 
-use super::wumpus::{Act, Cave, CaveState};
-use super::{ActionIdx, Graph, Space, StateIdx, States, Transition, make_room};
+use super::{Graph, Implicit, Operator, Space, StateIdx, States, Transition, make_room};
 use crate::interrupt::{Interrupted, Meter};
 
-/// The states of a cave that were found, numbered in the order in which they were, and the ways out of those that were explored.
+/// The states that were found, numbered in the order in which they were, and the transitions from those that were explored.
 ///
-/// An action without effect is no way, and neither is one into death.
+/// Actions without effect are no transitions, and neither are those into unsafe states.
 #[derive(Debug)]
-pub(crate) struct Explored<'c> {
-    cave: &'c Cave,
-    acts: Vec<(ActionIdx, Act)>,
-    found: Vec<CaveState>,
-    indices: FxHashMap<CaveState, StateIdx>,
+pub(crate) struct Explored<'d> {
+    found: Found,
+    frontier: Box<dyn Frontier + 'd>,
+}
+
+/// What is known of the states that were found.
+#[derive(Debug)]
+struct Found {
     states: States,
-    /// Where the ways out of each state are; [`UNEXPLORED`] where they are not known yet. Shape `[found.len()]`.
+    /// Where the transitions from each state are; [`UNEXPLORED`] where they are not known yet. Shape `[n_states]`.
     bounds: Vec<(u32, u32)>,
-    ways: Vec<Transition>,
+    transitions: Vec<Transition>,
 }
 
 const UNEXPLORED: (u32, u32) = (u32::MAX, u32::MAX);
 
-impl<'c> Explored<'c> {
-    /// Nothing but the state `first`, which gets the number 0.
-    pub(crate) fn new(cave: &'c Cave, first: CaveState) -> Self {
-        let acts = (0..).zip(cave.actions()).filter_map(|(index, action)| Some((index, Act::named(&action.name)?)));
-        let mut explored = Self {
-            cave,
-            acts: acts.collect(),
-            found: Vec::new(),
-            indices: FxHashMap::default(),
-            states: States::new(cave.domains(), Vec::new()),
-            bounds: Vec::new(),
-            ways: Vec::new(),
-        };
-        explored.number_of(first);
-        explored
+/// What finds more states.
+trait Frontier: Debug {
+    /// Adds the transitions from the state numbered `from`, and the states that they lead to.
+    fn explore(&mut self, from: StateIdx, found: &mut Found);
+
+    /// Makes room for `growth` times as many states, once there is hardly any left.
+    fn make_room(&mut self, growth: f64);
+
+    /// About how much memory each state takes here, in bytes.
+    fn state_bytes(&self) -> usize;
+}
+
+/// The states of `dynamics` that have a number.
+#[derive(Debug)]
+struct Numbered<'d, D: Implicit> {
+    dynamics: &'d D,
+    states: Vec<D::State>,
+    numbers: FxHashMap<D::State, StateIdx>,
+}
+
+impl<D: Implicit> Numbered<'_, D> {
+    fn number_of(&mut self, state: D::State, found: &mut Found) -> StateIdx {
+        #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
+        let next = self.states.len() as StateIdx;
+        if let Some(number) = self.numbers.get(&state) {
+            return *number;
+        }
+        found.states.push(self.dynamics.row(&state));
+        found.bounds.push(UNEXPLORED);
+        self.numbers.insert(state.clone(), next);
+        self.states.push(state);
+        next
+    }
+}
+
+impl<D: Implicit> Frontier for Numbered<'_, D> {
+    fn explore(&mut self, from: StateIdx, found: &mut Found) {
+        let dynamics = self.dynamics;
+        let state = self.states[from as usize].clone();
+        for (action, outcome) in dynamics.successors(&state) {
+            debug_assert!(outcome.is_certain() && outcome.cost.is_none(), "searches know no others");
+            if outcome.to != state && !dynamics.is_unsafe(&outcome.to) {
+                let to = self.number_of(outcome.to, found);
+                found.transitions.push(Transition { action, to });
+            }
+        }
+    }
+
+    fn make_room(&mut self, growth: f64) {
+        make_room(&mut self.states, growth);
+    }
+
+    fn state_bytes(&self) -> usize {
+        // The index is at most half empty just after it has grown.
+        size_of::<D::State>() + 2 * size_of::<(D::State, StateIdx)>()
+    }
+}
+
+impl<'d> Explored<'d> {
+    /// Nothing but the states `first`, which get the numbers from 0 on.
+    fn new<D: Implicit>(dynamics: &'d D, first: impl IntoIterator<Item = D::State>) -> Self {
+        let mut found =
+            Found { states: States::new(dynamics.domains(), Vec::new()), bounds: Vec::new(), transitions: Vec::new() };
+        let mut numbered = Numbered { dynamics, states: Vec::new(), numbers: FxHashMap::default() };
+        for state in first {
+            numbered.number_of(state, &mut found);
+        }
+        Self { found, frontier: Box::new(numbered) }
     }
 
     /// How many states were found.
     pub(super) fn n_found(&self) -> usize {
-        self.found.len()
+        self.found.bounds.len()
     }
 
-    /// How many ways out of those that were explored.
-    pub(super) fn n_ways(&self) -> usize {
-        self.ways.len()
-    }
-
-    /// How much work it is to explore a state, in successors.
-    pub(super) fn n_acts(&self) -> u64 {
-        self.acts.len() as u64
+    /// How many transitions were found.
+    pub(super) fn n_transitions(&self) -> usize {
+        self.found.transitions.len()
     }
 
     /// The states `kept`, numbered in this order.
     pub(crate) fn keep(&self, kept: &[StateIdx]) -> States {
-        let rows = kept.iter().flat_map(|state| self.states.row(*state)).copied().collect();
-        States::new(self.cave.domains(), rows)
+        self.found.states.keep(kept)
+    }
+
+    /// The states that were found.
+    pub(super) fn into_states(self) -> States {
+        self.found.states
     }
 
     /// What was found: the states, and the transitions between them.
@@ -67,59 +132,40 @@ impl<'c> Explored<'c> {
     ///
     /// What the interrupt of `meter` said, if that was not to continue.
     pub(super) fn into_parts(self, meter: &mut Meter<'_>) -> Result<(States, Graph), Interrupted> {
-        let Self { states, bounds, ways, .. } = self;
+        let Self { found: Found { states, bounds, transitions }, .. } = self;
         let explored = (0..).zip(&bounds).filter(|(_, bounds)| **bounds != UNEXPLORED);
         let edges = explored.flat_map(|(from, (begin, end))| {
-            let ways = &ways[*begin as usize..*end as usize];
-            ways.iter().map(move |way| (from, *way))
+            let out = &transitions[*begin as usize..*end as usize];
+            out.iter().map(move |transition| (from, *transition))
         });
         let graph = Graph::new(states.len() as usize, edges, meter)?;
         Ok((states, graph))
     }
-
-    fn number_of(&mut self, state: CaveState) -> StateIdx {
-        #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
-        let next = self.found.len() as StateIdx;
-        let number = *self.indices.entry(state).or_insert(next);
-        if number == next {
-            self.found.push(state);
-            self.states.push(self.cave.row(&state));
-            self.bounds.push(UNEXPLORED);
-        }
-        number
-    }
 }
 
 impl Space for Explored<'_> {
+    #[inline]
     fn explore(&mut self, from: StateIdx) {
-        if self.bounds[from as usize] != UNEXPLORED {
+        if self.found.bounds[from as usize] != UNEXPLORED {
             return;
         }
-        let state = self.found[from as usize];
-        let begin = self.ways.len();
-        for n in 0..self.acts.len() {
-            let (action, act) = self.acts[n];
-            let next = self.cave.after(state, act);
-            if next != state && !self.cave.is_deadly(&next) {
-                let to = self.number_of(next);
-                self.ways.push(Transition { action, to });
-            }
-        }
-        #[expect(clippy::cast_possible_truncation, reason = "at most six for each state")]
-        let bounds = [begin, self.ways.len()].map(|bound| bound as u32);
-        self.bounds[from as usize] = bounds.into();
+        let begin = self.found.transitions.len();
+        self.frontier.explore(from, &mut self.found);
+        #[expect(clippy::cast_possible_truncation, reason = "memory is spent before there are 2^32 transitions")]
+        let bounds = [begin, self.found.transitions.len()].map(|bound| bound as u32);
+        self.found.bounds[from as usize] = bounds.into();
     }
 
     #[inline]
     fn successors(&self, state: StateIdx) -> &[Transition] {
-        let (begin, end) = self.bounds[state as usize];
+        let (begin, end) = self.found.bounds[state as usize];
         debug_assert!((begin, end) != UNEXPLORED, "only what was explored has successors");
-        &self.ways[begin as usize..end as usize]
+        &self.found.transitions[begin as usize..end as usize]
     }
 
     #[inline]
     fn row(&self, state: StateIdx) -> &[u32] {
-        self.states.row(state)
+        self.found.states.row(state)
     }
 
     fn keeps_numbers(&self) -> bool {
@@ -131,18 +177,58 @@ impl Space for Explored<'_> {
     }
 
     fn make_room(&mut self, growth: f64) {
-        make_room(&mut self.found, growth);
-        make_room(&mut self.bounds, growth);
-        make_room(&mut self.ways, growth);
-        self.states.make_room(growth);
+        make_room(&mut self.found.bounds, growth);
+        make_room(&mut self.found.transitions, growth);
+        self.found.states.make_room(growth);
+        self.frontier.make_room(growth);
     }
 
     #[inline]
     fn found_bytes(&self) -> usize {
-        /// Of the index, which is at most half empty just after it has grown.
-        const ENTRY_BYTES: usize = 2 * size_of::<(CaveState, StateIdx)>();
-        let row_bytes = size_of_val(self.states.row(0));
-        let state_bytes = size_of::<CaveState>() + size_of::<(u32, u32)>() + row_bytes;
-        self.found.len() * (state_bytes + ENTRY_BYTES) + self.ways.len() * size_of::<Transition>()
+        let row_bytes = size_of_val(self.found.states.row(0));
+        let state_bytes = self.frontier.state_bytes() + size_of::<(u32, u32)>() + row_bytes;
+        self.n_found() * state_bytes + self.found.transitions.len() * size_of::<Transition>()
+    }
+}
+
+/// [`Implicit`] dynamics, whatever the type of their states.
+pub(crate) trait Unexplored: Debug + Send + Sync {
+    /// The start states, and nothing else.
+    fn explore_from_start(&self) -> Explored<'_>;
+
+    /// The state with this row, which is numbered 0, and nothing else; `None` if there is no such state.
+    fn explore_from(&self, row: &[u32]) -> Option<Explored<'_>>;
+
+    /// The whole row of the state with this one, as [`Implicit::state_of`].
+    fn complete_row(&self, row: &[Option<u32>]) -> Option<Vec<u32>>;
+
+    /// As [`Implicit::is_derived`].
+    fn is_derived(&self, attribute: usize) -> bool;
+
+    /// As [`Implicit::operators`].
+    fn operators(&self) -> Box<dyn Iterator<Item = Operator> + '_>;
+}
+
+impl<D: Implicit> Unexplored for D {
+    fn explore_from_start(&self) -> Explored<'_> {
+        Explored::new(self, self.start_states())
+    }
+
+    fn explore_from(&self, row: &[u32]) -> Option<Explored<'_>> {
+        let row: Vec<Option<u32>> = row.iter().copied().map(Some).collect();
+        Some(Explored::new(self, [self.state_of(&row)?]))
+    }
+
+    fn complete_row(&self, row: &[Option<u32>]) -> Option<Vec<u32>> {
+        let state = self.state_of(row)?;
+        Some(self.row(&state).collect())
+    }
+
+    fn is_derived(&self, attribute: usize) -> bool {
+        Implicit::is_derived(self, attribute)
+    }
+
+    fn operators(&self) -> Box<dyn Iterator<Item = Operator> + '_> {
+        Box::new(Implicit::operators(self))
     }
 }

@@ -43,9 +43,9 @@ impl Graph {
         Ok(Self { transitions })
     }
 
-    /// A graph of a single state, which no transition leaves.
-    pub(super) fn of_one_state() -> Self {
-        Self { transitions: Rows::of_entries(1, std::iter::empty()) }
+    /// A graph of states that no transition leaves.
+    pub(super) fn without_transitions(n_states: usize) -> Self {
+        Self { transitions: Rows::of_entries(n_states, std::iter::empty()) }
     }
 
     /// The ways out of `state`, in the order of their actions.

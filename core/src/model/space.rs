@@ -1,6 +1,6 @@
 //! What a search sees of a model: states by number, and the ways out of them.
 
-use super::{Graph, Model, StateIdx, States, Transition};
+use super::{Graph, StateIdx, States, Transition};
 
 /// States as a search walks on them. What is known of them may grow as it goes.
 pub(crate) trait Space {
@@ -54,8 +54,8 @@ pub(crate) struct Whole<'m> {
 }
 
 impl<'m> Whole<'m> {
-    pub(crate) fn of(model: &'m Model) -> Self {
-        Self { states: model.states(), graph: model.graph() }
+    pub(super) fn new(states: &'m States, graph: &'m Graph) -> Self {
+        Self { states, graph }
     }
 }
 

@@ -30,6 +30,12 @@ impl States {
         debug_assert!(self.rows.len().is_multiple_of(self.domains.len()), "a whole row");
     }
 
+    /// The states `kept`, numbered in this order.
+    pub(super) fn keep(&self, kept: &[StateIdx]) -> Self {
+        let rows = kept.iter().flat_map(|state| self.row(*state)).copied().collect();
+        Self::new(self.domains.clone(), rows)
+    }
+
     /// Makes room for `growth` times as many, once there is hardly any left.
     pub(super) fn make_room(&mut self, growth: f64) {
         make_room(&mut self.rows, growth);

@@ -95,10 +95,8 @@ mod tests {
 
     fn world(wumpi: &[[u16; 2]], gold: &[[u16; 2]]) -> WumpusWorld {
         let model = json!({"dynamics": {"kind": "wumpus", "width": 4, "height": 2, "wumpi": wumpi, "gold": gold}});
-        let Ok(Definition::Wumpus(cave)) = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted) else {
-            panic!("a cave")
-        };
-        WumpusWorld::new(cave, Rewards::PAPER)
+        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        WumpusWorld::new(definition.dynamics::<Cave>().unwrap().clone(), Rewards::PAPER)
     }
 
     fn acts(letters: &str) -> impl Iterator<Item = Act> + '_ {

@@ -15,10 +15,8 @@ use serde_json::{Value, json};
 const LAZY: Limits = Limits { max_states: 0, ..Limits::DEFAULT };
 
 fn cave_of(model: &Value) -> Cave {
-    match Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap() {
-        Definition::Wumpus(cave) => cave,
-        Definition::Table(_) => panic!("a cave"),
-    }
+    let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    definition.dynamics::<Cave>().unwrap().clone()
 }
 
 /// The values of a state, as they are written outside.

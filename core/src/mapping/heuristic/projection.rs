@@ -82,15 +82,15 @@ impl Projections {
         let states = model.states();
         let positions = (0..model.schema().len()).filter(|position| states.domain(*position).len() > 1);
         let mut found = EdgeSets::of(positions.collect(), max_edges);
-        match model.unexplored() {
+        match model.operators() {
             None => {
                 for (from, transition) in model.graph().iter() {
                     meter.spend_or_stop(found.positions.len() as u64)?;
                     found.add_transition(transition.action, states.row(from), states.row(transition.to));
                 }
             }
-            Some(cave) => {
-                for operator in cave.operators() {
+            Some(operators) => {
+                for operator in operators {
                     meter.spend_or_stop(found.positions.len() as u64)?;
                     found.add_operator(&operator);
                 }
@@ -274,14 +274,15 @@ mod tests {
         }});
         let definition = Definition::read(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-        let Definition::Wumpus(cave) = definition else { panic!("a cave") };
+        let unlisted = Limits { max_states: 0, ..Limits::DEFAULT };
+        let unlisted = Model::compile(&definition, unlisted, &mut Uninterrupted).unwrap();
         let none = || EdgeSets::of((0..model.schema().len()).collect(), MAX_EDGES);
         let (mut known, mut lazy) = (none(), none());
         for (from, transition) in model.graph().iter() {
             let [row, row_after] = [from, transition.to].map(|state| model.states().row(state));
             known.add_transition(transition.action, row, row_after);
         }
-        cave.operators().for_each(|operator| lazy.add_operator(&operator));
+        unlisted.operators().unwrap().for_each(|operator| lazy.add_operator(&operator));
         let of = |found: &EdgeSets, number: usize| -> FxHashSet<(ValueIdx, ValueIdx, ActionIdx, Vec<u16>)> {
             let set = |edge: &Edge| found.change_sets.sets[edge.change_set as usize].clone();
             let edges = found.edges[number].iter().flatten();

@@ -20,7 +20,7 @@ use super::heuristic::projection::Projections;
 use super::heuristic::{Blind, Heuristic, HeuristicName};
 use super::search::{Found, Move, astar, best_first, layered};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
-use crate::model::{Explored, Model, Space, StateIdx, States, Whole};
+use crate::model::{Model, Space, StateIdx, States};
 use escalation::Patience;
 
 /// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
@@ -274,10 +274,9 @@ impl Mapper {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
         self.check(problem);
-        let Some(cave) = self.model.unexplored() else {
-            return self.map_in(&mut Whole::of(&self.model), problem, settings, interrupt);
+        let Some(mut explored) = self.model.explore_from(&problem.start_row) else {
+            return self.map_in(&mut self.model.whole(), problem, settings, interrupt);
         };
-        let mut explored = Explored::new(cave, problem.cave_start.unwrap_or_else(|| cave.first_state()));
         let mut mapping = self.map_in(&mut explored, problem, settings, interrupt)?;
         mapping.states = Some(explored.keep(&renumber(&mut mapping.moves)));
         Ok(mapping)
@@ -404,7 +403,7 @@ impl Mapper {
             n_expanded: 0,
             n_generated: 0,
         };
-        let mapping = conclude(problem, &mut Whole::of(&self.model), &Blind, found, interrupt)?;
+        let mapping = conclude(problem, &mut self.model.whole(), &Blind, found, interrupt)?;
         Ok(Mapping { status: Status::Local, lower_bound: None, stopped_by: Some(stopped_by), ..mapping })
     }
 }

@@ -3,17 +3,19 @@
 mod document;
 mod reading;
 
-use std::sync::{Arc, OnceLock};
+use std::io;
+use std::sync::Arc;
 
 pub use document::{ActionReference, StartDocument, TableDocument, TransitionDocument};
 pub(super) use reading::read;
 
-use super::{Action, ActionIdx, Graph, Model, Start, StateIdx, States, Transition};
+use super::dynamics::{Dynamics, write_definition};
+use super::{Action, ActionIdx, Graph, Limits, Model, Start, StateIdx, States, Transition};
 use crate::attribute::Schema;
 use crate::interrupt::{Interrupt, Interrupted, Meter};
 
 /// Cost of an action that names none.
-pub(super) const DEFAULT_ACTION_COST: f64 = 1.0;
+const DEFAULT_ACTION_COST: f64 = 1.0;
 
 /// A model whose states and transitions are listed. At most one transition leaves a state by an action.
 #[derive(Clone, Debug)]
@@ -65,14 +67,21 @@ impl Table {
     ) -> Self {
         Self { schema, actions, states: Arc::new(states), edges, start, unsafe_states }
     }
+}
+
+impl Dynamics for Table {
+    fn schema(&self) -> &Schema {
+        &self.schema
+    }
+
+    fn compiling_bytes(&self, _: Limits) -> u64 {
+        let n_states = u64::from(self.states.len());
+        Model::compiled_bytes(n_states, self.edges.len() as u64, self.schema.len() as u64)
+    }
 
     /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, which
     /// a `skip` does for nothing.
-    ///
-    /// # Errors
-    ///
-    /// What `interrupt` said, if that was not to continue.
-    pub(super) fn compile(&self, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted> {
+    fn compile(self: Arc<Self>, _: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted> {
         /// How many transitions are looked at between two looks at the interrupt: less than a millisecond.
         const POLL_EVERY: u64 = 1 << 14;
         let mut meter = Meter::new(interrupt, POLL_EVERY);
@@ -87,31 +96,16 @@ impl Table {
             *from != transition.to && is_unsafe.get(transition.to as usize) != Some(&true)
         };
         let graph = Graph::new(n_states, self.edges.iter().filter(is_useful), &mut meter)?;
+        let (states, start) = (Arc::clone(&self.states), self.start.clone());
         Ok(Model {
-            schema: self.schema.clone(),
-            actions: self.actions.clone(),
-            graph,
-            states: Arc::clone(&self.states),
-            start: self.start.clone(),
             n_transitions: self.edges.len(),
             n_unsafe: self.unsafe_states.len(),
             is_unsafe,
-            unexplored: None,
-            state_bytes: OnceLock::new(),
+            ..Model::listed(self.schema.clone(), self.actions.clone(), states, graph, start)
         })
     }
 
-    /// See [`Definition::compiling_bytes`](super::Definition::compiling_bytes).
-    pub(super) fn compiling_bytes(&self) -> u64 {
-        let n_states = u64::from(self.states.len());
-        Model::compiled_bytes(n_states, self.edges.len() as u64, self.schema.len() as u64)
-    }
-
-    pub(super) fn schema(&self) -> &Schema {
-        &self.schema
-    }
-
-    pub(super) fn actions(&self) -> &[Action] {
-        &self.actions
+    fn write(&self, writer: &mut dyn io::Write) -> io::Result<()> {
+        write_definition(writer, Some(&self.schema), &self.actions, self)
     }
 }

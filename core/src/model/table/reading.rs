@@ -5,30 +5,33 @@ use std::sync::Arc;
 
 use hashbrown::HashTable;
 
-use super::{Edges, Table};
+use super::{DEFAULT_ACTION_COST, Edges, Table};
 use crate::attribute::{Attribute, Schema, Value};
 use crate::document::{Faults, Object, Path, Place, index_of};
 use crate::interrupt::{Interrupted, Meter};
 use crate::model::action::ReadActions;
+use crate::model::dynamics::{Description, Dynamics};
 use crate::model::reading::{Distinct, NoTransition, Raw, RawIndex, RawStates, RawTransitions};
 use crate::model::{ActionIdx, Limits, Start, StateIdx, States};
 
-/// Reads the dynamics. `attributes` and `actions` are `None` where they had faults of their own; what does not
-/// depend on them is checked all the same. `lists` are the states and transitions that were taken out of the dynamics.
+/// Reads a model with listed states and transitions. What does not depend on attributes or actions that have faults of their own is checked
+/// all the same.
 pub(in crate::model) fn read(
-    place: &Place<'_, '_>,
-    lists: (Option<RawStates>, Option<RawTransitions>),
-    attributes: Option<Vec<Option<Attribute>>>,
-    actions: Option<ReadActions<'_>>,
+    description: &mut Description<'_, '_>,
     limits: Limits,
     meter: &mut Meter<'_>,
     faults: &mut Faults,
-) -> Result<Option<Table>, Interrupted> {
-    let Some(object) = place.object(&["kind", "states", "transitions", "start", "unsafe"], faults) else {
+) -> Result<Option<Arc<dyn Dynamics>>, Interrupted> {
+    let (model, dynamics) = (description.model, description.dynamics);
+    let (rows, items) = (description.states.take(), description.transitions.take());
+    let attributes = model.required("attributes", faults).and_then(|place| Schema::read(&place, faults));
+    let actions = model.required("actions", faults);
+    let actions = actions.and_then(|place| ReadActions::read(&place, DEFAULT_ACTION_COST, faults));
+    let Some(object) = dynamics.object(&["kind", "states", "transitions", "start", "unsafe"], faults) else {
         return Ok(None);
     };
-    let rows = object.required("states", faults).and_then(|place| place.array(faults).map(|_| place));
-    let rows = rows.zip(lists.0).filter(|(place, rows)| {
+    let place = object.required("states", faults).and_then(|place| place.array(faults).map(|_| place));
+    let rows = place.zip(rows).filter(|(place, rows)| {
         let is_number_right = (1..=limits.max_states).contains(&rows.n_states);
         if !is_number_right {
             faults.note(place, format!("expected 1 to {} states, found {}", limits.max_states, rows.n_states));
@@ -41,8 +44,8 @@ pub(in crate::model) fn read(
         Some(((_, rows), attributes)) => read_states(rows, attributes, meter, faults)?,
         None => None,
     };
-    let items = object.required("transitions", faults).and_then(|place| place.array(faults).map(|_| place));
-    let items = items.zip(lists.1).filter(|(place, items)| {
+    let place = object.required("transitions", faults).and_then(|place| place.array(faults).map(|_| place));
+    let items = place.zip(items).filter(|(place, items)| {
         let is_number_right = items.n_transitions <= limits.max_transitions;
         if !is_number_right {
             let detail =
@@ -75,7 +78,7 @@ pub(in crate::model) fn read(
             unsafe_states: unsafe_states?,
         })
     };
-    Ok(table())
+    Ok(table().map(|table| Arc::new(table) as Arc<dyn Dynamics>))
 }
 
 /// The values of a column, as far as they are values of its attribute.

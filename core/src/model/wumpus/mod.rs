@@ -4,22 +4,20 @@
 //! to the wall and kills the first live wumpus in line. Gold is taken piece by piece, and the cave is left by climbing
 //! out of the start cell.
 //!
-//! [`Cave`] holds the rules ([`Cave::after`]), free of any body; [`Cave::compile`] explores what a body can reach by them
-//! ([`Explored`]), or leaves that to searches if it is too much.
+//! [`Cave`] holds the rules ([`Cave::after`]), and the actions of a body; as [`Implicit`](super::Implicit) dynamics it gives the states that
+//! this body reaches.
 
+mod dynamics;
+mod operators;
 mod reading;
-
-use std::ops::Range;
-use std::sync::{Arc, OnceLock};
 
 use serde::{Deserialize, Serialize};
 
+pub(super) use reading::read;
 pub use reading::{CellDocument, PoseDocument, WumpusDocument};
 
-use super::explored::Explored;
-use super::{Action, Graph, Limits, Model, Space, Start, StateIdx, States, Transition};
-use crate::attribute::{Attribute, Cycle, Kind, Labels, Schema, Value};
-use crate::interrupt::{Interrupt, Interrupted, Meter};
+use super::Action;
+use crate::attribute::Schema;
 
 /// A direction in the grid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -54,16 +52,6 @@ impl Heading {
     fn turned(self, quarters: usize) -> Self {
         Self::ALL[(self as usize + quarters) % Self::ALL.len()]
     }
-}
-
-/// Where the attributes of a state stand; wumpi and pieces of gold come after these.
-pub(super) mod position {
-    pub(in crate::model) const X: usize = 0;
-    pub(in crate::model) const Y: usize = 1;
-    pub(in crate::model) const HEADING: usize = 2;
-    pub(in crate::model) const GOLD: usize = 3;
-    pub(in crate::model) const ARROWS: usize = 4;
-    pub(in crate::model) const OUTSIDE: usize = 5;
 }
 
 /// A cell of the grid: `(x, y)`.
@@ -139,7 +127,12 @@ pub struct Cave {
     gold: Vec<Cell>,
     start: (Cell, Heading),
     arrows: u8,
+    /// The body.
     actions: Vec<Action>,
+    /// What each of its actions does. Shape `[n_actions]`.
+    acts: Vec<Act>,
+    /// See [`Self::schema`].
+    schema: Schema,
 }
 
 impl Cave {
@@ -156,6 +149,12 @@ impl Cave {
     #[must_use]
     pub fn actions(&self) -> &[Action] {
         &self.actions
+    }
+
+    /// The attributes of a state of this cave.
+    #[must_use]
+    pub fn schema(&self) -> &Schema {
+        &self.schema
     }
 
     /// Width and height of the grid.
@@ -250,207 +249,6 @@ impl Cave {
             Heading::South => (x, y.checked_sub(1)?),
         };
         (x < self.width && y < self.height).then_some((x, y))
-    }
-
-    /// The attributes of a state of this cave.
-    #[must_use]
-    pub fn schema(&self) -> Schema {
-        let number = Kind::Number { scale: 1.0 };
-        let labels = Labels::of(Heading::ALL.map(Heading::name));
-        let heading = Kind::Cyclic { scale: 1.0, cycle: Cycle::Labels(labels) };
-        let attribute =
-            |name: &str, kind: &Kind, weight: f64| Attribute { name: name.to_owned(), kind: kind.clone(), weight };
-        let mut attributes = vec![
-            attribute("x", &number, 1.0),
-            attribute("y", &number, 1.0),
-            attribute("heading", &heading, 1.0),
-            attribute("gold", &number, 1.0),
-            attribute("arrows", &number, 1.0),
-            attribute("outside", &Kind::Category, 5.0),
-        ];
-        attributes.extend((1..=self.wumpi.len()).map(|k| attribute(&format!("wumpus_{k}"), &Kind::Category, 0.0)));
-        attributes.extend((1..=self.gold.len()).map(|k| attribute(&format!("gold_{k}"), &Kind::Category, 0.0)));
-        Schema::of(attributes)
-    }
-
-    /// Values by attribute; [`Self::row`] gives indices into these. A boolean's index is its value.
-    pub(super) fn domains(&self) -> Vec<Vec<Value>> {
-        let count = |n: u16| (0..n).map(|n| Value::Number(f64::from(n))).collect::<Vec<_>>();
-        #[expect(clippy::cast_possible_truncation, reason = "at most MAX_THINGS")]
-        let n_gold = self.gold.len() as u16;
-        let mut domains = vec![
-            count(self.width),
-            count(self.height),
-            (0..4).map(Value::Label).collect(),
-            count(n_gold + 1),
-            count(u16::from(self.arrows) + 1),
-        ];
-        let booleans = vec![Value::Boolean(false), Value::Boolean(true)];
-        domains.extend(std::iter::repeat_n(booleans, 1 + self.wumpi.len() + self.gold.len()));
-        domains
-    }
-
-    /// The state as indices into [`Self::domains`].
-    pub(crate) fn row(&self, state: &CaveState) -> impl Iterator<Item = u32> {
-        #[expect(clippy::cast_possible_truncation, reason = "at most MAX_THINGS")]
-        let n_gold = self.gold.len() as u32;
-        let (x, y) = state.cell;
-        let taken = n_gold - state.lying.count_ones();
-        let counts = [x.into(), y.into(), state.heading as u32, taken, state.arrows.into(), state.outside.into()];
-        let bits = |word: u64, n: usize| (0..n).map(move |k| u32::from(word >> k & 1 == 1));
-        counts.into_iter().chain(bits(state.alive, self.wumpi.len())).chain(bits(state.lying, self.gold.len()))
-    }
-
-    /// Explores, breadth first, every state that the body reaches from the start. States are numbered as they are found. If that are
-    /// more than `limits` allow, they are left to searches.
-    pub(super) fn compile(&self, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted> {
-        /// How many successors, cells or transitions are looked at between two looks at the interrupt: well below a millisecond.
-        const POLL_EVERY: u64 = 1 << 10;
-        /// What a transition takes in the end, beside what is found.
-        const TRANSITION_BYTES: usize = 2 * size_of::<Transition>();
-        let mut meter = Meter::new(interrupt, POLL_EVERY);
-        let n_attributes = self.first_row().len();
-        let max_states = limits.max_states.min(limits.max_values / n_attributes);
-        if self.least_states(&mut meter)? > max_states as u64 {
-            return Ok(self.unexplored());
-        }
-        let mut explored = Explored::new(self, self.first_state());
-        let mut from = 0;
-        while from < explored.n_found() {
-            let n_bytes = explored.found_bytes() + explored.n_ways() * TRANSITION_BYTES;
-            if explored.n_found() > max_states || n_bytes > limits.max_bytes {
-                return Ok(self.unexplored());
-            }
-            meter.spend_or_stop(explored.n_acts())?;
-            #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
-            explored.explore(from as StateIdx);
-            from += 1;
-        }
-        let (states, graph) = explored.into_parts(&mut meter)?;
-        Ok(self.model(states, graph, None))
-    }
-
-    /// See [`Definition::compiling_bytes`](super::Definition::compiling_bytes).
-    pub(super) fn compiling_bytes(&self, limits: Limits) -> u64 {
-        /// Exploring keeps the states themselves, their numbers, and the ways out of each, beside what is compiled.
-        const EXPLORED_BYTES: u64 = (4 * size_of::<(CaveState, StateIdx)>()) as u64;
-        let n_bits = u32::try_from(self.wumpi.len() + self.gold.len()).unwrap_or(u32::MAX);
-        // Facing four ways, inside and outside.
-        let n_poses = self.is_pit.len() as u64 * 4 * 2 * (u64::from(self.arrows) + 1);
-        let n_states = 1_u64.checked_shl(n_bits).unwrap_or(u64::MAX).saturating_mul(n_poses);
-        let n_states = n_states.min(limits.max_states as u64);
-        let n_transitions = n_states.saturating_mul(self.actions.len() as u64);
-        let compiled = Model::compiled_bytes(n_states, n_transitions, self.schema().len() as u64);
-        compiled.saturating_add(n_states.saturating_mul(EXPLORED_BYTES)).min(limits.max_bytes as u64)
-    }
-
-    /// How many states the body reaches at least: those with all wumpi alive. A body that goes ahead and turns comes to every pose in the
-    /// cells that are connected, with or without each piece of gold there; of several in one cell, the first is taken first. It may have
-    /// shot any of its arrows before, which opens cells and closes none.
-    fn least_states(&self, meter: &mut Meter<'_>) -> Result<u64, Interrupted> {
-        let has = |act: Act| self.actions.iter().any(|action| Act::named(&action.name) == Some(act));
-        if !has(Act::Forward) || !(has(Act::TurnLeft) || has(Act::TurnRight)) {
-            return Ok(1);
-        }
-        let (start, _) = self.start;
-        let mut is_closed = self.is_pit.clone();
-        for wumpus in &self.wumpi {
-            is_closed[cell_index(*wumpus, self.width)] = true;
-        }
-        is_closed[cell_index(start, self.width)] = true;
-        let mut reached = vec![start];
-        let mut next = 0;
-        while let Some(cell) = reached.get(next).copied() {
-            meter.spend_or_stop(1)?;
-            next += 1;
-            for to in Heading::ALL.into_iter().filter_map(|heading| self.ahead(cell, heading)) {
-                if !std::mem::replace(&mut is_closed[cell_index(to, self.width)], true) {
-                    reached.push(to);
-                }
-            }
-        }
-        let n_arrows = if has(Act::Shoot) { u64::from(self.arrows) } else { 0 };
-        let mut n_states = 4 * reached.len() as u64 * (1 + n_arrows);
-        let is_reached =
-            |cell: Cell| is_closed[cell_index(cell, self.width)] && !self.is_pit(cell) && !self.wumpi.contains(&cell);
-        let heaps =
-            self.gold.iter().enumerate().filter(|(k, cell)| !self.gold[..*k].contains(cell) && is_reached(**cell));
-        for (_, cell) in heaps.filter(|_| has(Act::Grab)) {
-            let n_pieces = self.gold.iter().filter(|other| *other == cell).count() as u64;
-            n_states = n_states.saturating_mul(1 + n_pieces);
-        }
-        Ok(n_states)
-    }
-
-    /// The row of the first state.
-    fn first_row(&self) -> Vec<u32> {
-        self.row(&self.first_state()).collect()
-    }
-
-    /// The model of which nothing but the start is known.
-    fn unexplored(&self) -> Model {
-        let states = States::new(self.domains(), self.first_row());
-        self.model(states, Graph::of_one_state(), Some(self.clone()))
-    }
-
-    fn model(&self, states: States, graph: Graph, unexplored: Option<Self>) -> Model {
-        Model {
-            schema: self.schema(),
-            actions: self.actions.clone(),
-            n_transitions: graph.n_transitions(),
-            states: Arc::new(states),
-            graph,
-            start: Start::State(0),
-            is_unsafe: Vec::new(),
-            n_unsafe: 0,
-            unexplored,
-            state_bytes: OnceLock::new(),
-        }
-    }
-
-    /// The state with these values, if there may be one; the one of [`position::GOLD`] may be missing.
-    fn state_of(&self, wanted: &[Option<Value>]) -> Option<CaveState> {
-        let domains = self.domains();
-        let index = |at: usize| domains[at].iter().position(|value| Some(value) == wanted[at].as_ref());
-        let word = |positions: Range<usize>| {
-            let bits = positions.zip(0..).map(|(at, bit)| Some((index(at)? as u64) << bit));
-            bits.sum::<Option<u64>>()
-        };
-        let state = CaveState {
-            cell: (index(position::X)?.try_into().ok()?, index(position::Y)?.try_into().ok()?),
-            heading: Heading::ALL[index(position::HEADING)?],
-            arrows: index(position::ARROWS)?.try_into().ok()?,
-            outside: index(position::OUTSIDE)? == 1,
-            alive: word(self.wumpus_positions())?,
-            lying: word(self.gold_positions())?,
-        };
-        let n_taken = self.gold.len() - state.lying.count_ones() as usize;
-        let n_killed = self.wumpi.len() - state.alive.count_ones() as usize;
-        let is_consistent = (wanted[position::GOLD].is_none() || index(position::GOLD) == Some(n_taken))
-            && n_killed <= usize::from(self.arrows - state.arrows)
-            && (!state.outside || state.cell == self.start.0)
-            && !self.is_deadly(&state);
-        is_consistent.then_some(state)
-    }
-
-    /// Positions of the attributes `wumpus_1`, `wumpus_2`, ..
-    pub(super) fn wumpus_positions(&self) -> Range<usize> {
-        let first = position::OUTSIDE + 1;
-        first..first + self.wumpi.len()
-    }
-
-    /// Positions of the attributes `gold_1`, `gold_2`, ..
-    pub(super) fn gold_positions(&self) -> Range<usize> {
-        let first = self.wumpus_positions().end;
-        first..first + self.gold.len()
-    }
-
-    /// The world with a body of these actions; `None` leaves it all six.
-    pub(super) fn with_actions(self, actions: Option<Vec<Action>>) -> Self {
-        match actions {
-            Some(actions) => Self { actions, ..self },
-            None => self,
-        }
     }
 }
 

@@ -1,17 +1,61 @@
 //! Caves as they are written in JSON.
 
+use std::sync::Arc;
+
 use serde::{Deserialize, Serialize};
 
-use super::{Act, Cave, CaveState, Cell, Heading, cell_index, position};
-use crate::attribute::Schema;
+use super::{Act, Cave, Cell, Heading, cell_index, dynamics};
 use crate::document::{Faults, Object, Path, Place, Quoted};
 use crate::interrupt::{Interrupted, Meter};
-use crate::model::Action;
+use crate::model::action::ReadActions;
+use crate::model::dynamics::{Description, Dynamics};
+use crate::model::{Action, Limits};
+
+/// Reads a model of a cave, whose attributes follow from what is in it. A body that names no actions has all six.
+pub(in crate::model) fn read(
+    description: &mut Description<'_, '_>,
+    _: Limits,
+    meter: &mut Meter<'_>,
+    faults: &mut Faults,
+) -> Result<Option<Arc<dyn Dynamics>>, Interrupted> {
+    let (model, dynamics) = (description.model, description.dynamics);
+    if let Some(place) = model.optional("attributes") {
+        faults.note(&place, "the attributes of a wumpus world are implied; leave this out");
+    }
+    let actions = match model.optional("actions") {
+        None => Some(all_actions()),
+        Some(place) => {
+            let actions = ReadActions::read(&place, Cave::DEFAULT_ACTION_COST, faults);
+            check_actions(&place, faults);
+            actions.and_then(ReadActions::complete)
+        }
+    };
+    let cave = Cave::read(&dynamics, actions, meter, faults)?;
+    Ok(cave.map(|cave| Arc::new(cave) as Arc<dyn Dynamics>))
+}
+
+fn all_actions() -> Vec<Action> {
+    Act::ALL.map(|act| Action { name: act.name().into(), cost: Cave::DEFAULT_ACTION_COST }).to_vec()
+}
+
+/// Notes actions that the agent of a wumpus world does not have.
+fn check_actions(place: &Place<'_, '_>, faults: &mut Faults) {
+    let items = place.value.as_array().map(Vec::as_slice).unwrap_or_default();
+    for (n, item) in items.iter().enumerate() {
+        let name = item.get("name").and_then(serde_json::Value::as_str);
+        if let Some(name) = name.filter(|name| Act::named(name).is_none()) {
+            let known = Act::ALL.map(Act::name).join(", ");
+            let detail = format!("unknown action {}; a wumpus world has {known}", Quoted(name));
+            faults.note_at(&Path::Member(&Path::Item(&place.path, n), "name"), detail);
+        }
+    }
+}
 
 impl Cave {
-    /// Reads the world, with a body of all six actions.
-    pub(in crate::model) fn read(
+    /// Reads the world. `actions` are `None` where they had faults of their own.
+    fn read(
         place: &Place<'_, '_>,
+        actions: Option<Vec<Action>>,
         meter: &mut Meter<'_>,
         faults: &mut Faults,
     ) -> Result<Option<Self>, Interrupted> {
@@ -38,23 +82,25 @@ impl Cave {
             None => Some(1),
         };
         let cave = || {
-            let (width, height, pits) = (width?, height?, pits?);
+            let (width, height, pits, wumpi, gold) = (width?, height?, pits?, wumpi?, gold?);
             let mut is_pit = vec![false; usize::from(width) * usize::from(height)];
             for (x, y) in &pits {
                 is_pit[cell_index((*x, *y), width)] = true;
             }
+            let actions = actions?;
+            let schema = dynamics::schema(wumpi.len(), gold.len());
             Some(Self {
                 width,
                 height,
                 pits,
                 is_pit,
-                wumpi: wumpi?,
-                gold: gold?,
+                wumpi,
+                gold,
                 start: start?,
                 arrows: arrows?,
-                actions: Act::ALL
-                    .map(|act| Action { name: act.name().into(), cost: Self::DEFAULT_ACTION_COST })
-                    .to_vec(),
+                acts: actions.iter().map(|action| Act::named(&action.name)).collect::<Option<_>>()?,
+                actions,
+                schema,
             })
         };
         let cave = cave();
@@ -64,50 +110,7 @@ impl Cave {
         Ok(cave)
     }
 
-    /// Notes actions that the agent of a wumpus world does not have.
-    pub(in crate::model) fn check_actions(place: &Place<'_, '_>, faults: &mut Faults) {
-        let items = place.value.as_array().map(Vec::as_slice).unwrap_or_default();
-        for (n, item) in items.iter().enumerate() {
-            let name = item.get("name").and_then(serde_json::Value::as_str);
-            if let Some(name) = name.filter(|name| Act::named(name).is_none()) {
-                let known = Act::ALL.map(Act::name).join(", ");
-                let detail = format!("unknown action {}; a wumpus world has {known}", Quoted(name));
-                faults.note_at(&Path::Member(&Path::Item(&place.path, n), "name"), detail);
-            }
-        }
-    }
-
-    /// Reads the start of a request: every attribute of a state but `gold`, which follows from the pieces. Whether the body could come
-    /// to it is not asked.
-    pub(in crate::model) fn read_state(
-        &self,
-        schema: &Schema,
-        place: &Place<'_, '_>,
-        faults: &mut Faults,
-    ) -> Option<CaveState> {
-        let n_before = faults.count();
-        let wanted = schema.read_observation(place, faults)?;
-        if faults.count() != n_before {
-            return None;
-        }
-        let attributes = schema.attributes().iter().zip(&wanted).enumerate();
-        let missing = attributes.filter(|(at, (_, value))| *at != position::GOLD && value.is_none());
-        if let Some((_, (attribute, _))) = missing.into_iter().next() {
-            let detail = format!(
-                "the states of this world are found as it is searched, so all attributes of one are needed; {} is missing",
-                Quoted(&attribute.name)
-            );
-            faults.note(place, detail);
-            return None;
-        }
-        let state = self.state_of(&wanted);
-        if state.is_none() {
-            faults.note(place, "no state of the model has these values");
-        }
-        state
-    }
-
-    pub(in crate::model) fn document(&self) -> WumpusDocument {
+    fn document(&self) -> WumpusDocument {
         let cells = |cells: &[Cell]| cells.iter().map(|(x, y)| CellDocument(*x, *y)).collect();
         let ((x, y), heading) = self.start;
         WumpusDocument {
@@ -223,6 +226,20 @@ pub struct WumpusDocument {
     #[serde(default = "one_arrow")]
     #[cfg_attr(feature = "openapi", schema(maximum = 100, example = 1))]
     pub arrows: u8,
+}
+
+/// The dynamics as they are written in canonical form.
+#[derive(Serialize)]
+pub(super) struct Written {
+    kind: &'static str,
+    #[serde(flatten)]
+    cave: WumpusDocument,
+}
+
+impl Written {
+    pub(super) fn of(cave: &Cave) -> Self {
+        Self { kind: "wumpus", cave: cave.document() }
+    }
 }
 
 fn one_arrow() -> u8 {

@@ -1,19 +1,24 @@
+use std::sync::Arc;
+
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::interrupt::{Signal, Uninterrupted};
-use crate::model::Definition;
+use crate::interrupt::{Interrupt, Meter, Signal, Uninterrupted};
+use crate::model::dynamics::Dynamics;
+use crate::model::{Definition, Implicit, Limits, Model, Operator};
 
 fn cave(document: &Value) -> Cave {
-    match Definition::read(document, Limits::DEFAULT, &mut Uninterrupted).unwrap() {
-        Definition::Wumpus(cave) => cave,
-        Definition::Table(_) => panic!("a cave"),
-    }
+    let definition = Definition::read(document, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    definition.dynamics::<Cave>().unwrap().clone()
+}
+
+fn compiled_while(cave: &Cave, limits: Limits, interrupt: &mut dyn Interrupt) -> Model {
+    Arc::new(cave.clone()).compile(limits, interrupt).unwrap()
 }
 
 fn compiled(cave: &Cave, limits: Limits) -> Model {
-    cave.compile(limits, &mut Uninterrupted).unwrap()
+    compiled_while(cave, limits, &mut Uninterrupted)
 }
 
 /// Caves with things in any cells but the start's, and bodies.
@@ -80,7 +85,7 @@ fn a_cave_that_is_certainly_too_large_is_not_explored() {
         n_polls += 1;
         Signal::Continue
     };
-    assert!(cave.compile(Limits::DEFAULT, &mut count).unwrap().unexplored.is_some());
+    assert!(compiled_while(&cave, Limits::DEFAULT, &mut count).is_lazy());
     // A look at each cell, where a million states would be as many looks for each action.
     assert!(n_polls <= 1_000_000 / 1000, "{n_polls}");
 }
@@ -100,4 +105,29 @@ fn a_cave_that_would_take_more_values_or_memory_than_it_may_is_searched_lazily()
     // What exploring takes, with its index, is more than what is left in the end.
     assert!(!is_lazy(Limits { max_bytes: 8 * known.size_bytes(), ..Limits::NONE }));
     assert!(is_lazy(Limits { max_bytes: known.size_bytes(), ..Limits::NONE }));
+}
+
+#[test]
+fn every_transition_has_an_operator() {
+    let document = json!({"dynamics": {
+        "kind": "wumpus", "width": 4, "height": 3, "pits": [[3, 2]], "wumpi": [[2, 0], [2, 0], [0, 2]],
+        "gold": [[1, 0], [1, 0], [2, 0]], "start": {"x": 1, "y": 1, "heading": "north"}, "arrows": 3,
+    }});
+    let cave = cave(&document);
+    let model = compiled(&cave, Limits::DEFAULT);
+    let operators: Vec<Operator> = cave.operators().collect();
+    let mut is_used = vec![false; operators.len()];
+    for (from, transition) in model.graph().iter() {
+        let (row, row_after) = (model.states().row(from), model.states().row(transition.to));
+        let differences = (0..row.len()).filter(|at| row[*at] != row_after[*at]);
+        let changed: Vec<_> = differences.map(|at| (at, row[at], row_after[at])).collect();
+        let found = operators.iter().position(|operator| {
+            let is_kept = |(at, value): &(usize, u32)| row[*at] == *value && row_after[*at] == *value;
+            operator.action == transition.action && operator.changed == changed && operator.kept.iter().all(is_kept)
+        });
+        let found = found.unwrap_or_else(|| panic!("{} changes {changed:?}", model.action(transition.action).name));
+        is_used[found] = true;
+    }
+    let idle = operators.iter().zip(is_used).filter(|(_, is_used)| !is_used).count();
+    assert!(idle < operators.len() / 4, "{idle} of {} allow what never happens", operators.len());
 }

@@ -9,7 +9,7 @@ use crate::interrupt::Uninterrupted;
 use crate::mapping::Request;
 use crate::mapping::by_definition::least_costs;
 use crate::mapping::cost::cost_of;
-use crate::model::{Definition, Limits, Model, Whole};
+use crate::model::{Definition, Limits, Model};
 
 /// A model of up to 14 states, and a demonstration. Actions may cost nothing, states look alike, and not all is observed, so that many
 /// extra actions may follow each other.
@@ -76,7 +76,7 @@ proptest! {
             let swept = in_sections(&problem, section_len, Meter::new(&mut Uninterrupted, 1)).unwrap();
             let Swept::Done(found) = swept else { panic!("{swept:?}") };
             prop_assert!(is_a_mapping(&problem, &found.paths[0]), "{:?}", found.paths);
-            let cost = cost_of(&problem, &Whole::of(&model), &found.paths[0]).total;
+            let cost = cost_of(&problem, &model.whole(), &found.paths[0]).total;
             prop_assert!((cost - least).abs() <= 1e-9 * least, "{cost}, not {least}, in sections of {section_len}");
         }
     }

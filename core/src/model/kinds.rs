@@ -1,0 +1,34 @@
+//! Which kinds of dynamics there are. A new kind is an entry in each of the two lists here, and a folder.
+
+use serde::{Deserialize, Serialize};
+
+use super::dynamics::Read;
+use super::table::{self, TableDocument};
+use super::wumpus::{self, WumpusDocument};
+
+/// Each kind's name in JSON, and what reads it.
+const KINDS: [(&str, Read); 2] = [("table", table::read), ("wumpus", wumpus::read)];
+
+/// What reads the dynamics of the kind called `name`.
+pub(super) fn reader(name: &str) -> Option<Read> {
+    KINDS.into_iter().find(|(known, _)| *known == name).map(|(_, read)| read)
+}
+
+/// The names of all kinds, as they are listed in a fault.
+pub(super) fn names() -> String {
+    KINDS.map(|(name, _)| format!("{name:?}")).join(", ")
+}
+
+/// Which states there are, and how actions lead from one to another.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(tag = "kind", rename_all = "lowercase")]
+#[cfg_attr(feature = "openapi", schema(as = Dynamics))]
+pub enum DynamicsDocument {
+    /// States and transitions are listed.
+    #[cfg_attr(feature = "openapi", schema(title = "TableDynamics"))]
+    Table(TableDocument),
+    /// They follow from the rules of the wumpus world.
+    #[cfg_attr(feature = "openapi", schema(title = "WumpusDynamics"))]
+    Wumpus(WumpusDocument),
+}
