@@ -35,7 +35,8 @@ impl Mapper {
                     best_first::most_bytes(model, n_observations).max(sweep::most_bytes(model, n_observations));
                 search.saturating_add(2 * tables)
             }
-            HeuristicName::None | HeuristicName::Paper => astar::most_bytes(n_nodes).max(4 * tables),
+            HeuristicName::None => best_first::most_bytes(model, n_observations),
+            HeuristicName::Paper => astar::most_bytes(n_nodes).max(4 * tables),
         };
         budget.max_bytes.min(n_bytes.saturating_add(way_bytes(problem)))
     }

@@ -300,11 +300,11 @@ impl Mapper {
                 None => self.best_first(space, problem, settings, most_f, interrupt),
             },
             HeuristicName::None => {
-                let found = astar::search(problem, space, &Blind, budget, most_f, interrupt)?;
+                let found = self.search(space, problem, &Projected::blind(problem), budget, most_f, interrupt)?;
                 conclude(problem, space, &Blind, within(most_f, found, problem), interrupt)
             }
             HeuristicName::Paper => {
-                let found = astar::search(problem, space, &Paper::new(problem), budget, f64::INFINITY, interrupt)?;
+                let found = astar::search(problem, space, &Paper::new(problem), budget, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
                 let first = problem.distances.distance(0, space.row(problem.start));
                 let room = TableRoom::within(budget.max_bytes);

@@ -1,9 +1,11 @@
 //! The cheapest ways to every state at one observation, made from those at the observation before.
 
+use std::collections::BinaryHeap;
+
 use rustc_hash::FxHashMap;
 
-use super::open_list::OpenList;
 use crate::mapping::distances::ObservedDistances;
+use crate::mapping::open_list::CheapestFirst;
 use crate::model::{Model, StateIdx};
 
 /// Where a way comes from: a state of the layer before (by a skip if it is the same state, else by a match) or of the same
@@ -231,18 +233,19 @@ pub(super) struct Sweep {
     pub(super) action_costs: Vec<f64>,
     /// Distances to the observation in hand. Shape `[n_states]`.
     distances: Vec<f64>,
-    pub(super) open: OpenList,
+    pub(super) open: BinaryHeap<CheapestFirst>,
 }
 
 impl Sweep {
     pub(super) fn new(model: &Model) -> Self {
         let action_costs = model.actions().iter().map(|action| action.cost).collect();
-        Self { action_costs, distances: vec![0.0; model.graph().n_states()], open: OpenList::new() }
+        Self { action_costs, distances: vec![0.0; model.graph().n_states()], open: BinaryHeap::new() }
     }
 
     /// Approximate size in memory, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
-        (self.distances.len() + self.action_costs.len()) * size_of::<f64>() + self.open.size_bytes()
+        (self.distances.len() + self.action_costs.len()) * size_of::<f64>()
+            + self.open.capacity() * size_of::<CheapestFirst>()
     }
 
     /// The layer of the root, which costs `cost`: extras lead on from there (Dijkstra's algorithm). They lead to none but
@@ -260,8 +263,8 @@ impl Sweep {
         }
         let Spare { mut costs, mut nodes, .. } = spare.cleared(model.graph().n_states(), usize::MAX);
         costs[root as usize] = cost;
-        self.open.push(cost, root);
-        while let Some((cost, state)) = self.open.pop() {
+        self.open.push(CheapestFirst { cost, id: root });
+        while let Some(CheapestFirst { cost, id: state }) = self.open.pop() {
             if cost <= costs[state as usize] {
                 self.extras(model, state, &mut costs, &mut nodes, |_, _| true);
             }
@@ -310,10 +313,10 @@ impl Sweep {
         for state in reached {
             let cost = costs[*state as usize];
             if is_lower(*state, cost) {
-                self.open.push(cost, *state);
+                self.open.push(CheapestFirst { cost, id: *state });
             }
         }
-        while let Some((cost, state)) = self.open.pop() {
+        while let Some(CheapestFirst { cost, id: state }) = self.open.pop() {
             if cost <= costs[state as usize] {
                 self.extras(model, state, &mut costs, &mut nodes, is_lower);
             }
@@ -344,7 +347,7 @@ impl Sweep {
                 costs[to] = cost;
                 nodes[to].source = Source::within(state);
                 if leads_on(transition.to, cost) {
-                    self.open.push(cost, transition.to);
+                    self.open.push(CheapestFirst { cost, id: transition.to });
                 }
             }
         }

@@ -45,7 +45,6 @@
 //! the same ones give the same steps.
 
 mod layer;
-mod open_list;
 mod repair;
 mod window;
 
@@ -54,6 +53,7 @@ use std::sync::Arc;
 
 use super::cost::Cost;
 use super::distances::ObservedDistances;
+use super::open_list::CheapestFirst;
 use super::policy::{Step, StepWriter};
 use super::problem::choose_start;
 use super::{Mapper, Mapping, Move, MoveKind, Status};
@@ -198,7 +198,7 @@ impl OnlineMapping {
         };
         let each = each + size_of::<Layer>() + model.schema().len() * OBSERVED_BYTES;
         let once = n_states
-            * (size_of::<f64>() + size_of::<StateIdx>() + OPEN * size_of::<(u64, StateIdx)>() + 3 * layer::NODE_BYTES)
+            * (size_of::<f64>() + size_of::<StateIdx>() + OPEN * size_of::<CheapestFirst>() + 3 * layer::NODE_BYTES)
             + n_terms * size_of::<f64>()
             + Predecessors::bytes_for(model.graph());
         let moves = n_observations.saturating_mul(MOVES_PER_OBSERVATION * size_of::<Move>());

@@ -10,10 +10,12 @@
 //!
 //! Nodes that nobody wanted stay lost, as lower bounds for the next time.
 
+use std::collections::BinaryHeap;
+
 use super::layer::{Source, Sweep};
-use super::open_list::OpenList;
 use super::window::{Place, Window, action};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::mapping::open_list::CheapestFirst;
 use crate::model::{ActionIdx, Graph, Model, Rows, StateIdx};
 
 /// The ways into states, by the state that is led to.
@@ -70,7 +72,7 @@ pub(super) struct Repair<'r> {
     model: &'r Model,
     predecessors: &'r Predecessors,
     action_costs: &'r [f64],
-    open: &'r mut OpenList,
+    open: &'r mut BinaryHeap<CheapestFirst>,
     n_states: usize,
     /// Shape `[n_layers, n_states]`.
     standings: Vec<Standing>,
@@ -258,7 +260,7 @@ impl<'r> Repair<'r> {
             });
             self.set((index, state), best);
         }
-        while let Some((cost, state)) = self.open.pop() {
+        while let Some(CheapestFirst { cost, id: state }) = self.open.pop() {
             if cost > self.cost((index, state)) {
                 continue;
             }
@@ -287,7 +289,7 @@ impl<'r> Repair<'r> {
         layer.costs[state as usize] = cost;
         layer.set_source(state, source);
         if cost.is_finite() {
-            self.open.push(cost, state);
+            self.open.push(CheapestFirst { cost, id: state });
         }
     }
 }

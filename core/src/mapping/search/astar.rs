@@ -1,4 +1,4 @@
-//! A* over nodes `(i, s)` (Hart, Nilsson & Raphael 1968).
+//! A* over nodes `(i, s)`, as in the textbook (Hart, Nilsson & Raphael 1968): what the paper searched with, for its own heuristic.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
@@ -11,8 +11,7 @@ use crate::mapping::heuristic::Heuristic;
 use crate::mapping::{Budget, Problem, StoppedBy};
 use crate::model::{ActionIdx, Space, StateIdx, make_room, room_to_make};
 
-/// Finds the cheapest mapping, as far as `heuristic` is admissible and `budget` allows, among those of at most `most_f`. If there is
-/// none, it comes to its end without one. A node is expanded again if a cheaper
+/// Finds a mapping, the cheapest if `heuristic` is admissible, as far as `budget` allows. A node is expanded again if a cheaper
 /// way to it is found, so the heuristic need not be consistent.
 ///
 /// # Errors
@@ -23,12 +22,11 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
     space: &mut S,
     heuristic: &H,
     budget: Budget,
-    most_f: f64,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
     let last = problem.last();
     let actions = problem.model.actions();
-    let mut nodes = Nodes::new(problem.demonstration.len(), space.n_states(), budget);
+    let mut nodes = Nodes::default();
     let mut open = BinaryHeap::new();
     // With what was taken out.
     let mut most_open = 0;
@@ -96,17 +94,12 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
             let observation = i as u32;
             if let Some(id) = nodes.reach(Way { observation, state, g, action, parent: entry.id }) {
-                let f = g + heuristic.cost_to_go(i, row);
-                if f <= most_f {
-                    open.push(Open { f, g, observation, id });
-                }
+                open.push(Open { f: g + heuristic.cost_to_go(i, row), g, observation, id });
             }
         }
         most_open = most_open.max(open.len());
     }
-    // Whatever is left costs more than `most_f`: there is no such mapping.
-    let paths = [farthest.id, 0].map(|id| nodes.path(id)).to_vec();
-    Ok(Found { paths, is_complete: true, stopped_by: None, least_f: f64::INFINITY, n_expanded, n_generated })
+    unreachable!("skipping leads to the last observation");
 }
 
 /// Whether there is no memory left. `most_open` nodes were open at the same time.
@@ -122,10 +115,8 @@ fn is_out_of_memory(
     let n_bytes = nodes.size_bytes() + most_open * size_of::<Open>();
     let all_bytes = n_bytes + space.found_bytes();
     if all_bytes > budget.max_bytes / SMALL {
-        let fixed_bytes = nodes.fixed_bytes();
-        let most = budget.beside(fixed_bytes).max_bytes;
         #[expect(clippy::cast_precision_loss, reason = "about")]
-        let growth = most as f64 / (all_bytes - fixed_bytes) as f64;
+        let growth = budget.max_bytes as f64 / all_bytes as f64;
         make_room(&mut nodes.ways, growth);
         let _ = open.try_reserve_exact(room_to_make(open.len(), open.capacity(), growth));
         space.make_room(growth);
@@ -148,64 +139,28 @@ struct Way {
 
 type NodeId = u32;
 
-/// The least part of the memory that is taken at once.
-const PAGE_BYTES: usize = 4096;
-
 /// The nodes that were found, and where each is.
+#[derive(Default)]
 struct Nodes {
     ways: Vec<Way>,
-    index: NodeIndex,
-    /// How many keys each observation has.
-    n_keys: usize,
+    /// By observation and state.
+    ids: FxHashMap<(u32, StateIdx), NodeId>,
 }
 
-/// Finds the id of a node.
-enum NodeIndex {
-    /// By `i * n_keys + s`, plus 1; 0 for none. Zeroed pages cost nothing until they are touched.
-    Dense(Vec<NodeId>),
-    /// For problems of which a dense index would be too large.
-    Sparse(FxHashMap<u64, NodeId>),
-}
-
-/// Most entries of a dense index: 256 MB, and no more than this part of the memory.
-const MAX_DENSE_INDEX: usize = 1 << 26;
-const DENSE_INDEX_PART: usize = 4;
+/// What an entry of their hash table takes, in bytes, while it grows to twice its size.
+const ENTRY_BYTES: usize = 4 * size_of::<((u32, StateIdx), NodeId)>();
 
 /// About how much memory a search takes at most, in bytes, if it finds so many nodes.
 pub(in crate::mapping) fn most_bytes(n_nodes: usize) -> usize {
     /// How often a node is open, at different costs.
     const N_TIMES_OPEN: usize = 4;
-    n_nodes.saturating_mul(size_of::<Way>() + size_of::<NodeId>() + N_TIMES_OPEN * size_of::<Open>())
+    n_nodes.saturating_mul(size_of::<Way>() + ENTRY_BYTES + N_TIMES_OPEN * size_of::<Open>())
 }
 
 impl Nodes {
-    fn new(n_observations: usize, n_states: Option<usize>, budget: Budget) -> Self {
-        let n_keys = n_states.unwrap_or(1 << StateIdx::BITS);
-        let n_nodes = n_observations.saturating_mul(n_keys);
-        let most = MAX_DENSE_INDEX.min(budget.max_bytes / DENSE_INDEX_PART / size_of::<NodeId>());
-        let index =
-            if n_nodes <= most { NodeIndex::Dense(vec![0; n_nodes]) } else { NodeIndex::Sparse(FxHashMap::default()) };
-        Self { ways: Vec::new(), index, n_keys }
-    }
-
     /// How much memory they take, in bytes, with their places in the index.
     fn size_bytes(&self) -> usize {
-        /// Of a hash table, while it grows to twice its size.
-        const ENTRY_BYTES: usize = 4 * size_of::<(u64, NodeId)>();
-        let index = match &self.index {
-            NodeIndex::Dense(_) => self.fixed_bytes(),
-            NodeIndex::Sparse(ids) => ids.len() * ENTRY_BYTES,
-        };
-        size_of_val(self.ways.as_slice()) + index
-    }
-
-    /// What of this becomes no more.
-    fn fixed_bytes(&self) -> usize {
-        match &self.index {
-            // A page of the memory is taken for the first node in it.
-            NodeIndex::Dense(ids) => size_of_val(ids.as_slice()).min(self.ways.len().saturating_mul(PAGE_BYTES)),
-            NodeIndex::Sparse(_) => 0,
-        }
+        size_of_val(self.ways.as_slice()) + self.ids.len() * ENTRY_BYTES
     }
 
     fn get(&self, id: NodeId) -> &Way {
@@ -217,19 +172,7 @@ impl Nodes {
     fn reach(&mut self, way: Way) -> Option<NodeId> {
         #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
         let next = self.ways.len() as NodeId;
-        let key = way.observation as usize * self.n_keys + way.state as usize;
-        let id = match &mut self.index {
-            NodeIndex::Dense(ids) => {
-                let id = ids[key];
-                if id == 0 {
-                    ids[key] = next + 1;
-                    next
-                } else {
-                    id - 1
-                }
-            }
-            NodeIndex::Sparse(ids) => *ids.entry(key as u64).or_insert(next),
-        };
+        let id = *self.ids.entry((way.observation, way.state)).or_insert(next);
         if id == next {
             self.ways.push(way);
             return Some(id);

@@ -16,7 +16,7 @@ use std::collections::BinaryHeap;
 use std::ops::Range;
 
 use super::buckets::Buckets;
-use super::nodes::{Arrival, NO_NODE, NodeId, Nodes, Place, Reached, Step};
+use super::nodes::{Arrival, BlockIdx, NO_NODE, NodeId, Nodes, Reached, Step};
 use super::seen::{Estimates, Seen, SeenIdx, Way};
 use super::{End, Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
@@ -342,11 +342,11 @@ impl<S: Space> Search<'_, '_, S> {
         self.nodes.close(id);
         if may_skip {
             let is_near = Nodes::are_together(next);
-            let mut place = if is_near { Nodes::place_of(id) } else { self.nodes.find(state, next) };
-            if self.nodes.may_take(place, next, g) {
+            let mut block = if is_near { Nodes::block_of(id) } else { self.nodes.find(state, next) };
+            if self.nodes.may_take(block, next, g) {
                 let kind = MoveKind::Skip;
                 let skip = Arrival { kind, observation: next, state, cost: g, parent: id, action: NO_ACTION };
-                if let Some(node) = self.take(&mut place, skip) {
+                if let Some(node) = self.take(&mut block, skip) {
                     found(node, next);
                 }
             }
@@ -356,11 +356,11 @@ impl<S: Space> Search<'_, '_, S> {
         for way in ways {
             let Way { cost, to: state, action } = self.seen.way(way);
             let cost = g + cost;
-            let mut place = self.nodes.find(state, next);
-            if self.nodes.may_take(place, next, cost) {
+            let mut block = self.nodes.find(state, next);
+            if self.nodes.may_take(block, next, cost) {
                 let kind = MoveKind::Match;
                 let arrival = Arrival { kind, observation: next, state, cost, parent: id, action };
-                if let Some(node) = self.take(&mut place, arrival) {
+                if let Some(node) = self.take(&mut block, arrival) {
                     found(node, next);
                 }
             }
@@ -368,12 +368,12 @@ impl<S: Space> Search<'_, '_, S> {
                 continue;
             }
             if !Nodes::are_together(next) {
-                place = self.nodes.find(state, here);
+                block = self.nodes.find(state, here);
             }
-            if self.nodes.may_take(place, here, cost) {
+            if self.nodes.may_take(block, here, cost) {
                 let kind = MoveKind::Extra;
                 let arrival = Arrival { kind, observation: here, state, cost, parent: id, action };
-                if let Some(node) = self.take(&mut place, arrival) {
+                if let Some(node) = self.take(&mut block, arrival) {
                     found(node, here);
                 }
             }
@@ -384,10 +384,10 @@ impl<S: Space> Search<'_, '_, S> {
     /// observation.
     #[expect(clippy::inline_always, reason = "it is what a search does most")]
     #[inline(always)]
-    fn take(&mut self, place: &mut Place, arrival: Arrival) -> Option<Reached> {
+    fn take(&mut self, block: &mut BlockIdx, arrival: Arrival) -> Option<Reached> {
         let observation = arrival.observation;
         let Self { nodes, seen, projected, space, .. } = self;
-        let node = nodes.take(place, arrival, &Estimates { seen, projected, space: &**space }, self.limit)?;
+        let node = nodes.take(block, arrival, &Estimates { seen, projected, space: &**space }, self.limit)?;
         if observation == self.last {
             self.limit = node.g * (1.0 - self.rounding);
             self.incumbent = Some(node.id);

@@ -14,6 +14,9 @@ use crate::model::{ActionIdx, Space, make_room};
 /// Where a node is in [`Nodes`]: its block, and its place in that.
 pub(super) type NodeId = u32;
 
+/// Where a block is in [`Nodes`], [`NO_BLOCK`] if it is not.
+pub(super) type BlockIdx = u32;
+
 /// Stands for "no node".
 pub(super) const NO_NODE: NodeId = NodeId::MAX;
 
@@ -108,14 +111,6 @@ const BLOCK_BYTES: usize = size_of::<Key>()
     + size_of::<[Estimate; BLOCK_LEN]>()
     + size_of::<[Link; BLOCK_LEN]>();
 
-/// Where the block of a node is, or would be.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Place {
-    block: u32,
-    /// In the index.
-    slot: usize,
-}
-
 impl Nodes {
     /// Forgets all nodes, and keeps the memory. There will be nodes at so many observations.
     pub(super) fn clear(&mut self, n_observations: usize) {
@@ -207,15 +202,14 @@ impl Nodes {
 
     /// Looks for the block of a node.
     #[inline]
-    pub(super) fn find(&self, state: SeenIdx, observation: u32) -> Place {
-        let (block, slot) = self.index.find(Key { state, number: observation >> BLOCK_BITS }, &self.keys);
-        Place { block, slot }
+    pub(super) fn find(&self, state: SeenIdx, observation: u32) -> BlockIdx {
+        self.index.find(Key { state, number: observation >> BLOCK_BITS })
     }
 
-    /// Where the block of a node is that was found.
+    /// The block of a node that was found.
     #[inline]
-    pub(super) fn place_of(id: NodeId) -> Place {
-        Place { block: id >> BLOCK_BITS, slot: 0 }
+    pub(super) fn block_of(id: NodeId) -> BlockIdx {
+        id >> BLOCK_BITS
     }
 
     /// Whether the node before that of `observation`, of the same state, is in the same block.
@@ -224,38 +218,37 @@ impl Nodes {
         observation & IN_BLOCK != 0
     }
 
-    /// Whether a way to a node may be of interest, if it costs so much before the distance is paid. `place` is where its block was
-    /// found.
+    /// Whether a way to a node may be of interest, if it costs so much before the distance is paid. `block` is its block.
     #[inline]
-    pub(super) fn may_take(&self, place: Place, observation: u32, cost: f64) -> bool {
-        cost < self.costs[place.block as usize].0[(observation & IN_BLOCK) as usize]
+    pub(super) fn may_take(&self, block: BlockIdx, observation: u32, cost: f64) -> bool {
+        cost < self.costs[block as usize].0[(observation & IN_BLOCK) as usize]
     }
 
     /// Takes a way to a node that [may be](Self::may_take) of interest, if a mapping that goes on from there may cost less than
-    /// `limit`. Gives the node then. `place` is where its block was found, or that of its neighbour
+    /// `limit`. Gives the node then. `block` is its block as it was found, or that of its neighbour
     /// [together](Self::are_together) with it.
     #[expect(clippy::inline_always, reason = "it is what a search does most")]
     #[inline(always)]
     pub(super) fn take(
         &mut self,
-        place: &mut Place,
+        block: &mut BlockIdx,
         arrival: Arrival,
         estimates: &Estimates<'_, '_, impl Space>,
         limit: f64,
     ) -> Option<Reached> {
         let Arrival { kind, observation, state, cost, parent, action } = arrival;
-        if place.block == NO_BLOCK && !self.add(place, state, observation, cost, estimates, limit) {
+        if *block == NO_BLOCK && !self.add(block, state, observation, cost, estimates, limit) {
             return None;
         }
-        let (block, in_block) = (place.block as usize, (observation & IN_BLOCK) as usize);
-        let mark = &mut self.marks[block][in_block];
-        let estimate = &mut self.estimates[block][in_block];
+        let (at, in_block) = (*block as usize, (observation & IN_BLOCK) as usize);
+        let mark = &mut self.marks[at][in_block];
+        let estimate = &mut self.estimates[at][in_block];
         if *mark & ESTIMATED == 0 {
             *mark |= ESTIMATED;
             *estimate = estimates.of(state, observation);
         }
-        let reached = Reached::by(place.block << BLOCK_BITS | observation & IN_BLOCK, cost, *estimate);
-        self.costs[block].0[in_block] = cost;
+        let reached = Reached::by(*block << BLOCK_BITS | observation & IN_BLOCK, cost, *estimate);
+        self.costs[at].0[in_block] = cost;
         if reached.f >= limit && *mark & FOUND == 0 {
             return None;
         }
@@ -266,15 +259,15 @@ impl Nodes {
                 MoveKind::Extra => LINGERED_TO,
                 MoveKind::Start | MoveKind::Match => 0,
             };
-        self.links[block][in_block] = Link { parent, action };
+        self.links[at][in_block] = Link { parent, action };
         (reached.f < limit).then_some(reached)
     }
 
-    /// Adds a block at `place`, unless the way is not of interest for which that is done. Says whether it did.
+    /// Adds a block, unless the way is not of interest for which that is done. Says whether it did.
     #[inline(never)]
     fn add(
         &mut self,
-        place: &mut Place,
+        block: &mut BlockIdx,
         state: SeenIdx,
         observation: u32,
         cost: f64,
@@ -288,10 +281,11 @@ impl Nodes {
         let number = observation >> BLOCK_BITS;
         #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
         {
-            place.block = self.keys.len() as u32;
+            *block = self.keys.len() as u32;
         }
-        self.keys.push(Key { state, number });
-        self.index.insert(place.slot, &self.keys);
+        let key = Key { state, number };
+        self.keys.push(key);
+        self.index.insert(key, *block);
         self.links.push([NO_LINK; BLOCK_LEN]);
         if let Some(estimates) = estimates.of_all(state, number << BLOCK_BITS) {
             // A little more, as sums differ by rounding.

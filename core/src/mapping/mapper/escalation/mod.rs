@@ -95,7 +95,8 @@ impl Mapper {
         conclude(problem, space, &blind, found, interrupt)
     }
 
-    fn search<S: Space>(
+    /// Searches best first, with buffers of searches before.
+    pub(super) fn search<S: Space>(
         &self,
         space: &mut S,
         problem: &Problem<'_>,
