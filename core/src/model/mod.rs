@@ -15,10 +15,10 @@
 //!
 //! | file | is |
 //! |---|---|
-//! | `action`, `states`, `rows`, `graph`, `operator`, `limits` | the parts |
+//! | `action`, `room`, `states`, `rows`, `graph`, `operator`, `limits` | the parts |
 //! | `space` | states and transitions as a search sees them |
 //! | `implicit`, `explored` | rules by which states follow from one another; what was found by them |
-//! | `compiled`, `start` | the model; where the imitator starts |
+//! | `compiled`, `origin` | the model; where a request says that the imitator starts |
 //! | `dynamics` | the seam: what every kind of dynamics is to the rest |
 //! | `table`, `wumpus` | the kinds, a folder each |
 //! | `kinds` | the list of kinds |
@@ -37,10 +37,11 @@ mod implicit;
 mod kinds;
 mod limits;
 mod operator;
+mod origin;
 mod reading;
+mod room;
 mod rows;
 mod space;
-mod start;
 mod states;
 mod table;
 mod wumpus;
@@ -54,10 +55,11 @@ pub use implicit::{Implicit, Outcome};
 pub use kinds::DynamicsDocument;
 pub use limits::{CompileError, Limits};
 pub use operator::Operator;
+pub use origin::{Origin, OriginRow};
 pub use reading::{Format, MAX_LINE_BYTES, ReadError};
+pub(crate) use room::{make_room, room_to_make};
 pub(crate) use rows::Rows;
-pub(crate) use space::{Space, Whole, make_room, room_to_make};
-pub use start::{Origin, OriginRow, Start};
-pub use states::{StateIdx, States};
+pub(crate) use space::{Space, Whole};
+pub use states::{Start, StateIdx, States};
 pub use table::{ActionReference, StartDocument, Table, TableDocument, TransitionDocument};
 pub use wumpus::{Act, Cave, CaveState, Cell, CellDocument, Heading, PoseDocument, WumpusDocument};

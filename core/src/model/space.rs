@@ -26,26 +26,6 @@ pub(crate) trait Space {
     fn make_room(&mut self, growth: f64);
 }
 
-/// Makes room for `growth` times as many items and half as many more, once there is room for only a few. So they are copied no more, as
-/// they are whenever a vector that is full grows by itself; and what is not filled takes no memory. Nothing if there are no addresses for it.
-pub(crate) fn make_room<T>(items: &mut Vec<T>, growth: f64) {
-    // Without it, they grow as they come.
-    let _ = items.try_reserve_exact(room_to_make(items.len(), items.capacity(), growth));
-}
-
-/// For how many more of `n_items` that does.
-pub(crate) fn room_to_make(n_items: usize, capacity: usize, growth: f64) -> usize {
-    const FEW: usize = 1 << 12;
-    /// As not all items become more at the same pace.
-    const MORE: f64 = 1.5;
-    #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "about")]
-    let times = |factor: f64| (n_items as f64 * factor) as usize;
-    if capacity - n_items >= FEW || capacity >= times(growth) {
-        return 0;
-    }
-    (times(growth * MORE) - n_items).max(FEW)
-}
-
 /// All states and transitions of a model, known beforehand.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Whole<'m> {

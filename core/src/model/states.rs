@@ -1,10 +1,21 @@
-//! The states of a model, interned.
+//! The states of a model, interned, and which of them the imitator may start in.
 
-use super::make_room;
+use super::room::make_room;
 use crate::attribute::Value;
 
 /// Index of a state in its model.
 pub type StateIdx = u32;
+
+/// Where the imitator may start.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Start {
+    /// In this state.
+    State(StateIdx),
+    /// In whichever of these states is closest to the first observation; the lowest index among equals. Not empty.
+    Candidates(Vec<StateIdx>),
+    /// In whichever state is closest to the first observation; the lowest index among equals.
+    Any,
+}
 
 /// The states of a model. Each attribute's distinct values are kept once, in its *domain*, and a state is a row
 /// of indices into the domains, so that a distance can be looked up per (observation, value) instead of computed per

@@ -1,59 +1,16 @@
-//! A cave as a source of states: its attributes, and how many states there are.
+//! A cave as a source of states: which there are, and how they follow from one another.
 
 use std::io;
 use std::ops::Range;
 use std::sync::Arc;
 
+use super::attributes::position;
 use super::reading::Written;
 use super::{Act, Cave, CaveState, Heading, cell_index};
-use crate::attribute::{Attribute, Cycle, Kind, Labels, Schema, Value};
+use crate::attribute::{Schema, Value};
 use crate::interrupt::{Interrupt, Interrupted, Meter};
 use crate::model::dynamics::{Dynamics, write_definition};
 use crate::model::{ActionIdx, Implicit, Limits, Model, Operator, Outcome, StateIdx};
-
-/// Where the attributes of a state stand; wumpi and pieces of gold come after these.
-pub(super) mod position {
-    pub(in super::super) const X: usize = 0;
-    pub(in super::super) const Y: usize = 1;
-    pub(in super::super) const HEADING: usize = 2;
-    pub(in super::super) const GOLD: usize = 3;
-    pub(in super::super) const ARROWS: usize = 4;
-    pub(in super::super) const OUTSIDE: usize = 5;
-}
-
-/// The attributes of a state of a cave with so many wumpi and pieces of gold.
-pub(super) fn schema(n_wumpi: usize, n_gold: usize) -> Schema {
-    let number = Kind::Number { scale: 1.0 };
-    let labels = Labels::of(Heading::ALL.map(Heading::name));
-    let heading = Kind::Cyclic { scale: 1.0, cycle: Cycle::Labels(labels) };
-    let attribute =
-        |name: &str, kind: &Kind, weight: f64| Attribute { name: name.to_owned(), kind: kind.clone(), weight };
-    let mut attributes = vec![
-        attribute("x", &number, 1.0),
-        attribute("y", &number, 1.0),
-        attribute("heading", &heading, 1.0),
-        attribute("gold", &number, 1.0),
-        attribute("arrows", &number, 1.0),
-        attribute("outside", &Kind::Category, 5.0),
-    ];
-    attributes.extend((1..=n_wumpi).map(|k| attribute(&format!("wumpus_{k}"), &Kind::Category, 0.0)));
-    attributes.extend((1..=n_gold).map(|k| attribute(&format!("gold_{k}"), &Kind::Category, 0.0)));
-    Schema::of(attributes)
-}
-
-impl Cave {
-    /// Positions of the attributes `wumpus_1`, `wumpus_2`, ..
-    pub(super) fn wumpus_positions(&self) -> Range<usize> {
-        let first = position::OUTSIDE + 1;
-        first..first + self.wumpi.len()
-    }
-
-    /// Positions of the attributes `gold_1`, `gold_2`, ..
-    pub(super) fn gold_positions(&self) -> Range<usize> {
-        let first = self.wumpus_positions().end;
-        first..first + self.gold.len()
-    }
-}
 
 impl Dynamics for Cave {
     fn schema(&self) -> &Schema {

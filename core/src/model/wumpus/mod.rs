@@ -7,6 +7,7 @@
 //! [`Cave`] holds the rules ([`Cave::after`]), and the actions of a body; as [`Implicit`](super::Implicit) dynamics it gives the states that
 //! this body reaches.
 
+mod attributes;
 mod dynamics;
 mod operators;
 mod reading;

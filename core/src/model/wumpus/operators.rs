@@ -1,6 +1,6 @@
 //! What the rules of a cave change, attribute by attribute.
 
-use super::dynamics::position;
+use super::attributes::position;
 use super::{Act, Cave, Heading};
 use crate::model::Operator;
 

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Act, Cave, Cell, Heading, cell_index, dynamics};
+use super::{Act, Cave, Cell, Heading, attributes, cell_index};
 use crate::document::{Faults, Object, Path, Place, Quoted};
 use crate::interrupt::{Interrupted, Meter};
 use crate::model::action::ReadActions;
@@ -88,7 +88,7 @@ impl Cave {
                 is_pit[cell_index((*x, *y), width)] = true;
             }
             let actions = actions?;
-            let schema = dynamics::schema(wumpi.len(), gold.len());
+            let schema = attributes::schema(wumpi.len(), gold.len());
             Some(Self {
                 width,
                 height,

@@ -1,4 +1,4 @@
-//! Where the imitator may start: as a model says, and as a request does.
+//! Where a request says that the imitator starts.
 
 use std::sync::Arc;
 
@@ -6,17 +6,6 @@ use super::explored::Unexplored;
 use super::{Model, StateIdx};
 use crate::attribute::Value;
 use crate::document::{Faults, Place, Quoted};
-
-/// Where the imitator may start.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Start {
-    /// In this state.
-    State(StateIdx),
-    /// In whichever of these states is closest to the first observation; the lowest index among equals. Not empty.
-    Candidates(Vec<StateIdx>),
-    /// In whichever state is closest to the first observation; the lowest index among equals.
-    Any,
-}
 
 /// The state that a request says the imitator starts in.
 #[derive(Clone, Debug, PartialEq, Eq)]
