@@ -101,23 +101,23 @@ fn best_move<S: Space, H: Heuristic>(
     state: StateIdx,
     seen: Option<&Vec<StateIdx>>,
 ) -> (Move, usize) {
-    let estimate = |i: usize, state, cost: f64| {
+    let estimate = |kind: MoveKind, i: usize, state, cost: f64| {
         let row = space.row(state);
-        cost + problem.distances.distance(i, row) + heuristic.cost_to_go(i, row)
+        kind.arrive(cost, problem.distances.distance(i, row)) + heuristic.cost_to_go(i, row)
     };
     #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
     let step = |kind, action, i: usize, state| Move { kind, action, observation: i as u32, state };
 
-    let mut best = (estimate(i + 1, state, 0.0), skip_to(i + 1, state), i + 1);
+    let mut best = (estimate(MoveKind::Skip, i + 1, state, 0.0), skip_to(i + 1, state), i + 1);
     for transition in space.successors(state) {
         let (action, to) = (transition.action, transition.to);
         let cost = problem.model.action(action).cost;
-        let advanced = estimate(i + 1, to, cost);
+        let advanced = estimate(MoveKind::Match, i + 1, to, cost);
         if advanced < best.0 {
             best = (advanced, step(MoveKind::Match, Some(action), i + 1, to), i + 1);
         }
         if seen.is_some_and(|seen| !seen.contains(&to)) {
-            let lingered = estimate(i, to, cost);
+            let lingered = estimate(MoveKind::Extra, i, to, cost);
             if lingered < best.0 {
                 best = (lingered, step(MoveKind::Extra, Some(action), i, to), i);
             }

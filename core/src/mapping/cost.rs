@@ -70,7 +70,8 @@ pub(super) fn cost_of(problem: &Problem<'_>, space: &impl Space, moves: &[Move])
     let mut sum = CostSum::default();
     for step in moves {
         let action_cost = step.action.map_or(0.0, |action| problem.model.action(action).cost);
-        sum.add(action_cost, problem.distances.distance(step.observation as usize, space.row(step.state)));
+        let distance = problem.distances.distance(step.observation as usize, space.row(step.state));
+        sum.add(action_cost, step.kind.paid(distance));
     }
     sum.cost()
 }

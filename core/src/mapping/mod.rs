@@ -32,7 +32,6 @@
 //! replaced by a sweep over all nodes, from the last observation back, in which a node is left by a skip unless a match is cheaper, and by
 //! a match unless an extra action is; when it is depends on the problem and the budget alone.
 
-mod backward;
 #[cfg(test)]
 mod by_definition;
 mod completion;
@@ -45,6 +44,7 @@ mod online;
 mod open_list;
 mod policy;
 mod problem;
+mod recurrence;
 mod request;
 mod search;
 mod written;

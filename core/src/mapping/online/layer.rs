@@ -4,6 +4,7 @@ use std::collections::BinaryHeap;
 
 use rustc_hash::FxHashMap;
 
+use crate::mapping::MoveKind;
 use crate::mapping::distances::ObservedDistances;
 use crate::mapping::open_list::CheapestFirst;
 use crate::model::{Model, StateIdx};
@@ -307,7 +308,7 @@ impl Sweep {
         for state in reached {
             let at = *state as usize;
             self.distances[at] = observed.distance(model, *state);
-            costs[at] += self.distances[at];
+            costs[at] = MoveKind::Match.arrive(costs[at], self.distances[at]);
         }
         let is_lower = |state: StateIdx, cost: f64| cost < before[state as usize];
         for state in reached {
@@ -342,7 +343,7 @@ impl Sweep {
             if cost >= costs[to] {
                 continue;
             }
-            let cost = cost + self.distances[to];
+            let cost = MoveKind::Extra.arrive(cost, self.distances[to]);
             if cost < costs[to] {
                 costs[to] = cost;
                 nodes[to].source = Source::within(state);

@@ -375,7 +375,7 @@ impl OnlineMapping {
         if step.kind != MoveKind::Start {
             let action_cost = step.action.map_or(0.0, |action| model.action(action).cost);
             self.root_cost += action_cost;
-            self.root_cost += layer.observed.distance(model, step.state);
+            self.root_cost = step.kind.arrive(self.root_cost, layer.observed.distance(model, step.state));
         }
         let terms = layer.observed.terms(model, step.state);
         let written = writer.write(model, model.states(), &step, terms);

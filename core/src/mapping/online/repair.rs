@@ -15,6 +15,7 @@ use std::collections::BinaryHeap;
 use super::layer::{Source, Sweep};
 use super::window::{Place, Window, action};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::mapping::MoveKind;
 use crate::mapping::open_list::CheapestFirst;
 use crate::model::{ActionIdx, Graph, Model, Rows, StateIdx};
 
@@ -157,6 +158,12 @@ impl<'r> Repair<'r> {
         self.window.layers[index].observed.distance(self.model, state)
     }
 
+    /// What it costs to come from `origin` to `place`, with this distance.
+    fn arrive(&self, origin: Place, action_cost: f64, place: Place, distance: f64) -> f64 {
+        let kind = if origin.0 == place.0 { MoveKind::Extra } else { MoveKind::Match };
+        kind.arrive(self.cost(origin) + action_cost, distance)
+    }
+
     /// Whether a node's way leads from the root and costs what it says. Every node of the way is noted as what it is.
     fn is_sound(&mut self, mut place: Place) -> bool {
         let root = (0, self.window.root);
@@ -203,7 +210,7 @@ impl<'r> Repair<'r> {
             action(self.model, source.1, state).map_or(f64::INFINITY, |action| self.action_costs[usize::from(action)])
         };
         #[expect(clippy::float_cmp, reason = "the same sum gives the same float")]
-        let is_same = self.cost(source) + action_cost + self.distance(place) == self.cost(place);
+        let is_same = self.arrive(source, action_cost, place, self.distance(place)) == self.cost(place);
         is_same
     }
 
@@ -231,13 +238,13 @@ impl<'r> Repair<'r> {
             let distance = self.distance(place);
             let mut bound = f64::INFINITY;
             self.each_origin(place, |this, origin, action_cost| {
-                let cost = this.cost(origin) + action_cost + distance;
+                let cost = this.arrive(origin, action_cost, place, distance);
                 if cost < bound && this.is_sound(origin) {
                     bound = cost;
                 }
             });
             self.each_origin(place, |this, origin, action_cost| {
-                let cost = this.cost(origin) + action_cost + distance;
+                let cost = this.arrive(origin, action_cost, place, distance);
                 if cost < bound && !this.is_sound(origin) && this.standings[this.at(origin)] != Standing::Wanted {
                     this.want(origin);
                 }
@@ -252,7 +259,7 @@ impl<'r> Repair<'r> {
             let distance = self.distance((index, state));
             let mut best = (f64::INFINITY, Source::NONE);
             self.each_origin((index, state), |this, origin, action_cost| {
-                let cost = this.cost(origin) + action_cost + distance;
+                let cost = this.arrive(origin, action_cost, (index, state), distance);
                 if cost < best.0 && this.is_sound(origin) {
                     let source = if origin.0 == index { Source::within(origin.1) } else { Source::before(origin.1) };
                     best = (cost, source);
@@ -269,7 +276,8 @@ impl<'r> Repair<'r> {
                 if self.standings[self.at(to)] != Standing::Wanted {
                     continue;
                 }
-                let cost = cost + self.action_costs[usize::from(transition.action)] + self.distance(to);
+                let before = cost + self.action_costs[usize::from(transition.action)];
+                let cost = MoveKind::Extra.arrive(before, self.distance(to));
                 if cost < self.cost(to) {
                     self.set(to, (cost, Source::within(state)));
                 }

@@ -34,7 +34,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
     let mut meter = Meter::new(interrupt, POLL_EVERY);
 
     let row = space.row(problem.start);
-    let g = problem.distances.distance(0, row);
+    let g = MoveKind::Start.arrive(0.0, problem.distances.distance(0, row));
     let first = nodes.reach(Way { observation: 0, state: problem.start, g, action: NO_ACTION, parent: 0 });
     open.extend(first.map(|id| Open { f: g + heuristic.cost_to_go(0, row), g, observation: 0, id }));
     // The farthest expanded node, and among those the most promising: where a search out of budget goes on greedily.
@@ -74,13 +74,14 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             farthest = entry;
         }
 
-        let skip = (i + 1, state, 0.0, NO_ACTION);
+        let skip = (MoveKind::Skip, i + 1, state, 0.0, NO_ACTION);
         space.explore(state);
         let moves = space.successors(state).iter().flat_map(|transition| {
             let cost = actions[usize::from(transition.action)].cost;
-            [i + 1, i].map(|i| (i, transition.to, cost, transition.action))
+            let moves = [(MoveKind::Match, i + 1), (MoveKind::Extra, i)];
+            moves.map(|(kind, i)| (kind, i, transition.to, cost, transition.action))
         });
-        for (i, state, cost, action) in std::iter::once(skip).chain(moves) {
+        for (kind, i, state, cost, action) in std::iter::once(skip).chain(moves) {
             match meter.spend(heuristic.work(i)) {
                 Signal::Continue => {}
                 Signal::Finish => {
@@ -90,7 +91,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             }
             n_generated += 1;
             let row = space.row(state);
-            let g = node.g + cost + problem.distances.distance(i, row);
+            let g = kind.arrive(node.g + cost, problem.distances.distance(i, row));
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
             let observation = i as u32;
             if let Some(id) = nodes.reach(Way { observation, state, g, action, parent: entry.id }) {

@@ -331,14 +331,11 @@ impl<S: Space> Search<'_, '_, S> {
 
     /// Follows the moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper
     /// way.
-    ///
-    /// A skip and an extra action, in either order, cost no less than the action as a match: it comes to the same node without the
-    /// distance in between. So what was come to by the one is not left by the other.
     #[inline]
     fn expand(&mut self, id: NodeId, g: f64, step: Step, ways: Range<usize>, mut found: impl FnMut(Reached, u32)) {
         let Step { state, observation: here, kind } = step;
         let next = here + 1;
-        let (may_skip, may_linger) = (kind != MoveKind::Extra, kind != MoveKind::Skip);
+        let (may_skip, may_linger) = (MoveKind::Skip.may_follow(kind), MoveKind::Extra.may_follow(kind));
         self.nodes.close(id);
         if may_skip {
             let is_near = Nodes::are_together(next);

@@ -244,7 +244,7 @@ impl Search<'_> {
     }
 
     /// Expands the open nodes of a layer that may be on a mapping of less than `limit`, and those to which they lead by actions that do
-    /// not advance, but not many more than `width`. As to what moves are left out, see [`best_first`](super::best_first).
+    /// not advance, but not many more than `width`.
     fn expand(&mut self, observation: usize, limit: f64, width: usize) -> Result<End, Cancelled> {
         let entries = self.parts.at(observation);
         let Nodes { n_states, costs, links, are_open, open } = &mut *self.nodes;
@@ -262,7 +262,8 @@ impl Search<'_> {
         while let Some(&state) = open.get(at) {
             at += 1;
             let estimate = self.parts.estimate(entries, state);
-            let before = costs[state as usize] + estimate.distance;
+            let kind = links[state as usize].kind();
+            let before = kind.arrive(costs[state as usize], estimate.distance);
             let f = before + estimate.cost_to_go;
             if f >= limit || n_left == 0 {
                 // It stays open for a wider beam, if it is of interest then.
@@ -281,8 +282,7 @@ impl Search<'_> {
             }
             n_left -= 1;
             are_open[state as usize] = false;
-            let kind = links[state as usize].kind();
-            let (may_skip, may_linger) = (kind != MoveKind::Extra, kind != MoveKind::Skip);
+            let (may_skip, may_linger) = (MoveKind::Skip.may_follow(kind), MoveKind::Extra.may_follow(kind));
             self.n_expanded += 1;
             self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
             let mut advance = |to: StateIdx, cost: f64, link: Link| {
@@ -336,7 +336,7 @@ impl Search<'_> {
         for state in open[self.last].drain(..) {
             let at = self.last * *n_states + state as usize;
             are_open[at] = false;
-            let cost = costs[at] + self.parts.estimate(entries, state).distance;
+            let cost = MoveKind::Match.arrive(costs[at], self.parts.estimate(entries, state).distance);
             if cost < self.limit {
                 self.limit = cost * (1.0 - self.rounding);
                 self.cheapest = Some(state);

@@ -48,7 +48,8 @@ impl Reached {
     /// By a way of `cost` before the distance is paid.
     #[inline]
     fn by(id: NodeId, cost: f64, estimate: Estimate) -> Self {
-        let g = cost + estimate.distance;
+        // Moves of all kinds pay the same, so that ways are compared before.
+        let g = MoveKind::Match.arrive(cost, estimate.distance);
         Self { id, g, f: g + estimate.cost_to_go }
     }
 }

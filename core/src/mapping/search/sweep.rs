@@ -5,11 +5,13 @@
 //! much memory, they are divided into *sections*: of all but the first, only what its first layer costs is kept, and it is gone through
 //! again when the mapping has come there.
 
+mod backward;
+
 use super::{Found, Move, MoveKind};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
-use crate::mapping::backward::{self, Arriving, GoOn, Graph, Link, Links, NoLinks, Price};
 use crate::mapping::{Budget, Problem};
-use crate::model::{self, Model, Transition};
+use crate::model::{Graph, Model, Transition};
+use backward::{GoOn, Link, Links, NoLinks, Ways, Workspace};
 
 /// What a sweep came to.
 #[derive(Debug)]
@@ -55,10 +57,8 @@ pub(in crate::mapping) fn sweep(
 fn in_sections(problem: &Problem<'_>, section_len: usize, mut meter: Meter<'_>) -> Result<Swept, Cancelled> {
     let model = problem.model;
     let n_states = model.graph().n_states();
-    let ways = model.graph().iter().map(|(from, transition)| (from, transition.to, transition.action));
-    let prices = model.actions().iter().map(|action| Price { share: action.cost, part: 0.0 });
-    let graph = match Graph::new(n_states, ways, prices.collect(), &mut meter) {
-        Ok(Some(graph)) => graph,
+    let ways = match Ways::new(model, &mut meter) {
+        Ok(Some(ways)) => ways,
         Ok(None) => return Ok(Swept::TooLarge),
         Err(Signal::Cancel) => return Err(Cancelled),
         Err(_) => {
@@ -69,13 +69,13 @@ fn in_sections(problem: &Problem<'_>, section_len: usize, mut meter: Meter<'_>) 
     };
     let mut sweep = Sweep {
         problem,
-        graph: &graph,
+        ways: &ways,
         observation: problem.last(),
         distances: vec![0.0; n_states],
         here: vec![0.0; n_states],
         next: vec![0.0; n_states],
         n_stepped: 0,
-        buffers: backward::Buffers::default(),
+        workspace: Workspace::default(),
         meter,
     };
     let done = sweep.run(section_len);
@@ -106,8 +106,8 @@ pub(in crate::mapping) fn most_bytes(model: &Model, n_observations: usize) -> us
 
 /// What a sweep takes besides its sections: the graph, distances, two layers and one to be told if it is cut short, and as much in
 /// buffers.
-fn basis_bytes(graph: &model::Graph) -> usize {
-    Graph::bytes_for(graph.n_states(), graph.n_transitions()) + 8 * graph.n_states() * size_of::<f64>()
+fn basis_bytes(graph: &Graph) -> usize {
+    Ways::bytes_for(graph.n_states(), graph.n_transitions()) + 8 * graph.n_states() * size_of::<f64>()
 }
 
 /// How many layers a section has, as many as there is room for; `None` if there is not even for the shortest.
@@ -123,7 +123,7 @@ fn section_len(problem: &Problem<'_>, budget: Budget) -> Option<usize> {
 
 struct Sweep<'s, 'i> {
     problem: &'s Problem<'s>,
-    graph: &'s Graph,
+    ways: &'s Ways,
     /// What was looked at last,
     observation: usize,
     /// what its states cost there,
@@ -134,7 +134,7 @@ struct Sweep<'s, 'i> {
     next: Vec<f64>,
     /// How many layers were done.
     n_stepped: usize,
-    buffers: backward::Buffers,
+    workspace: Workspace,
     meter: Meter<'i>,
 }
 
@@ -181,7 +181,11 @@ impl Sweep<'_, '_> {
                 return Ok(moves);
             }
             if first == 0 {
-                let costs = self.distances.iter().zip(&self.here).map(|(distance, here)| distance + here);
+                let costs = self
+                    .distances
+                    .iter()
+                    .zip(&self.here)
+                    .map(|(distance, here)| MoveKind::Start.go_on(*distance, *here));
                 earliest = Some(Layer { observation: 0, costs: costs.collect() });
             }
             first = end;
@@ -207,16 +211,13 @@ impl Sweep<'_, '_> {
 
     /// Goes back by an observation.
     fn step_back<L: Links + ?Sized>(&mut self, links: &mut L) -> Result<(), CutShort> {
-        let Self { problem, graph, observation, distances, here, next, n_stepped, buffers, meter } = self;
+        let Self { problem, ways, observation, distances, here, next, n_stepped, workspace, meter } = self;
         for ((next, distance), here) in next.iter_mut().zip(&*distances).zip(&*here) {
-            *next = distance + here;
+            *next = MoveKind::Match.go_on(*distance, *here);
         }
         *observation -= 1;
         let looked_up = problem.distances.of_states(*observation, problem.model.states(), distances, meter);
-        let stepped = looked_up.and_then(|()| {
-            let arriving = Arriving { rests: distances, least_distance: 0.0 };
-            graph.step_back(next, arriving, here, links, buffers, meter)
-        });
+        let stepped = looked_up.and_then(|()| ways.step_back(next, distances, here, links, workspace, meter));
         stepped.map_err(|signal| {
             let known = Layer { observation: *observation + 1, costs: std::mem::take(next) };
             CutShort { signal, known }

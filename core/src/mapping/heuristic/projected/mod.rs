@@ -12,8 +12,8 @@ use super::Heuristic;
 use super::projection::{Projection, Projections};
 use super::shares::{SharedWay, SharedWays};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
-use crate::mapping::Problem;
 use crate::mapping::open_list::CheapestFirst;
+use crate::mapping::{MoveKind, Problem};
 
 /// What a node `(i, s)` costs: what is paid on arriving, and what must still be paid after.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -369,10 +369,10 @@ impl<'p> Projected<'p> {
             }
             for (value, (here, next)) in here.iter_mut().zip(&*next).enumerate() {
                 here.distance = self.table.at(offset + value, i).distance;
-                here.cost_to_go = next.distance + next.cost_to_go;
+                here.cost_to_go = MoveKind::Skip.go_on(next.distance, next.cost_to_go);
             }
             for (value, next) in next.iter().enumerate() {
-                let cost = next.distance + next.cost_to_go;
+                let cost = MoveKind::Match.go_on(next.distance, next.cost_to_go);
                 for way in predecessors.into_value(value) {
                     let matched = way.share + cost;
                     let known = &mut here[way.from as usize].cost_to_go;
@@ -384,7 +384,7 @@ impl<'p> Projected<'p> {
             let least = self.least_terms[i * self.columns.len() + number];
             let least_distance = self.least_distances[i];
             for value in 0..n_values {
-                let cost = here[value].distance - least + here[value].cost_to_go;
+                let cost = MoveKind::Extra.go_on(here[value].distance - least, here[value].cost_to_go);
                 relax(predecessors, value, cost, least_distance, here, open);
             }
             while let Some(CheapestFirst { cost, id: value }) = open.pop() {
@@ -394,7 +394,7 @@ impl<'p> Projected<'p> {
                 }
                 let entry = here[value as usize];
                 if cost <= entry.cost_to_go {
-                    let cost = entry.distance - least + cost;
+                    let cost = MoveKind::Extra.go_on(entry.distance - least, cost);
                     relax(predecessors, value as usize, cost, least_distance, here, open);
                 }
             }

@@ -98,7 +98,7 @@ fn sections_are_as_long_as_there_is_room_for_and_a_sweep_without_room_is_not_beg
     let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
     let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
     let within = |max_bytes| section_len(&problem, Budget { max_bytes, ..Budget::DEFAULT });
-    let basis = Graph::bytes_for(100, 99) + 8 * 100 * 8;
+    let basis = Ways::bytes_for(100, 99) + 8 * 100 * 8;
     assert_eq!(within(usize::MAX), Some(900));
     assert_eq!(within(basis + 100 * (8 + 900 * 2)), Some(900));
     assert_eq!(within(basis + 100 * (8 + 900 * 2) - 1), Some(450));
