@@ -11,8 +11,8 @@ use axum::http::header::{ETAG, HOST, LOCATION, ORIGIN, RETRY_AFTER};
 use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, Uri};
 use tower_http::cors::{AllowHeaders, CorsLayer};
 
-use super::observe::REQUEST_ID;
 use super::problem::{Problem, ProblemKind};
+use super::request_id::REQUEST_ID;
 use etude_core::document::Quoted;
 
 /// How long browsers may keep what a preflight was answered.

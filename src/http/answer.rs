@@ -1,15 +1,21 @@
-//! Answers that are large: their memory is counted while they are written, and whoever reads them too slowly is cut off.
+//! Answers: written as JSON, with their memory counted until they are sent. Whoever reads a large one too slowly is cut off.
 
 use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use axum::body::{Body, Bytes, HttpBody};
-use axum::response::Response;
+use axum::http::header::CONTENT_TYPE;
+use axum::http::{HeaderValue, StatusCode};
+use axum::response::{IntoResponse, Response};
+use futures_util::{Stream, TryStreamExt};
 use hyper::body::{Frame, SizeHint};
+use serde::Serialize;
 use tokio::time::Instant;
 
+use super::problem::Problem;
 use crate::memory::{self, Held, Memory, NoRoom};
+use crate::service::ServiceError;
 
 /// Bodies and answers up to this are not counted: the budget of memory keeps room for what is small.
 #[expect(clippy::cast_possible_truncation, reason = "64 KiB")]
@@ -20,6 +26,32 @@ const READ_TIMEOUT: Duration = Duration::from_mins(1);
 
 /// Slowest that an answer may be read beyond [`READ_TIMEOUT`]: its memory is not there for others until then.
 const MIN_BYTES_PER_S: u64 = 64 * 1024;
+
+/// A JSON answer.
+pub(super) fn json(status: StatusCode, answer: &impl Serialize) -> Response {
+    match serde_json::to_string(answer) {
+        Ok(text) => json_text(status, text),
+        Err(error) => Problem::from(ServiceError::Write(error)).into_response(),
+    }
+}
+
+/// An answer that is JSON already.
+pub(super) fn json_text(status: StatusCode, text: String) -> Response {
+    let mut response = (status, text).into_response();
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
+    response
+}
+
+/// An answer whose JSON comes in parts.
+pub(super) fn json_stream(parts: impl Stream<Item = Result<Bytes, ServiceError>> + Send + 'static) -> Response {
+    // Too late for another answer: the connection is closed in the middle, which no client takes for the end.
+    let parts = parts.inspect_err(|error| {
+        tracing::error!(error = error as &dyn std::error::Error, "an answer was cut off");
+    });
+    let mut response = paced(Body::from_stream(parts)).into_response();
+    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
+    response
+}
 
 /// Takes the memory of an answer that is at hand, until it is written.
 ///

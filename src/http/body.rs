@@ -1,4 +1,4 @@
-//! Reading bodies and writing JSON.
+//! Reading bodies.
 //!
 //! Nobody waits for a client for ever, and nobody takes a client's word for how much will come: each body has a limit in bytes and a
 //! least speed, and takes memory as its bytes come. Who is refused is answered at once; what is still to come of the body is read
@@ -7,21 +7,19 @@
 use std::io::{self, BufRead};
 use std::time::Duration;
 
-use axum::body::{Body, BodyDataStream, Bytes, HttpBody};
+use axum::body::{BodyDataStream, Bytes, HttpBody};
 use axum::extract::{FromRequestParts, Request};
+use axum::http::HeaderMap;
 use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, EXPECT, TRANSFER_ENCODING};
 use axum::http::request::Parts;
-use axum::http::{HeaderMap, HeaderValue, StatusCode};
-use axum::response::{IntoResponse, Response};
-use futures_util::{Stream, StreamExt, TryStreamExt};
-use serde::Serialize;
+use futures_util::StreamExt;
 use tokio::time::Instant;
 
 use super::Context;
-use super::answer::{self, UNCOUNTED_BYTES};
+use super::collected::Collected;
 use super::encoding::{BodyError, DecodedLimit, Encoding};
 use super::problem::{Problem, ProblemKind};
-use crate::memory::{Held, Memory, NoRoom};
+use crate::memory::Held;
 use crate::service::{Client, ModelText, OpenText, PipeWriter, ServiceError, pipe};
 use etude_core::document::Quoted;
 use etude_core::model::Format;
@@ -90,12 +88,12 @@ async fn read_json_within(limit: SentLimit, request: Request, context: &Context)
             let n_bytes = chunk.len();
             decoder.consume(n_bytes);
             // The decoder looks back at as much.
-            let n_seen = decoded.bytes.len().min(Encoding::MAX_WINDOW_BYTES);
-            decoded.hold(decoded.bytes.capacity() + n_seen).map_err(BodyError::NoRoom)?;
+            let n_seen = decoded.n_bytes().min(Encoding::MAX_WINDOW_BYTES);
+            decoded.hold(decoded.capacity() + n_seen).map_err(BodyError::NoRoom)?;
         }
     };
     let decoded = context.etude.pool().read_patiently(client, limit.n_bytes, decode).await;
-    decoded.map_err(ServiceError::from)?.map_err(|error| unreadable(&error))
+    decoded.map_err(ServiceError::from)?.map_err(|error| Problem::unreadable(&error))
 }
 
 /// Most bytes of a body as it is sent, and what the setting is called.
@@ -209,76 +207,6 @@ impl Arriving {
     }
 }
 
-/// Bytes that are collected, whose memory is held if they are many.
-struct Collected<'m> {
-    memory: &'m Memory,
-    /// Most bodies come in one piece, which is not copied. All that there is, unless there are `bytes`.
-    first: Bytes,
-    bytes: Vec<u8>,
-    held: Option<Held>,
-}
-
-impl<'m> Collected<'m> {
-    fn new(memory: &'m Memory) -> Self {
-        Self { memory, first: Bytes::new(), bytes: Vec::new(), held: None }
-    }
-
-    fn n_bytes(&self) -> usize {
-        self.first.len().max(self.bytes.len())
-    }
-
-    /// Adds a chunk that may be kept as it is.
-    fn add(&mut self, chunk: Bytes) -> Result<(), NoRoom> {
-        if self.n_bytes() == 0 {
-            self.hold(chunk.len())?;
-            self.first = chunk;
-            return Ok(());
-        }
-        if self.bytes.is_empty() {
-            let first = std::mem::take(&mut self.first);
-            self.push(&first)?;
-        }
-        self.push(&chunk)
-    }
-
-    fn push(&mut self, chunk: &[u8]) -> Result<(), NoRoom> {
-        let n_bytes = self.bytes.len() + chunk.len();
-        if n_bytes > self.bytes.capacity() {
-            // Not by what was announced, which need not come.
-            let capacity = n_bytes.next_power_of_two();
-            self.hold(capacity)?;
-            self.bytes.reserve_exact(capacity - self.bytes.len());
-        }
-        self.bytes.extend_from_slice(chunk);
-        Ok(())
-    }
-
-    /// Takes memory until `n_bytes` are held, if that is much.
-    fn hold(&mut self, n_bytes: usize) -> Result<(), NoRoom> {
-        match &mut self.held {
-            Some(held) => held.grow_to(n_bytes as u64)?,
-            None if n_bytes > UNCOUNTED_BYTES => self.held = Some(self.memory.try_take(n_bytes as u64)?),
-            None => {}
-        }
-        Ok(())
-    }
-
-    /// The bytes, and their memory.
-    fn into_parts(self) -> (Bytes, Option<Held>) {
-        let Self { first, bytes, mut held, .. } = self;
-        if let Some(held) = &mut held {
-            held.shrink_to(first.len().max(bytes.capacity()) as u64);
-        }
-        (if bytes.is_empty() { first } else { bytes.into() }, held)
-    }
-
-    /// The bytes, which hold their memory.
-    fn into_bytes(self) -> Bytes {
-        let (bytes, held) = self.into_parts();
-        answer::holding(bytes, held)
-    }
-}
-
 /// A request that is complete without a body, and has none that a web page can send without asking.
 pub(super) struct NoForm;
 
@@ -309,30 +237,6 @@ pub(super) fn refuse(request: Request, context: &Context, problem: Problem) -> P
 /// Whether a request declares that its body is NDJSON.
 pub(super) fn is_ndjson(headers: &HeaderMap) -> bool {
     format_of(headers) == Some(Format::Ndjson)
-}
-
-/// The problem of a body that could not be read to its end.
-pub(super) fn unreadable(error: &io::Error) -> Problem {
-    match error.get_ref() {
-        Some(inner) if inner.is::<NoRoom>() => Problem::new(ProblemKind::Busy, inner.to_string()),
-        Some(inner) => match inner.downcast_ref::<BodyError>() {
-            Some(error) => error.into(),
-            None => Problem::new(ProblemKind::BrokenEncoding, error.to_string()),
-        },
-        None => Problem::new(ProblemKind::BrokenEncoding, error.to_string()),
-    }
-}
-
-impl From<&BodyError> for Problem {
-    fn from(error: &BodyError) -> Self {
-        let kind = match error {
-            BodyError::Incomplete => ProblemKind::IncompleteBody,
-            BodyError::TooLarge(_) => ProblemKind::TooLarge,
-            BodyError::Slow(_) => ProblemKind::SlowBody,
-            BodyError::NoRoom(_) => ProblemKind::Busy,
-        };
-        Self::new(kind, error.to_string())
-    }
 }
 
 /// The body, if it is not announced as too large.
@@ -425,36 +329,11 @@ fn too_large(limit: SentLimit) -> BodyError {
     BodyError::TooLarge(format!("the body has over {n_bytes} bytes, the limit of this service ({setting})"))
 }
 
-/// A JSON answer.
-pub(super) fn json(status: StatusCode, answer: &impl Serialize) -> Response {
-    match serde_json::to_string(answer) {
-        Ok(text) => json_text(status, text),
-        Err(error) => Problem::from(crate::service::ServiceError::Write(error)).into_response(),
-    }
-}
-
-/// An answer that is JSON already.
-pub(super) fn json_text(status: StatusCode, text: String) -> Response {
-    let mut response = (status, text).into_response();
-    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
-    response
-}
-
-/// An answer whose JSON comes in parts.
-pub(super) fn json_stream(parts: impl Stream<Item = Result<Bytes, ServiceError>> + Send + 'static) -> Response {
-    // Too late for another answer: the connection is closed in the middle, which no client takes for the end.
-    let parts = parts.inspect_err(|error| {
-        tracing::error!(error = error as &dyn std::error::Error, "an answer was cut off");
-    });
-    let mut response = answer::paced(Body::from_stream(parts)).into_response();
-    response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/json"));
-    response
-}
-
 #[cfg(test)]
 mod tests {
     use std::convert::Infallible;
 
+    use axum::body::Body;
     use futures_util::stream;
 
     use super::*;
@@ -499,28 +378,5 @@ mod tests {
         assert_eq!(started.elapsed(), DISCARD_TIMEOUT);
         throw_away(trickling(1 << 20, Duration::from_millis(1)), 1 << 20).await;
         assert!(started.elapsed() < DISCARD_TIMEOUT * 2, "as many limits were read as are");
-    }
-
-    #[test]
-    fn memory_is_taken_as_bytes_come_and_held_as_long_as_they_are() {
-        let memory = Memory::with_room(1 << 20);
-        let chunk = |n_bytes: usize| Bytes::from(vec![b' '; n_bytes]);
-        let mut small = Collected::new(&memory);
-        small.add(chunk(UNCOUNTED_BYTES / 2)).unwrap();
-        small.add(chunk(UNCOUNTED_BYTES / 2)).unwrap();
-        assert_eq!(memory.free(), 1 << 20, "what is small is not counted");
-        small.add(chunk(1)).unwrap();
-        let bytes = small.into_bytes();
-        assert_eq!((bytes.len(), memory.free()), (UNCOUNTED_BYTES + 1, (1 << 20) - 2 * UNCOUNTED_BYTES as u64));
-        let part = bytes.slice(..10);
-        drop(bytes);
-        assert!(memory.free() < 1 << 20);
-        drop(part);
-        assert_eq!(memory.free(), 1 << 20);
-        let mut large = Collected::new(&memory);
-        let refused = (0..1 << 10).find_map(|_| large.add(chunk(UNCOUNTED_BYTES)).err());
-        assert_eq!(refused, Some(NoRoom { wanted: 2 << 20, room: 1 << 20 }));
-        drop(large);
-        assert_eq!(memory.free(), 1 << 20);
     }
 }

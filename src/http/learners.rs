@@ -10,7 +10,8 @@ use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::SharedContext;
-use super::body::{NoForm, json, read_json};
+use super::answer::json;
+use super::body::{NoForm, read_json};
 use super::paging::{List, Paging};
 use super::path::PathName;
 use super::problem::Problem;

@@ -16,7 +16,8 @@ use utoipa::ToSchema;
 
 use super::SharedContext;
 use super::answer;
-use super::body::{NoForm, SentLimit, SentModel, json, json_stream, read_model};
+use super::answer::{json, json_stream};
+use super::body::{NoForm, SentLimit, SentModel, read_model};
 use super::encoding::DecodedLimit;
 use super::paging::{List, Paging};
 use super::path::PathName;

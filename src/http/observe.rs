@@ -8,30 +8,20 @@ use std::time::{Duration, Instant};
 
 use axum::extract::{MatchedPath, Request, State};
 use axum::http::header::ALLOW;
-use axum::http::{HeaderMap, HeaderName, HeaderValue, Method, StatusCode};
+use axum::http::{HeaderValue, Method, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use futures_util::FutureExt;
 use metrics::{Counter, Histogram, SharedString};
 use rustc_hash::FxHashMap;
 use tracing::{Instrument, Span};
-use uuid::Uuid;
 
 use super::SharedContext;
 use super::access::is_for_cors;
 use super::answer;
 use super::body::refuse;
 use super::problem::{Problem, ProblemKind};
-
-/// What names a request, in both directions.
-pub(super) const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
-
-/// Longest request id that is taken from a client.
-const MAX_REQUEST_ID_BYTES: usize = 64;
-
-/// The id of the request, for handlers.
-#[derive(Clone, Debug)]
-pub(super) struct RequestId(pub(super) Arc<str>);
+use super::request_id::{REQUEST_ID, RequestId, request_id};
 
 /// Gives the request an id, lets it in or not, logs and measures it, turns panics into problems and problems into documents.
 pub(super) async fn observe(State(context): State<SharedContext>, mut request: Request, next: Next) -> Response {
@@ -122,19 +112,6 @@ fn measure(method: &'static str, route: &Arc<str>, status: StatusCode, elapsed: 
 fn method_label(method: &Method) -> &'static str {
     const KNOWN: [&str; 9] = ["GET", "HEAD", "POST", "PUT", "DELETE", "CONNECT", "OPTIONS", "TRACE", "PATCH"];
     KNOWN.into_iter().find(|known| *known == method.as_str()).unwrap_or("other")
-}
-
-/// Takes the client's id if it is short and plain, else makes one.
-fn request_id(headers: &HeaderMap) -> Arc<str> {
-    let is_plain = |id: &&str| {
-        (1..=MAX_REQUEST_ID_BYTES).contains(&id.len())
-            && id.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._-".contains(&byte))
-    };
-    let given = headers.get(REQUEST_ID).and_then(|id| id.to_str().ok()).filter(is_plain);
-    match given {
-        Some(given) => given.into(),
-        None => Arc::from(&*Uuid::now_v7().hyphenated().encode_lower(&mut Uuid::encode_buffer())),
-    }
 }
 
 fn panic_message(panic: &(dyn Any + Send)) -> &str {

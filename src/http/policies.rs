@@ -8,11 +8,12 @@ use axum::response::Response;
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::body::{json, json_text, read_json};
-use super::observe::RequestId;
+use super::answer::{json, json_text};
+use super::body::read_json;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::Problem;
+use super::request_id::RequestId;
 use super::{SharedContext, answer};
 use crate::service::{BatchRequest, Caller, ServiceError};
 use etude_core::mapping::{Policy, PolicySummary, RequestDocument};

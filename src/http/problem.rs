@@ -1,6 +1,7 @@
 //! Errors as clients see them (RFC 9457), and the only mapping of errors to status codes.
 
 use std::error::Error;
+use std::io;
 
 use axum::http::header::{ACCEPT_ENCODING, CONTENT_TYPE, RETRY_AFTER, SEC_WEBSOCKET_VERSION, UPGRADE};
 use axum::http::{HeaderValue, StatusCode};
@@ -8,8 +9,9 @@ use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 use utoipa::ToSchema;
 
-use super::encoding::Encoding;
-use super::observe::RequestId;
+use super::encoding::{BodyError, Encoding};
+use super::request_id::RequestId;
+use crate::memory::NoRoom;
 use crate::service::{self, PoolError, ServiceError};
 use crate::store::{StoreError, Unavailable};
 use etude_core::document::{Fault, Faults, ParseError};
@@ -148,6 +150,18 @@ impl Problem {
         Self { errors: faults.listed().to_vec(), ..Self::new(ProblemKind::Invalid, detail) }
     }
 
+    /// The problem of a body that could not be read to its end.
+    pub(super) fn unreadable(error: &io::Error) -> Self {
+        match error.get_ref() {
+            Some(inner) if inner.is::<NoRoom>() => Self::new(ProblemKind::Busy, inner.to_string()),
+            Some(inner) => match inner.downcast_ref::<BodyError>() {
+                Some(error) => error.into(),
+                None => Self::new(ProblemKind::BrokenEncoding, error.to_string()),
+            },
+            None => Self::new(ProblemKind::BrokenEncoding, error.to_string()),
+        }
+    }
+
     /// The same, as part of the answer to a request.
     pub(super) fn of_request(self, id: &RequestId) -> Self {
         Self { request_id: id.0.to_string(), ..self }
@@ -194,6 +208,18 @@ impl IntoResponse for Problem {
     }
 }
 
+impl From<&BodyError> for Problem {
+    fn from(error: &BodyError) -> Self {
+        let kind = match error {
+            BodyError::Incomplete => ProblemKind::IncompleteBody,
+            BodyError::TooLarge(_) => ProblemKind::TooLarge,
+            BodyError::Slow(_) => ProblemKind::SlowBody,
+            BodyError::NoRoom(_) => ProblemKind::Busy,
+        };
+        Self::new(kind, error.to_string())
+    }
+}
+
 impl From<Faults> for Problem {
     fn from(faults: Faults) -> Self {
         Self::invalid(&faults)
@@ -213,7 +239,7 @@ impl From<ServiceError> for Problem {
             ServiceError::Parse(ParseError::Syntax { .. }) => Self::new(ProblemKind::MalformedJson, detail),
             ServiceError::Parse(ParseError::Faults(faults)) | ServiceError::Faults(faults) => Self::invalid(&faults),
             ServiceError::TooLarge(_) => Self::new(ProblemKind::TooLarge, detail),
-            ServiceError::Body(error) => super::body::unreadable(&error),
+            ServiceError::Body(error) => Self::unreadable(&error),
             ServiceError::Unknown { kind, pointer, .. } => {
                 let problem = match kind {
                     "policy" => ProblemKind::UnknownPolicy,

@@ -23,7 +23,8 @@ use tracing::Instrument;
 use utoipa::ToSchema;
 
 use super::SharedContext;
-use super::body::{is_ndjson, json, refuse};
+use super::answer::json;
+use super::body::{is_ndjson, refuse};
 use super::connections::IsStream;
 use super::encoding::Encoding;
 use super::paging::{List, Paging, after_sequence};

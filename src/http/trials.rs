@@ -10,7 +10,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::value::RawValue;
 use utoipa::{IntoParams, ToSchema};
 
-use super::body::{json, read_json, read_small_json};
+use super::answer::json;
+use super::body::{read_json, read_small_json};
 use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
 use super::problem::Problem;
