@@ -11,8 +11,6 @@ mod render;
 mod serve;
 mod side_by_side;
 mod stream;
-mod stream_client;
-mod stream_session;
 
 use std::error::Error;
 use std::io;

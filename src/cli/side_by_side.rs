@@ -5,13 +5,14 @@ use std::io::Write;
 use reqwest::Client;
 use serde_json::{Value, json};
 
-use super::stream::{Frame, Step, refused};
-use super::{CliError, render, stream_client};
+use super::stream::client;
+use super::stream::frames::{Frame, Step, refused};
+use super::{CliError, render};
 use etude_core::attribute::{ByAttribute, Scalar};
 
 /// Streams `demonstration` to `model` at the service, an observation at a time, and shows what comes back as it comes.
 pub(super) async fn stream(
-    client: &Client,
+    http: &Client,
     server: &str,
     model: &str,
     demonstration: &Value,
@@ -19,7 +20,7 @@ pub(super) async fn stream(
 ) -> Result<(), CliError> {
     let io = |error: serde_json::Error| CliError::Io(error.into());
     let observations: Vec<ByAttribute<Scalar>> = serde_json::from_value(demonstration.clone()).map_err(io)?;
-    let (frames, mut answers) = stream_client::connect(client, server).await?;
+    let (frames, mut answers) = client::connect(http, server).await?;
     frames.send(&json!({"type": "open", "model": model, "lookahead": 8})).await;
     let observe = async |seq: usize| match observations.get(seq) {
         Some(state) => frames.send(&json!({"type": "observe", "seq": seq, "states": [state]})).await,

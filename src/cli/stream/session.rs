@@ -16,9 +16,11 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
-use super::CliError;
-use super::stream::{Answer, Line, MAX_READ_AHEAD, Printer, refused};
-use super::stream_client::{self, Answers, Frames};
+use super::client::{self, Answers, Frames};
+use super::frames::{Problem, refused};
+use super::lines::{Line, MAX_READ_AHEAD};
+use super::printer::{Answer, Printer};
+use crate::cli::CliError;
 
 /// How long to wait before the first attempt to take up a lost stream; twice as long before each further one.
 const FIRST_DELAY: Duration = Duration::from_millis(100);
@@ -105,7 +107,7 @@ impl StreamSession {
 
     /// Streams over one connection.
     async fn speak(&mut self, printer: &mut Printer<'_, impl Write>) -> Result<(), Broken> {
-        let (frames, mut answers) = stream_client::connect(&self.client, &self.server).await?;
+        let (frames, mut answers) = client::connect(&self.client, &self.server).await?;
         match &self.id {
             None => frames.send(&self.open).await,
             Some(id) => frames.send(&json!({"type": "resume", "session": id, "step": printer.n_steps()})).await,
@@ -189,7 +191,7 @@ impl StreamSession {
     }
 
     /// Errors are about the first line that is not acknowledged, but for those that are about the connection.
-    fn refused(&self, problem: super::stream::Problem) -> Broken {
+    fn refused(&self, problem: Problem) -> Broken {
         let is_passing = problem.is_passing();
         let error = refused(problem, self.waiting.front().map(|line| line.number));
         if is_passing { Broken::Lost(error) } else { Broken::Failed(error) }

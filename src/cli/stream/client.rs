@@ -7,25 +7,25 @@ use serde_json::Value;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-use super::CliError;
+use crate::cli::CliError;
 
 /// Frames that wait to be sent. The server takes no more than it can handle, so more would only wait longer.
 const MAX_WAITING: usize = 16;
 
 /// The sending half of a stream. The request ends when it is dropped.
-pub(super) struct Frames {
+pub(in crate::cli) struct Frames {
     lines: mpsc::Sender<Result<String, Infallible>>,
 }
 
 impl Frames {
     /// Sends a frame, waiting for room. Says whether anybody listens still.
-    pub(super) async fn send(&self, frame: &Value) -> bool {
+    pub(in crate::cli) async fn send(&self, frame: &Value) -> bool {
         self.lines.send(Ok(format!("{frame}\n"))).await.is_ok()
     }
 }
 
 /// The receiving half of a stream.
-pub(super) struct Answers {
+pub(in crate::cli) struct Answers {
     url: String,
     response: Response,
     buffer: Vec<u8>,
@@ -33,7 +33,7 @@ pub(super) struct Answers {
 
 impl Answers {
     /// The next frame; `None` when the server has ended the stream. Nothing is lost if this is dropped while it waits.
-    pub(super) async fn receive(&mut self) -> Result<Option<String>, CliError> {
+    pub(in crate::cli) async fn receive(&mut self) -> Result<Option<String>, CliError> {
         loop {
             if let Some(end) = self.buffer.iter().position(|byte| *byte == b'\n') {
                 let line: Vec<u8> = self.buffer.drain(..=end).collect();
@@ -49,7 +49,7 @@ impl Answers {
 }
 
 /// Opens a stream to the service at `server`. The first answer is its `hello`.
-pub(super) async fn connect(client: &Client, server: &str) -> Result<(Frames, Answers), CliError> {
+pub(in crate::cli) async fn connect(client: &Client, server: &str) -> Result<(Frames, Answers), CliError> {
     let url = format!("{}/v1/stream", server.trim_end_matches('/'));
     let (lines, body) = mpsc::channel(MAX_WAITING);
     let request = client.post(&url).header("content-type", "application/x-ndjson");
