@@ -6,6 +6,8 @@
 //! a round. Figures are medians over the rounds, and in brackets the least and the most. The service is the program itself, in a
 //! process of its own; the other handlers have a runtime of their own in this one. Clients share the two's cores with them, on one
 //! thread, and do no more than they must: they send bytes that were prepared before, and count those of the answer.
+//!
+//! This file is longer than 400 lines because contenders that are compared are read side by side.
 
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
 

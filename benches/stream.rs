@@ -3,6 +3,8 @@
 //! `cargo bench --bench stream` runs all of it, `cargo bench --bench stream -- core round-trips memory` the parts named.
 //! Rounds of what is compared are interleaved, so that a machine that slows down slows all of them down. Client and
 //! service share the machine. Figures are medians, and in brackets the least and the most.
+//!
+//! This file is longer than 400 lines because its three parts share what they measure.
 
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
 

@@ -1,4 +1,6 @@
 //! What becomes of the service when its disk is full, fails, cannot be written to, or is not the one that it was.
+//!
+//! This file is longer than 400 lines because every kind of disk is tried with the same round of writes, which is most of it.
 
 use std::fs::{self, File};
 use std::io::{ErrorKind, Write};

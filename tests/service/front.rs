@@ -1,4 +1,6 @@
 //! What stands before the contract: hosts, web pages, slow and silent clients, and places for connections.
+//!
+//! This file is longer than 400 lines because it is a list of facts, each of which stands by itself, with few helpers.
 
 use std::net::SocketAddr;
 

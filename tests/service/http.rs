@@ -1,4 +1,6 @@
 //! The HTTP contract, from outside.
+//!
+//! This file is longer than 400 lines because it is a list of facts, each of which stands by itself, with few helpers.
 
 use std::io::{Read, Write};
 use std::net::{Shutdown, TcpStream};

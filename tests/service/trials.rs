@@ -1,4 +1,6 @@
 //! Learners and trials, from outside.
+//!
+//! This file is longer than 400 lines because it is a list of facts, each of which stands by itself, with few helpers.
 
 use crate::harness::service::{Service, answer, example};
 use etude_core::learning::{Distribution, Learner};

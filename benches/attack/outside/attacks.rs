@@ -1,4 +1,6 @@
 //! Attackers: each sends what a client must not send, or does not read what it asked for, on a bounded number of connections.
+//!
+//! This file is longer than 400 lines because it is a list of attacks, each of which stands by itself.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -1,4 +1,6 @@
 //! The mapping against the independent solver and the published figures.
+//!
+//! This file is longer than 400 lines because it is a list of facts, each of which stands by itself, with few helpers.
 
 use std::collections::HashMap;
 

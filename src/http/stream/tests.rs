@@ -1,4 +1,6 @@
 //! Streams over transports without a network.
+//!
+//! This file is longer than 400 lines because it is a list of facts, each of which stands by itself, with few helpers.
 
 use std::time::Duration;
 

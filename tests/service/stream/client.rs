@@ -1,0 +1,98 @@
+//! A client of streams over websockets.
+
+use futures_util::{SinkExt, StreamExt};
+use serde_json::{Value, json};
+use tokio::net::TcpStream;
+use tokio_tungstenite::WebSocketStream;
+use tokio_tungstenite::tungstenite::Message;
+use tokio_tungstenite::tungstenite::client::IntoClientRequest;
+use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
+
+use super::slow_readers::narrow;
+use crate::harness::service::Service;
+use crate::harness::waiting::within;
+
+/// A websocket client.
+pub(super) struct Client {
+    pub(super) socket: WebSocketStream<TcpStream>,
+}
+
+impl Client {
+    /// Connects, and takes the server's hello.
+    pub(super) async fn connect(service: &Service) -> Self {
+        Self::connect_to(&service.address.to_string()).await
+    }
+
+    pub(super) async fn connect_to(address: &str) -> Self {
+        Self::over(TcpStream::connect(address).await.unwrap(), address).await
+    }
+
+    /// A client that soon has no room for what it does not read.
+    pub(super) async fn connect_narrowly(service: &Service) -> Self {
+        Self::over(narrow(service).await, &service.address.to_string()).await
+    }
+
+    pub(super) async fn over(stream: TcpStream, address: &str) -> Self {
+        let mut request = format!("ws://{address}/v1/stream").into_client_request().unwrap();
+        request.headers_mut().insert("sec-websocket-protocol", "etude.v1+json".parse().unwrap());
+        // As many clients do, it closes where a message is longer than announced.
+        let config = WebSocketConfig::default().max_message_size(Some(262_144));
+        let (socket, response) =
+            tokio_tungstenite::client_async_with_config(request, stream, Some(config)).await.unwrap();
+        assert_eq!(response.headers()["sec-websocket-protocol"], "etude.v1+json");
+        let mut client = Self { socket };
+        let hello = client.receive().await;
+        assert_eq!((&hello["type"], &hello["protocol"]), (&json!("hello"), &json!("etude.v1+json")));
+        assert_eq!(
+            (&hello["limits"]["frame_bytes"], &hello["limits"]["observations"]),
+            (&json!(262_144), &json!(100_000))
+        );
+        client
+    }
+
+    pub(super) async fn send(&mut self, frame: Value) {
+        self.socket.send(Message::text(frame.to_string())).await.unwrap();
+    }
+
+    pub(super) async fn next(&mut self) -> Message {
+        within("a message", self.socket.next()).await.unwrap().unwrap()
+    }
+
+    pub(super) async fn receive(&mut self) -> Value {
+        let message = self.next().await;
+        serde_json::from_str(message.to_text().unwrap_or_else(|_| panic!("{message:?}"))).unwrap()
+    }
+
+    /// Receives frames up to one of type `kind`, which comes last.
+    pub(super) async fn receive_until(&mut self, kind: &str) -> Vec<Value> {
+        let mut frames = Vec::new();
+        loop {
+            let frame = self.receive().await;
+            let is_last = frame["type"] == kind;
+            assert!(is_last || frame["type"] != "error", "{frame}");
+            frames.push(frame);
+            if is_last {
+                return frames;
+            }
+        }
+    }
+
+    /// Receives the close code.
+    pub(super) async fn closed(&mut self) -> u16 {
+        loop {
+            match self.next().await {
+                Message::Close(frame) => return frame.unwrap().code.into(),
+                Message::Text(text) => assert!(!text.contains("\"error\""), "{text}"),
+                _ => {}
+            }
+        }
+    }
+
+    /// Opens a session and gives its id.
+    pub(super) async fn open(&mut self, open: Value) -> String {
+        self.send(open).await;
+        let opened = self.receive().await;
+        assert_eq!((&opened["type"], &opened["received"]), (&json!("opened"), &json!(0)), "{opened}");
+        opened["session"].as_str().unwrap().to_owned()
+    }
+}
