@@ -17,9 +17,6 @@ const CORE: &[&str] = &[
     "mapping/policy, mapping/request",
     "mapping/request, mapping/search",
     "mapping/search/nodes, mapping/search/seen",
-    "model/compiled, model/start",
-    "model/space, model/states",
-    "model/wumpus/dynamics, model/wumpus/reading",
 ];
 
 /// Circles of the service that are still to be opened.
