@@ -8,6 +8,7 @@
 )]
 
 mod compiling;
+mod implicit;
 mod lazy;
 mod mapping;
 mod online;

@@ -56,6 +56,28 @@ proptest! {
     }
 
     #[test]
+    fn a_row_leads_back_to_its_state(document in document()) {
+        let cave = cave(&document);
+        let mut found = cave.start_states();
+        let mut next = 0;
+        while let Some(state) = found.get(next).copied() {
+            next += 1;
+            let mut row: Vec<Option<u32>> = cave.row(&state).map(Some).collect();
+            prop_assert_eq!(cave.state_of(&row), Some(state));
+            (0..row.len()).filter(|at| Implicit::is_derived(&cave, *at)).for_each(|at| row[at] = None);
+            prop_assert_eq!(cave.state_of(&row), Some(state));
+            for (_, outcome) in cave.successors(&state) {
+                if !cave.is_unsafe(&outcome.to) && !found.contains(&outcome.to) {
+                    found.push(outcome.to);
+                }
+            }
+            if next == 100 {
+                break;
+            }
+        }
+    }
+
+    #[test]
     fn an_arrow_hits_what_it_comes_to_first(
         wumpi in prop::collection::vec((0..5_u16, 0..5_u16), 0..20),
         cell in (0..5_u16, 0..5_u16),
