@@ -4,7 +4,7 @@ use serde_json::Value;
 
 use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Act, Cave, Cell, Definition, Limits};
-use etude_core::world::{Outcome, Rewards, WumpusWorld};
+use etude_core::world::{Execution, Rewards, WumpusWorld};
 
 /// A world, the body that the imitator has in it, and what it was shown.
 #[derive(Clone, Debug)]
@@ -89,7 +89,7 @@ impl Scene {
 
     /// What becomes of an imitator that executes these actions. Those that are none have no place in this world.
     #[must_use]
-    pub fn execute(&self, actions: &[String]) -> Outcome {
+    pub fn execute(&self, actions: &[String]) -> Execution {
         self.world.execute(actions.iter().filter_map(|name| Act::named(name)))
     }
 }

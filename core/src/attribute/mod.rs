@@ -163,13 +163,13 @@ impl Attribute {
     }
 
     /// `value` as it is written outside, without a copy.
-    pub(crate) fn written<'v>(&'v self, value: &'v Value) -> Written<'v> {
+    pub(crate) fn written<'v>(&'v self, value: &'v Value) -> WrittenValue<'v> {
         match (value, &self.kind) {
             (Value::Label(label), Kind::Cyclic { cycle: Cycle::Labels(labels), .. }) => {
-                Written::Text(&labels.names()[*label as usize])
+                WrittenValue::Text(&labels.names()[*label as usize])
             }
-            (Value::Text(text), _) => Written::Text(text),
-            _ => Written::Scalar(self.write_value(value)),
+            (Value::Text(text), _) => WrittenValue::Text(text),
+            _ => WrittenValue::Scalar(self.write_value(value)),
         }
     }
 
@@ -192,7 +192,7 @@ impl Attribute {
 /// A value of an attribute, as it is written in JSON.
 #[derive(Serialize)]
 #[serde(untagged)]
-pub(crate) enum Written<'v> {
+pub(crate) enum WrittenValue<'v> {
     Text(&'v str),
     Scalar(Scalar),
 }

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 use super::action::ReadActions;
 use super::dynamics::{Description, Dynamics};
 use super::kinds::{self, DynamicsDocument};
-use super::reading::{Interruptible, Outline, RawStates, RawTransitions, Reader};
+use super::reading::{Interruptible, RawStates, RawTransitions, Reader, Skeleton};
 use super::{ActionDocument, CompileError, Format, Limits, Model, ReadError};
 use crate::attribute::{AttributeDocument, Schema};
 use crate::document::{Faults, ParseError, Path, Place};
@@ -38,8 +38,8 @@ impl Definition {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Self, CompileError> {
         let mut meter = Meter::new(interrupt, POLL_EVERY);
-        let outline = Reader::new(limits, &mut meter).read_value(document);
-        let definition = outline.and_then(|outline| of_outline(outline, limits, &mut meter));
+        let skeleton = Reader::new(limits, &mut meter).read_value(document);
+        let definition = skeleton.and_then(|skeleton| of_skeleton(skeleton, limits, &mut meter));
         definition.map_err(|error| match error {
             ReadError::Faults(faults) | ReadError::Parse(ParseError::Faults(faults)) => faults.into(),
             ReadError::Cancelled(cancelled) => cancelled.into(),
@@ -62,8 +62,8 @@ impl Definition {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Self, ReadError> {
         let mut meter = Meter::new(interrupt, POLL_EVERY);
-        let outline = Reader::new(limits, &mut meter).read_text(text, format)?;
-        of_outline(outline, limits, &mut meter)
+        let skeleton = Reader::new(limits, &mut meter).read_text(text, format)?;
+        of_skeleton(skeleton, limits, &mut meter)
     }
 
     /// Reads a model's text as it comes. Of its states and transitions, only compact arrays are kept.
@@ -82,8 +82,8 @@ impl Definition {
         let (mut by_reader, mut by_maker) = (|| interrupt.borrow_mut().poll(), || interrupt.borrow_mut().poll());
         let mut meter = Meter::new(&mut by_maker, POLL_EVERY);
         let reader = Interruptible::new(reader, &mut by_reader);
-        let outline = Reader::new(limits, &mut meter).read_from(reader, format)?;
-        of_outline(outline, limits, &mut meter)
+        let skeleton = Reader::new(limits, &mut meter).read_from(reader, format)?;
+        of_skeleton(skeleton, limits, &mut meter)
     }
 
     /// The attributes of a state.
@@ -149,12 +149,12 @@ impl Model {
 /// How many values are read between two looks at the interrupt: less than a millisecond.
 const POLL_EVERY: u64 = 4096;
 
-fn of_outline(outline: Outline, limits: Limits, meter: &mut Meter<'_>) -> Result<Definition, ReadError> {
-    let line = outline.line;
-    let place = Place { value: &outline.root, path: line.map_or(Path::Root, Path::Line) };
+fn of_skeleton(skeleton: Skeleton, limits: Limits, meter: &mut Meter<'_>) -> Result<Definition, ReadError> {
+    let line = skeleton.line;
+    let place = Place { value: &skeleton.root, path: line.map_or(Path::Root, Path::Line) };
     let mut faults = Faults::default();
-    let dynamics = read_dynamics(&place, (outline.states, outline.transitions), limits, meter, &mut faults)?;
-    faults.append(outline.faults);
+    let dynamics = read_dynamics(&place, (skeleton.states, skeleton.transitions), limits, meter, &mut faults)?;
+    faults.append(skeleton.faults);
     Ok(Definition(faults.check(dynamics)?))
 }
 

@@ -3,7 +3,7 @@
 //! ```text
 //! search --Space--> Explored { found: rows, transitions }     read at every step, the same for all dynamics
 //!                        |
-//!                        +--Frontier--> Numbered<D>           called once per state: its successors, and their numbers
+//!                        +--Frontier--> NumberedStates<D>           called once per state: its successors, and their numbers
 //! ```
 //!
 //! Searches are compiled once for all dynamics, whatever the type of their states. What depends on that type stands behind
@@ -50,13 +50,13 @@ trait Frontier: Debug {
 
 /// The states of `dynamics` that have a number.
 #[derive(Debug)]
-struct Numbered<'d, D: Implicit> {
+struct NumberedStates<'d, D: Implicit> {
     dynamics: &'d D,
     states: Vec<D::State>,
     numbers: FxHashMap<D::State, StateIdx>,
 }
 
-impl<D: Implicit> Numbered<'_, D> {
+impl<D: Implicit> NumberedStates<'_, D> {
     fn number_of(&mut self, state: D::State, found: &mut Found) -> StateIdx {
         #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
         let next = self.states.len() as StateIdx;
@@ -71,7 +71,7 @@ impl<D: Implicit> Numbered<'_, D> {
     }
 }
 
-impl<D: Implicit> Frontier for Numbered<'_, D> {
+impl<D: Implicit> Frontier for NumberedStates<'_, D> {
     fn explore(&mut self, from: StateIdx, found: &mut Found) {
         let dynamics = self.dynamics;
         let state = self.states[from as usize].clone();
@@ -99,7 +99,7 @@ impl<'d> Explored<'d> {
     fn new<D: Implicit>(dynamics: &'d D, first: impl IntoIterator<Item = D::State>) -> Self {
         let mut found =
             Found { states: States::new(dynamics.domains(), Vec::new()), bounds: Vec::new(), transitions: Vec::new() };
-        let mut numbered = Numbered { dynamics, states: Vec::new(), numbers: FxHashMap::default() };
+        let mut numbered = NumberedStates { dynamics, states: Vec::new(), numbers: FxHashMap::default() };
         for state in first {
             numbered.number_of(state, &mut found);
         }

@@ -28,7 +28,7 @@ impl Default for Rewards {
 
 /// What became of an agent.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Outcome {
+pub struct Execution {
     /// What it earned.
     pub reward: f64,
     /// How many actions it executed.
@@ -63,25 +63,26 @@ impl WumpusWorld {
 
     /// Executes `acts` from the start, until the agent is dead or outside.
     #[must_use]
-    pub fn execute(&self, acts: impl IntoIterator<Item = Act>) -> Outcome {
+    pub fn execute(&self, acts: impl IntoIterator<Item = Act>) -> Execution {
         let Self { cave, rewards } = self;
-        let mut outcome = Outcome { reward: 0.0, n_executed: 0, n_gold: 0, is_dead: false, state: cave.first_state() };
+        let mut execution =
+            Execution { reward: 0.0, n_executed: 0, n_gold: 0, is_dead: false, state: cave.first_state() };
         for act in acts {
-            outcome.state = cave.after(outcome.state, act);
-            outcome.n_executed += 1;
-            outcome.reward += if act == Act::Shoot { rewards.shot } else { rewards.action };
-            if cave.is_deadly(&outcome.state) {
-                outcome.is_dead = true;
-                outcome.reward += rewards.death;
+            execution.state = cave.after(execution.state, act);
+            execution.n_executed += 1;
+            execution.reward += if act == Act::Shoot { rewards.shot } else { rewards.action };
+            if cave.is_deadly(&execution.state) {
+                execution.is_dead = true;
+                execution.reward += rewards.death;
                 break;
             }
-            if outcome.state.outside {
-                outcome.n_gold = cave.first_state().lying.count_ones() - outcome.state.lying.count_ones();
-                outcome.reward += rewards.gold * f64::from(outcome.n_gold);
+            if execution.state.outside {
+                execution.n_gold = cave.first_state().lying.count_ones() - execution.state.lying.count_ones();
+                execution.reward += rewards.gold * f64::from(execution.n_gold);
                 break;
             }
         }
-        outcome
+        execution
     }
 }
 
@@ -113,21 +114,21 @@ mod tests {
     #[test]
     fn gold_pays_once_it_is_carried_out() {
         let world = world(&[], &[[1, 0], [1, 0]]);
-        let outcome = world.execute(acts("FGGGLLFC"));
-        assert_eq!((outcome.reward, outcome.n_gold, outcome.is_dead), (1992.0, 2, false));
+        let execution = world.execute(acts("FGGGLLFC"));
+        assert_eq!((execution.reward, execution.n_gold, execution.is_dead), (1992.0, 2, false));
         assert_eq!(world.execute(acts("FGLLF")).reward, -5.0, "not while it is still inside");
         assert_eq!(world.execute(acts("FGC")).reward, -3.0, "not from elsewhere than the start");
-        let outcome = world.execute(acts("CFG"));
-        assert_eq!((outcome.reward, outcome.n_executed), (-1.0, 1), "outside, it is over");
+        let execution = world.execute(acts("CFG"));
+        assert_eq!((execution.reward, execution.n_executed), (-1.0, 1), "outside, it is over");
     }
 
     #[test]
     fn a_live_wumpus_kills_and_a_dead_one_does_not() {
         let world = world(&[[2, 0]], &[]);
-        let outcome = world.execute(acts("FFLF"));
-        assert_eq!((outcome.reward, outcome.n_executed, outcome.is_dead), (-1002.0, 2, true));
-        let outcome = world.execute(acts("SFFLF"));
-        assert_eq!((outcome.reward, outcome.is_dead, outcome.state.cell), (-14.0, false, (2, 1)));
+        let execution = world.execute(acts("FFLF"));
+        assert_eq!((execution.reward, execution.n_executed, execution.is_dead), (-1002.0, 2, true));
+        let execution = world.execute(acts("SFFLF"));
+        assert_eq!((execution.reward, execution.is_dead, execution.state.cell), (-14.0, false, (2, 1)));
     }
 
     #[test]

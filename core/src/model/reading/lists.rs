@@ -13,7 +13,7 @@ pub(super) const MAX_TRANSITIONS: usize = u32::MAX as usize - 1;
 
 /// Where the items of a list stand in the document: in one array, or in arrays on several lines.
 #[derive(Debug, Default)]
-pub(in crate::model) struct Places(Vec<Run>);
+pub(in crate::model) struct ItemPaths(Vec<Run>);
 
 /// Arrays of `n_each` items on lines that follow one another.
 #[derive(Debug)]
@@ -27,7 +27,7 @@ struct Run {
     is_in_model: bool,
 }
 
-impl Places {
+impl ItemPaths {
     /// Notes where the `n_items` items from `first_item` on stand.
     pub(super) fn add(&mut self, first_item: usize, n_items: usize, line: Option<u64>, is_in_model: bool) {
         if n_items == 0 {
@@ -71,7 +71,7 @@ pub(in crate::model) struct RawStates {
     pub(in crate::model) lens: Option<Vec<u32>>,
     /// The first of those that are no arrays.
     pub(in crate::model) no_rows: Vec<Raw>,
-    pub(in crate::model) places: Places,
+    pub(in crate::model) item_paths: ItemPaths,
 }
 
 impl RawStates {
@@ -90,8 +90,8 @@ impl RawStates {
         if self.n_states == 0 {
             self.width = len;
         }
-        let is_odd = len != self.width || len > Schema::MAX_ATTRIBUTES;
-        if is_odd || self.lens.is_some() {
+        let is_different = len != self.width || len > Schema::MAX_ATTRIBUTES;
+        if is_different || self.lens.is_some() {
             let len = u32::try_from(len).unwrap_or(Self::NO_ROW - 1);
             self.lens().push(len);
         }
@@ -143,9 +143,9 @@ pub(in crate::model) struct RawTransitions {
     /// Distinct ways to refer to an action.
     pub(in crate::model) references: Distinct,
     /// The first of what is no transition.
-    pub(in crate::model) odd: Vec<NoTransition>,
-    pub(in crate::model) n_odd: usize,
-    pub(in crate::model) places: Places,
+    pub(in crate::model) faulty: Vec<NoTransition>,
+    pub(in crate::model) n_faulty: usize,
+    pub(in crate::model) item_paths: ItemPaths,
 }
 
 impl RawTransitions {
@@ -168,19 +168,19 @@ impl RawTransitions {
             }
             (from, _, to) => {
                 let reference = self.references.values()[reference as usize].clone();
-                self.add_odd(NoTransition::Parts(from, reference, to));
+                self.add_faulty(NoTransition::Parts(from, reference, to));
             }
         }
     }
 
-    pub(super) fn add_odd(&mut self, odd: NoTransition) {
+    pub(super) fn add_faulty(&mut self, faulty: NoTransition) {
         self.from.push(Self::NOWHERE);
         self.action.push(0);
         self.to.push(0);
         self.n_transitions += 1;
-        self.n_odd += 1;
-        if self.odd.len() < Faults::MAX_LISTED {
-            self.odd.push(odd);
+        self.n_faulty += 1;
+        if self.faulty.len() < Faults::MAX_LISTED {
+            self.faulty.push(faulty);
         }
     }
 }

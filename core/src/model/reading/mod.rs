@@ -1,12 +1,12 @@
 //! Reading the text of a model, of which there may be gigabytes, in one pass and without a tree of it.
 //!
 //! The long lists of a table, its states and transitions, are taken out as they are met, into compact arrays of what was
-//! found. What is left, the [`Outline`], is small: a JSON value with empty arrays where lists were taken out. What the
+//! found. What is left, the [`Skeleton`], is small: a JSON value with empty arrays where lists were taken out. What the
 //! cells of the lists ought to be is looked at when all is read, once per *distinct* value; so the members of the text may stand in
 //! any order, and faults come out in the same order whatever that is.
 //!
 //! ```text
-//! JSON, NDJSON, Value --> Reader --> Outline { root, states, transitions } --> definition::of_outline, table::read
+//! JSON, NDJSON, Value --> Reader --> Skeleton { root, states, transitions } --> definition::of_skeleton, table::read
 //! ```
 
 mod interruptible;
@@ -79,7 +79,7 @@ impl From<Interrupted> for ReadError {
 
 /// A model's document without its long lists.
 #[derive(Debug, Default)]
-pub(super) struct Outline {
+pub(super) struct Skeleton {
     /// The document; an empty array stands for each list that was taken out.
     pub(super) root: Value,
     /// The line that it stands on, in a document of several.
@@ -90,7 +90,7 @@ pub(super) struct Outline {
     pub(super) faults: Faults,
 }
 
-/// Reads outlines.
+/// Reads skeletons.
 pub(super) struct Reader<'m, 'i> {
     meter: &'m mut Meter<'i>,
     limits: Limits,
@@ -106,7 +106,7 @@ pub(super) struct Reader<'m, 'i> {
     /// Why an error was raised that is not the text's.
     stop: Option<Stop>,
     /// The way to where an error was met, innermost step first.
-    trace: Vec<Step>,
+    trace: Vec<PathStep>,
 }
 
 #[derive(Debug)]
@@ -116,7 +116,7 @@ enum Stop {
 }
 
 #[derive(Debug)]
-enum Step {
+enum PathStep {
     Member(String),
     Item(usize),
 }
@@ -148,21 +148,21 @@ impl<'m, 'i> Reader<'m, 'i> {
     }
 
     /// Reads what is in memory already.
-    pub(super) fn read_value(mut self, document: &Value) -> Result<Outline, ReadError> {
+    pub(super) fn read_value(mut self, document: &Value) -> Result<Skeleton, ReadError> {
         self.max_held_bytes = usize::MAX;
         let root = Seed::new(&mut self, Position::Root).deserialize(document);
         let root = root.map_err(|error| self.explain(error))?;
         Ok(self.finish(root, Faults::default()))
     }
 
-    pub(super) fn read_text(self, text: &[u8], format: Format) -> Result<Outline, ReadError> {
+    pub(super) fn read_text(self, text: &[u8], format: Format) -> Result<Skeleton, ReadError> {
         match format {
             Format::Json => self.read_json(&mut serde_json::Deserializer::from_slice(text)),
             Format::Ndjson => self.read_ndjson(text),
         }
     }
 
-    pub(super) fn read_from(self, reader: impl BufRead, format: Format) -> Result<Outline, ReadError> {
+    pub(super) fn read_from(self, reader: impl BufRead, format: Format) -> Result<Skeleton, ReadError> {
         match format {
             Format::Json => self.read_json(&mut serde_json::Deserializer::from_reader(reader)),
             Format::Ndjson => self.read_ndjson(reader),
@@ -172,13 +172,13 @@ impl<'m, 'i> Reader<'m, 'i> {
     fn read_json<'de, R: serde_json::de::Read<'de>>(
         mut self,
         json: &mut serde_json::Deserializer<R>,
-    ) -> Result<Outline, ReadError> {
+    ) -> Result<Skeleton, ReadError> {
         let root = Seed::new(&mut self, Position::Root).deserialize(&mut *json);
         let root = root.and_then(|root| json.end().map(|()| root)).map_err(|error| self.explain(error))?;
         Ok(self.finish(root, Faults::default()))
     }
 
-    fn read_ndjson(mut self, mut reader: impl BufRead) -> Result<Outline, ReadError> {
+    fn read_ndjson(mut self, mut reader: impl BufRead) -> Result<Skeleton, ReadError> {
         let mut line = Vec::new();
         let mut root = None;
         let mut model_line = None;
@@ -225,8 +225,8 @@ impl<'m, 'i> Reader<'m, 'i> {
         Ok(self.finish(root, faults))
     }
 
-    fn finish(self, root: Value, faults: Faults) -> Outline {
-        Outline { root, line: self.line, states: self.states, transitions: self.transitions, faults }
+    fn finish(self, root: Value, faults: Faults) -> Skeleton {
+        Skeleton { root, line: self.line, states: self.states, transitions: self.transitions, faults }
     }
 
     /// What an error means that was raised within a seed.
@@ -256,11 +256,11 @@ impl<'m, 'i> Reader<'m, 'i> {
 }
 
 /// Notes a number beyond floats where `trace` leads to.
-fn note_along(trace: &[Step], path: &Path<'_>, faults: &mut Faults) {
+fn note_along(trace: &[PathStep], path: &Path<'_>, faults: &mut Faults) {
     match trace.split_last() {
         None => faults.note_at(path, BEYOND_FLOATS),
-        Some((Step::Member(name), rest)) => note_along(rest, &Path::Member(path, name), faults),
-        Some((Step::Item(index), rest)) => note_along(rest, &Path::Item(path, *index), faults),
+        Some((PathStep::Member(name), rest)) => note_along(rest, &Path::Member(path, name), faults),
+        Some((PathStep::Item(index), rest)) => note_along(rest, &Path::Item(path, *index), faults),
     }
 }
 

@@ -7,7 +7,7 @@ use serde_json::{Map, Value};
 
 use super::lists::{NoTransition, RawIndex, RawStates, RawTransitions};
 use super::raw::{Distinct, Raw};
-use super::{Limits, Reader, Step, Stop};
+use super::{Limits, PathStep, Reader, Stop};
 use crate::attribute::Schema;
 use crate::interrupt::Meter;
 
@@ -151,7 +151,7 @@ impl<'de> Take<'de> for Seed<'_, '_, '_> {
         let mut held = Vec::new();
         loop {
             let item = items.next_element_seed(Seed::new(reader, Position::Elsewhere));
-            match reader.traced(item, || Step::Item(held.len()))? {
+            match reader.traced(item, || PathStep::Item(held.len()))? {
                 Some(item) => held.push(item),
                 None => return Ok(Value::Array(held)),
             }
@@ -168,7 +168,7 @@ impl<'de> Take<'de> for Seed<'_, '_, '_> {
         while let Some(name) = members.next_key::<String>()? {
             reader.hold(size_of::<String>() + name.len())?;
             let member = members.next_value_seed(Seed::new(reader, position.of_member(&name)));
-            let member = reader.traced(member, || Step::Member(name.clone()))?;
+            let member = reader.traced(member, || PathStep::Member(name.clone()))?;
             if position == Position::Chunk && held.contains_key(&name) {
                 reader.twice.push(name.clone());
             }
@@ -191,7 +191,7 @@ impl Reader<'_, '_> {
     }
 
     /// Notes on the way out of an error where it was met.
-    fn traced<T, E>(&mut self, read: Result<T, E>, step: impl FnOnce() -> Step) -> Result<T, E> {
+    fn traced<T, E>(&mut self, read: Result<T, E>, step: impl FnOnce() -> PathStep) -> Result<T, E> {
         traced(&mut self.trace, read, step)
     }
 
@@ -217,11 +217,11 @@ impl Reader<'_, '_> {
             } else {
                 rows.next_element::<IgnoredAny>().map(|row| row.map(|_| states.n_states += 1))
             };
-            if traced(trace, row, || Step::Item(n_before - first))?.is_none() {
+            if traced(trace, row, || PathStep::Item(n_before - first))?.is_none() {
                 break;
             }
         }
-        states.places.add(first, states.n_states - first, *line, is_in_model);
+        states.item_paths.add(first, states.n_states - first, *line, is_in_model);
         Ok(Value::Array(Vec::new()))
     }
 
@@ -243,11 +243,11 @@ impl Reader<'_, '_> {
             } else {
                 items.next_element::<IgnoredAny>().map(|item| item.map(|_| transitions.n_transitions += 1))
             };
-            if traced(trace, item, || Step::Item(n_before - first))?.is_none() {
+            if traced(trace, item, || PathStep::Item(n_before - first))?.is_none() {
                 break;
             }
         }
-        transitions.places.add(first, transitions.n_transitions - first, *line, is_in_model);
+        transitions.item_paths.add(first, transitions.n_transitions - first, *line, is_in_model);
         Ok(Value::Array(Vec::new()))
     }
 }
@@ -273,7 +273,7 @@ fn check_memory<E: Error>(n_bytes: usize, limits: Limits, stop: &mut Option<Stop
     Err(E::custom("too large"))
 }
 
-fn traced<T, E>(trace: &mut Vec<Step>, read: Result<T, E>, step: impl FnOnce() -> Step) -> Result<T, E> {
+fn traced<T, E>(trace: &mut Vec<PathStep>, read: Result<T, E>, step: impl FnOnce() -> PathStep) -> Result<T, E> {
     if read.is_err() {
         trace.push(step());
     }
@@ -283,7 +283,7 @@ fn traced<T, E>(trace: &mut Vec<Step>, read: Result<T, E>, step: impl FnOnce() -
 /// Takes a state.
 struct Row<'r> {
     states: &'r mut RawStates,
-    trace: &'r mut Vec<Step>,
+    trace: &'r mut Vec<PathStep>,
 }
 
 impl<'de> Take<'de> for Row<'_> {
@@ -306,7 +306,7 @@ impl<'de> Take<'de> for Row<'_> {
             } else {
                 cells.next_element::<IgnoredAny>().map(|cell| cell.map(|_| ()))
             };
-            if traced(trace, cell, || Step::Item(len))?.is_none() {
+            if traced(trace, cell, || PathStep::Item(len))?.is_none() {
                 break;
             }
             len += 1;
@@ -319,41 +319,41 @@ impl<'de> Take<'de> for Row<'_> {
 /// Takes a transition.
 struct Entry<'r> {
     transitions: &'r mut RawTransitions,
-    trace: &'r mut Vec<Step>,
+    trace: &'r mut Vec<PathStep>,
 }
 
 impl<'de> Take<'de> for Entry<'_> {
     type Taken = ();
 
     fn scalar(self, found: Raw<&str>) {
-        self.transitions.add_odd(NoTransition::Other(found.owned()));
+        self.transitions.add_faulty(NoTransition::Other(found.owned()));
     }
 
     fn array<A: SeqAccess<'de>>(self, mut parts: A) -> Result<(), A::Error> {
         let Self { transitions, trace } = self;
         let from = parts.next_element_seed(Taking(Index));
-        let Some(from) = traced(trace, from, || Step::Item(0))? else {
-            transitions.add_odd(NoTransition::Array(0));
+        let Some(from) = traced(trace, from, || PathStep::Item(0))? else {
+            transitions.add_faulty(NoTransition::Array(0));
             return Ok(());
         };
         let reference = parts.next_element_seed(Taking(Numbered(&mut transitions.references)));
-        let Some(reference) = traced(trace, reference, || Step::Item(1))? else {
-            transitions.add_odd(NoTransition::Array(1));
+        let Some(reference) = traced(trace, reference, || PathStep::Item(1))? else {
+            transitions.add_faulty(NoTransition::Array(1));
             return Ok(());
         };
         let to = parts.next_element_seed(Taking(Index));
-        let Some(to) = traced(trace, to, || Step::Item(2))? else {
-            transitions.add_odd(NoTransition::Array(2));
+        let Some(to) = traced(trace, to, || PathStep::Item(2))? else {
+            transitions.add_faulty(NoTransition::Array(2));
             return Ok(());
         };
         let mut len = 3;
-        while traced(trace, parts.next_element::<IgnoredAny>(), || Step::Item(len))?.is_some() {
+        while traced(trace, parts.next_element::<IgnoredAny>(), || PathStep::Item(len))?.is_some() {
             len += 1;
         }
         if len == 3 {
             transitions.add(from, reference, to);
         } else {
-            transitions.add_odd(NoTransition::Array(len));
+            transitions.add_faulty(NoTransition::Array(len));
         }
         Ok(())
     }

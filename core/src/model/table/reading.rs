@@ -139,7 +139,7 @@ fn read_states(
     meter: &mut Meter<'_>,
     faults: &mut Faults,
 ) -> Result<Option<States>, Interrupted> {
-    let RawStates { n_states, columns, mut cells, width, lens, no_rows, places } = rows;
+    let RawStates { n_states, columns, mut cells, width, lens, no_rows, item_paths } = rows;
     let width_wanted = attributes.len();
     let is_even = lens.is_none() && width == width_wanted;
     // As long as no fault is to be told, a column's raw values are let go as soon as they are read.
@@ -179,7 +179,7 @@ fn read_states(
         let len = lens.as_ref().map_or(width, |lens| lens[n] as usize);
         if len == RawStates::NO_ROW as usize {
             match no_rows.next() {
-                Some(found) => places.with_path("states", n, |path| faults.note_mismatch(path, "an array", found)),
+                Some(found) => item_paths.with_path("states", n, |path| faults.note_mismatch(path, "an array", found)),
                 None => faults.count_unlisted(1),
             }
             continue;
@@ -188,14 +188,14 @@ fn read_states(
         next_cell += row.len();
         if len != width_wanted {
             let detail = format!("expected {width_wanted} values, one per attribute, found {len}");
-            places.with_path("states", n, |path| faults.note_at(path, detail));
+            item_paths.with_path("states", n, |path| faults.note_at(path, detail));
             continue;
         }
         for (k, cell) in row.iter().enumerate() {
             let (Some(domain), Some(attribute)) = (&domains[k], &attributes[k]) else { continue };
             if domain.positions[*cell as usize] == Domain::NONE {
                 let found = &columns[k][*cell as usize];
-                places.with_path("states", n, |path| note_no_value(&Path::Item(path, k), found, attribute, faults));
+                item_paths.with_path("states", n, |path| note_no_value(&Path::Item(path, k), found, attribute, faults));
             }
         }
     }
@@ -218,7 +218,7 @@ fn read_transitions(
     meter: &mut Meter<'_>,
     faults: &mut Faults,
 ) -> Result<Option<Edges>, Interrupted> {
-    let RawTransitions { n_transitions, from, mut action, to, references, odd, n_odd, places } = items;
+    let RawTransitions { n_transitions, from, mut action, to, references, faulty, n_faulty, item_paths } = items;
     let read_reference = |found: &Raw, path: &Path<'_>, faults: &mut Faults| {
         let actions = actions?;
         if let Some(value) = found.scalar() {
@@ -233,7 +233,7 @@ fn read_transitions(
     let n_before = faults.count();
     // Of any length, so that the chunks are looked at in between.
     let are_states = |states: &[StateIdx]| states.iter().all(|state| (*state as usize) < n_states);
-    let is_faultless = n_odd == 0 && known.iter().all(Option::is_some) && are_states(&from) && are_states(&to);
+    let is_faultless = n_faulty == 0 && known.iter().all(Option::is_some) && are_states(&from) && are_states(&to);
     // Where it leaves from, and by which action, of what is a transition.
     let key = |n: usize| {
         let action = known.get(usize::from(action[n])).copied().flatten()?;
@@ -242,7 +242,7 @@ fn read_transitions(
     };
     let again = find_repeated(n_transitions, key, meter)?;
     if !is_faultless || !again.is_empty() {
-        let mut odd = odd.into_iter();
+        let mut faulty = faulty.into_iter();
         let mut again = again.into_iter().peekable();
         let read_index = |found: RawIndex, path: &Path<'_>, faults: &mut Faults| match found {
             Err(found) => faults.note_mismatch(path, &index_of("state"), found),
@@ -257,11 +257,11 @@ fn read_transitions(
         for n in 0..n_transitions {
             meter.spend_or_stop(1)?;
             if from[n] == RawTransitions::NOWHERE {
-                let Some(odd) = odd.next() else {
+                let Some(faulty) = faulty.next() else {
                     faults.count_unlisted(1);
                     continue;
                 };
-                places.with_path("transitions", n, |path| match odd {
+                item_paths.with_path("transitions", n, |path| match faulty {
                     NoTransition::Other(found) => faults.note_mismatch(path, "an array", found),
                     NoTransition::Array(len) => {
                         faults.note_at(path, format!("expected [from, action, to], found an array of {len}"));
@@ -273,10 +273,11 @@ fn read_transitions(
             let repeated = again.next_if(|(again, _)| *again as usize == n);
             let (reference, is_action) = (&references.values()[usize::from(action[n])], known[usize::from(action[n])]);
             if is_action.is_none() || from[n] as usize >= n_states || to[n] as usize >= n_states {
-                places.with_path("transitions", n, |path| read_parts(path, Ok(from[n]), reference, Ok(to[n]), faults));
+                item_paths
+                    .with_path("transitions", n, |path| read_parts(path, Ok(from[n]), reference, Ok(to[n]), faults));
             } else if let Some((_, other)) = repeated {
                 let detail = format!("state {} has a transition by this action already: transition {other}", from[n]);
-                places.with_path("transitions", n, |path| faults.note_at(path, detail));
+                item_paths.with_path("transitions", n, |path| faults.note_at(path, detail));
             }
         }
         debug_assert!(faults.count() > n_before || known.contains(&None), "there was a reason");

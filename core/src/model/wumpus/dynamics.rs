@@ -5,7 +5,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use super::attributes::position;
-use super::reading::Written;
+use super::reading::WrittenCave;
 use super::{Act, Cave, CaveState, Heading, cell_index};
 use crate::attribute::{Schema, Value};
 use crate::interrupt::{Interrupt, Interrupted, Meter};
@@ -35,7 +35,7 @@ impl Dynamics for Cave {
     }
 
     fn write(&self, writer: &mut dyn io::Write) -> io::Result<()> {
-        write_definition(writer, None, &self.actions, &Written::of(self))
+        write_definition(writer, None, &self.actions, &WrittenCave::of(self))
     }
 }
 

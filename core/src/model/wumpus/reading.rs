@@ -230,13 +230,13 @@ pub struct WumpusDocument {
 
 /// The dynamics as they are written in canonical form.
 #[derive(Serialize)]
-pub(super) struct Written {
+pub(super) struct WrittenCave {
     kind: &'static str,
     #[serde(flatten)]
     cave: WumpusDocument,
 }
 
-impl Written {
+impl WrittenCave {
     pub(super) fn of(cave: &Cave) -> Self {
         Self { kind: "wumpus", cave: cave.document() }
     }
