@@ -22,7 +22,7 @@ pub enum Signal {
 #[error("cancelled")]
 pub struct Cancelled;
 
-/// Why a computation has no result that is of no use unless it is finished.
+/// Why a computation has no result, as a part of it would be of no use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum Interrupted {
     /// It was told to [`Signal::Cancel`].
@@ -42,7 +42,7 @@ impl From<Interrupted> for Signal {
     }
 }
 
-/// Asked by a long computation whether to go on. Called often, so it should be cheap.
+/// Tells a long computation whether to go on. It is asked often, so it should be cheap.
 pub trait Interrupt {
     /// What to do next.
     fn poll(&mut self) -> Signal;
@@ -54,9 +54,9 @@ impl<F: FnMut() -> Signal> Interrupt for F {
     }
 }
 
-/// When to tell a computation to [`Signal::Finish`] that is to have its answer after `deadline`: a twentieth of it and a few
-/// microseconds before, but no more than ten milliseconds. That is what ends a search: up to a look at the clock, the bound of
-/// what is open, the mapping.
+/// How long after its start a search that must answer within `deadline` is told to [`Signal::Finish`]. The rest, a twentieth of
+/// `deadline` and a few microseconds, at most ten milliseconds, is what a search needs to notice the signal, to compute its lower bound, and
+/// to make the mapping.
 #[must_use]
 pub fn time_until_finish(deadline: Duration) -> Duration {
     const LEAST_RESERVED: Duration = Duration::from_micros(25);
@@ -89,7 +89,7 @@ impl<'i> Meter<'i> {
         Self { interrupt, every, left: 0 }
     }
 
-    /// Counts `units` of work that are about to be done, and says whether to go on.
+    /// Counts `units` of work that are about to be done; asks the interrupt if it is time to, and otherwise says to continue.
     #[inline]
     pub fn spend(&mut self, units: u64) -> Signal {
         if let Some(left) = self.left.checked_sub(units) {
@@ -100,7 +100,7 @@ impl<'i> Meter<'i> {
         self.interrupt.poll()
     }
 
-    /// As [`Self::spend`], for work that ends at once.
+    /// As [`Self::spend`], for work that stops whatever the signal is.
     ///
     /// # Errors
     ///

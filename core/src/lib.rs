@@ -21,7 +21,7 @@
 //! | [`interrupt`] | how a long computation is stopped from outside |
 //! | [`document`] | reading JSON with all its faults, each with its pointer |
 //! | [`attribute`] | attributes of states: kinds, values, weights, distance |
-//! | [`model`] | what a body can do: `table` and `wumpus` dynamics, compiled to one state graph, or left to searches |
+//! | [`model`] | what a body can do: dynamics of any kind, compiled to one state graph, or searched lazily |
 //! | [`mapping`] | the cheapest way to follow a demonstration: problem, search, heuristics, streams, policy |
 //! | [`learning`] | which attributes matter: a weight distribution, drawn from and learned from rewards |
 //! | [`world`] | simulators that execute a policy and give its reward |

@@ -65,7 +65,7 @@ impl Model {
     ) -> Result<Self, Interrupted> {
         /// How many successors or transitions are looked at between two looks at the interrupt: well below a millisecond.
         const POLL_EVERY: u64 = 1 << 10;
-        /// What a transition takes in the end, beside what is found.
+        /// What a transition takes in the graph, besides the one that was found.
         const TRANSITION_BYTES: usize = 2 * size_of::<Transition>();
         let mut meter = Meter::new(interrupt, POLL_EVERY);
         let max_states = limits.max_states.min(limits.max_values / schema.len());
@@ -111,15 +111,15 @@ impl Model {
         &self.actions
     }
 
-    /// Whether each search finds the states that it comes to, and numbers them on its own, as there are too many to know them
-    /// all. Of such a model, [`Self::states`] has only the start states, and [`Self::graph`] nothing.
+    /// Whether there are too many states to list them, so that each search finds the states that it comes to and numbers them itself. Then
+    /// [`Self::states`] has only the start states, and [`Self::graph`] no transitions.
     #[must_use]
     pub fn is_lazy(&self) -> bool {
         self.unexplored.is_some()
     }
 
-    /// Of a model that is searched lazily: the state with this row, numbered 0, from which the others are found. `None` if all states are
-    /// known.
+    /// For a model that is searched lazily: the state with this row, numbered 0, from which a search finds the others. `None` if the model
+    /// lists its states.
     ///
     /// # Panics
     ///
@@ -129,12 +129,12 @@ impl Model {
         Some(unexplored.explore_from(row).expect("a search starts in a state of its model"))
     }
 
-    /// Of a model that is searched lazily: every way in which its actions change attributes. `None` if all transitions are known.
+    /// For a model that is searched lazily: every way in which its actions change attributes. `None` if the model lists its transitions.
     pub(crate) fn operators(&self) -> Option<Box<dyn Iterator<Item = Operator> + '_>> {
         Some(self.unexplored.as_ref()?.operators())
     }
 
-    /// What searches see of it if all states are known.
+    /// What searches see of a model that lists its states.
     pub(crate) fn whole(&self) -> Whole<'_> {
         Whole::new(&self.states, &self.graph)
     }
@@ -156,7 +156,7 @@ impl Model {
         self.graph.successors(state).iter().map(|transition| (transition.action, Outcome::certain(transition.to)))
     }
 
-    /// Where the imitator may start when a request does not say.
+    /// Where the imitator may start if a request does not say.
     #[must_use]
     pub fn start(&self) -> &Start {
         &self.start
@@ -168,13 +168,13 @@ impl Model {
         self.is_unsafe.get(state as usize).copied().unwrap_or(false)
     }
 
-    /// How many transitions its definition has, those that a body may not make included.
+    /// How many transitions its definition lists, including those that are not in [`Self::graph`].
     #[must_use]
     pub fn n_transitions(&self) -> usize {
         self.n_transitions
     }
 
-    /// How many states must never be entered.
+    /// How many of the listed states must never be entered.
     #[must_use]
     pub fn n_unsafe(&self) -> usize {
         self.n_unsafe
@@ -194,24 +194,24 @@ impl Model {
         self.schema.by_attribute(written)
     }
 
-    /// About how many bytes of JSON the values of a state are: as many as those of the first one. `O(1)`, once it is known.
+    /// About how many bytes of JSON the values of a state take: the length of those of the first state. `O(1)` after the first call.
     pub fn state_bytes(&self) -> usize {
         let first = || serde_json::to_string(&self.describe(0)).map_or(usize::MAX, |text| text.len());
         *self.state_bytes.get_or_init(first)
     }
 
-    /// About how much memory it takes to read and compile a model of so many states, transitions and attributes, in bytes: enough for
-    /// most. Where nearly every state has a value of its own in several attributes, or texts are long, it takes more, as
-    /// [`Self::size_bytes`] tells in the end.
+    /// About how much memory it takes to read and compile a model of so many states, transitions and attributes, in bytes. It is enough for
+    /// most models. A model takes more if nearly every state has its own value in several attributes, or if texts are long;
+    /// [`Self::size_bytes`] tells what it takes, once the model is compiled.
     #[must_use]
     pub fn compiled_bytes(n_states: u64, n_transitions: u64, n_attributes: u64) -> u64 {
-        /// Besides its row: where its transitions begin, and a value of its own.
+        /// Besides its row, a state has an offset into the transitions, and a value of its own.
         const STATE_BYTES: u64 = 32;
-        /// Listed, in the graph and in a projection.
+        /// A transition is listed, in the graph, and in a projection.
         const TRANSITION_BYTES: u64 = 20;
-        /// Domains, actions and what else there is once.
+        /// Domains, actions, and whatever else a model has once.
         const OTHER_BYTES: u64 = 1 << 16;
-        // Of the rows, some more while they are read.
+        // Lists of rows grow while they are read, and have room to spare.
         let row_bytes = n_attributes * (size_of::<u32>() as u64) * 3 / 2;
         let states = n_states.saturating_mul(row_bytes + STATE_BYTES);
         states.saturating_add(n_transitions.saturating_mul(TRANSITION_BYTES)).saturating_add(OTHER_BYTES)

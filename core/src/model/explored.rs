@@ -3,7 +3,7 @@
 //! ```text
 //! search --Space--> Explored { found: rows, transitions }     read at every step, the same for all dynamics
 //!                        |
-//!                        +--Frontier--> NumberedStates<D>           called once per state: its successors, and their numbers
+//!                        +--Frontier--> NumberedStates<D>  called once per state: its successors, and their numbers
 //! ```
 //!
 //! Searches are compiled once for all dynamics, whatever the type of their states. What depends on that type stands behind
@@ -41,7 +41,7 @@ trait Frontier: Debug {
     /// Adds the transitions from the state numbered `from`, and the states that they lead to.
     fn explore(&mut self, from: StateIdx, found: &mut Found);
 
-    /// Makes room for `growth` times as many states, once there is hardly any left.
+    /// Reserves memory for `growth` times as many states, once there is hardly any left.
     fn make_room(&mut self, growth: f64);
 
     /// About how much memory each state takes here, in bytes.
@@ -95,7 +95,7 @@ impl<D: Implicit> Frontier for NumberedStates<'_, D> {
 }
 
 impl<'d> Explored<'d> {
-    /// Nothing but the states `first`, which get the numbers from 0 on.
+    /// Only the states `first`, numbered from 0, none of them explored.
     fn new<D: Implicit>(dynamics: &'d D, first: impl IntoIterator<Item = D::State>) -> Self {
         let mut found =
             Found { states: States::new(dynamics.domains(), Vec::new()), bounds: Vec::new(), transitions: Vec::new() };
@@ -193,10 +193,10 @@ impl Space for Explored<'_> {
 
 /// [`Implicit`] dynamics, whatever the type of their states.
 pub(crate) trait Unexplored: Debug + Send + Sync {
-    /// The start states, and nothing else.
+    /// Only the start states, in their order, none of them explored.
     fn explore_from_start(&self) -> Explored<'_>;
 
-    /// The state with this row, which is numbered 0, and nothing else; `None` if there is no such state.
+    /// Only the state with this row, which is numbered 0, not explored. `None` if there is no such state.
     fn explore_from(&self, row: &[u32]) -> Option<Explored<'_>>;
 
     /// The whole row of the state with this one, as [`Implicit::state_of`].

@@ -3,7 +3,7 @@
 use super::{ActionIdx, Rows, StateIdx};
 use crate::interrupt::{Interrupted, Meter};
 
-/// One way out of a state.
+/// A transition, of which the state that it leaves is known.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Transition {
     /// The action that leads along it.
@@ -20,8 +20,8 @@ pub struct Graph {
 }
 
 impl Graph {
-    /// A graph of `n_states` states with the transitions that `edges` gives, in any order. It goes through them twice, so that
-    /// nothing is kept but the graph. `O(n_states + E log d)`, d the most transitions out of a state.
+    /// A graph of `n_states` states with the transitions that `edges` gives, in any order. It iterates over `edges` twice, so that
+    /// nothing but the graph takes memory. `O(n_states + E log d)`, d the most transitions out of a state.
     ///
     /// # Errors
     ///
@@ -48,7 +48,7 @@ impl Graph {
         Self { transitions: Rows::of_entries(n_states, std::iter::empty()) }
     }
 
-    /// The ways out of `state`, in the order of their actions.
+    /// The transitions from `state`, in the order of their actions.
     #[inline]
     #[must_use]
     pub fn successors(&self, state: StateIdx) -> &[Transition] {

@@ -17,8 +17,8 @@ impl<T> Default for Rows<T> {
 }
 
 impl<T: Copy> Rows<T> {
-    /// `n_rows` rows of what `entries` gives, each with its row; a row's items stay in order. It goes through them twice, so that
-    /// nothing is kept but the rows (counting sort). `O(n_rows + n_entries)`.
+    /// `n_rows` rows of what `entries` gives, each with its row; a row's items stay in order. It iterates over them twice (counting sort), so that
+    /// nothing but the rows takes memory. `O(n_rows + n_entries)`.
     ///
     /// # Panics
     ///
@@ -28,7 +28,7 @@ impl<T: Copy> Rows<T> {
         rows
     }
 
-    /// The same; `go_on` is asked before each look at an entry, of which there are two.
+    /// As [`Self::of_entries`]; `go_on` is called before each entry, in both passes.
     ///
     /// # Errors
     ///
@@ -73,7 +73,7 @@ impl<T: Copy> Rows<T> {
         Rows { offsets: self.offsets.clone(), items: self.items.iter().map(map).collect() }
     }
 
-    /// Takes items out of each row that `merge` has merged into the last one before that is left, as it says.
+    /// Removes from each row every item that `merge(last, item)` says it has merged into `last`, the last item that was kept before it.
     pub(crate) fn dedup(&mut self, mut merge: impl FnMut(&mut T, &T) -> bool) {
         let mut end = 0;
         for n in 0..self.n_rows() {
@@ -132,7 +132,7 @@ impl<T> Rows<T> {
         self.items.len()
     }
 
-    /// Gives memory back that is not needed.
+    /// Returns memory that was reserved and is not used.
     pub(crate) fn shrink_to_fit(&mut self) {
         self.items.shrink_to_fit();
     }

@@ -1,13 +1,13 @@
-//! What a search sees of a model: states by number, and the ways out of them.
+//! What a search sees of a model: numbered states, and the transitions from them.
 
 use super::{Graph, StateIdx, States, Transition};
 
-/// States as a search walks on them. What is known of them may grow as it goes.
+/// The states of a model, as a search walks from one to another. A search of unlisted states adds those that it comes to.
 pub(crate) trait Space {
-    /// Finds the ways out of `state`, if they are not known yet.
+    /// Finds the transitions from `state`, if they are not known yet.
     fn explore(&mut self, state: StateIdx);
 
-    /// The ways out of `state`, which was explored, in the order of their actions.
+    /// The transitions from `state`, which was explored, in the order of their actions.
     fn successors(&self, state: StateIdx) -> &[Transition];
 
     /// The row of `state`: per attribute, the index of its value in the domain. Shape `[n_attributes]`.
@@ -16,17 +16,17 @@ pub(crate) trait Space {
     /// Whether a state has the same number in every search.
     fn keeps_numbers(&self) -> bool;
 
-    /// How many states there are, if that is known.
+    /// How many states there are; `None` if they are not listed.
     fn n_states(&self) -> Option<usize>;
 
-    /// About how much memory what was found so far takes, in bytes.
+    /// About how much memory the states and transitions that this search found take, in bytes.
     fn found_bytes(&self) -> usize;
 
-    /// Makes room for `growth` times as many states, once there is hardly any left.
+    /// Reserves memory for `growth` times as many states, once there is hardly any left.
     fn make_room(&mut self, growth: f64);
 }
 
-/// All states and transitions of a model, known beforehand.
+/// The states and transitions of a model that lists them all.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Whole<'m> {
     states: &'m States,
