@@ -4,7 +4,7 @@ use std::collections::HashSet;
 
 use super::{Attribute, Cycle, Kind, Labels, MAX_COST, Scalar, Schema, Value, Weights};
 
-/// Why something was not built.
+/// Why an attribute, a schema, a model or a demonstration could not be built.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum BuildError {
     /// There are too few or too many of something.
@@ -40,7 +40,7 @@ pub enum BuildError {
         /// The number.
         found: f64,
     },
-    /// A value is none of its attribute's.
+    /// A value is not one of its attribute.
     #[error("attribute {attribute:?}: expected {expected}, found {found}")]
     Value {
         /// The attribute's name.
@@ -50,7 +50,7 @@ pub enum BuildError {
         /// The value.
         found: Scalar,
     },
-    /// A state or an action that there is not.
+    /// There is no state or action with this index.
     #[error("there is no {what} {index}")]
     Unknown {
         /// `state` or `action`.
@@ -136,7 +136,7 @@ impl Attribute {
         Self { name: name.into(), kind: Kind::Category, weight: 1.0 }
     }
 
-    /// The same attribute, with `scale` as what counts as a difference of 1. Categories have none, and stay as they are.
+    /// The same attribute, with another `scale`: the difference of values that counts as 1. A category has no scale and stays as it is.
     #[must_use]
     pub fn with_scale(self, scale: f64) -> Self {
         let kind = match self.kind {
@@ -157,7 +157,7 @@ impl Attribute {
     ///
     /// # Errors
     ///
-    /// [`BuildError::Value`] if it has none that is written so.
+    /// [`BuildError::Value`] if `scalar` is not a value of this attribute.
     pub fn value(&self, scalar: impl Into<Scalar>) -> Result<Value, BuildError> {
         let scalar = scalar.into();
         #[expect(clippy::cast_precision_loss, reason = "integers beyond 2^53 are read from JSON likewise")]

@@ -1,4 +1,4 @@
-//! Something for each of some attributes, as a JSON object in schema order.
+//! A JSON object with a member for each of some attributes, in schema order.
 
 use std::fmt;
 use std::marker::PhantomData;
@@ -8,7 +8,7 @@ use serde::de::{MapAccess, Visitor};
 use serde::ser::SerializeMap;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// A `T` for each of some attributes. WrittenValue as a JSON object whose members stand in schema order, so that the
+/// A `T` for each of some attributes. It is written as a JSON object whose members stand in schema order, so that the
 /// same content always gives the same bytes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ByAttribute<T>(Vec<(Arc<str>, T)>);

@@ -1,4 +1,4 @@
-//! Reading values from JSON as it comes, without a document in between.
+//! Deserializing values of attributes from JSON text, without a tree of JSON values.
 
 use std::fmt;
 
@@ -6,8 +6,8 @@ use serde::de::{DeserializeSeed, Deserializer, Error, Visitor};
 
 use super::{Attribute, Cycle, Kind, Value};
 
-/// Reads a value of this attribute, or `null`: not observed. What is a value is what [`Attribute::read_value`] takes for one, and a
-/// property of demonstrations holds the two together; an error does not tell what is wrong, as faults do.
+/// Reads a value of this attribute, or `null`: not observed. It accepts exactly the values that [`Attribute::read_value`] accepts, which a
+/// property test of demonstrations holds. Its errors do not explain what is wrong; the faults of `read_value` do.
 pub(crate) struct ValueSeed<'a>(pub(crate) &'a Attribute);
 
 impl<'de> DeserializeSeed<'de> for ValueSeed<'_> {
@@ -67,7 +67,7 @@ impl Visitor<'_> for ValueSeed<'_> {
 }
 
 impl ValueSeed<'_> {
-    /// A number, if the attribute's values are some.
+    /// A number, if the attribute's values are numbers.
     fn number(&self, number: f64) -> Option<Value> {
         // Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bits.
         let is_number = matches!(self.0.kind, Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. });
@@ -75,7 +75,7 @@ impl ValueSeed<'_> {
     }
 }
 
-/// What was `read`, which must be a value.
+/// The value that was `read`; an error if there is none.
 fn checked<E: Error>(read: Option<Value>) -> Result<Option<Value>, E> {
     if read.is_some() { Ok(read) } else { Err(E::custom("not a value of the attribute")) }
 }

@@ -12,7 +12,7 @@ pub struct Distribution {
 }
 
 impl Distribution {
-    /// Whether both have the same bits: what replaying the log must give.
+    /// Whether both have the same bits, as they must after the log was replayed.
     #[must_use]
     pub fn has_bits_of(&self, other: &Self) -> bool {
         let bits = |distribution: &Self| -> Vec<u64> {

@@ -12,14 +12,21 @@ use crate::interrupt::{Interrupt, Interrupted, Meter};
 /// A body in its world, ready to be searched.
 #[derive(Debug)]
 pub struct Model {
+    /// The attributes of its states.
     pub(super) schema: Schema,
+    /// What the body can do.
     pub(super) actions: Vec<Action>,
+    /// Shared with the table that they come from, if any. If the model is searched lazily: the start states.
     pub(super) states: Arc<States>,
+    /// The transitions that the body may make.
     pub(super) graph: Graph,
+    /// Where it may start if a request does not say.
     pub(super) start: Start,
+    /// See [`Self::n_transitions`].
     pub(super) n_transitions: usize,
     /// Shape `[n_states]`; empty if no state is unsafe, or none of those is listed.
     pub(super) is_unsafe: Vec<bool>,
+    /// How many states are unsafe.
     pub(super) n_unsafe: usize,
     /// What finds the states, if they are not listed.
     pub(super) unexplored: Option<Arc<dyn Unexplored>>,

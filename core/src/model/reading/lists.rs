@@ -1,4 +1,4 @@
-//! The long lists of a table in compact form, whatever is wrong with them.
+//! The long lists of a table in compact form, valid or not.
 
 use super::raw::{Distinct, Raw};
 use crate::attribute::Schema;
@@ -11,7 +11,7 @@ pub(super) const MAX_STATES: usize = u32::MAX as usize - 1;
 /// Most transitions that can be told apart by an index.
 pub(super) const MAX_TRANSITIONS: usize = u32::MAX as usize - 1;
 
-/// Where the items of a list stand in the document: in one array, or in arrays on several lines.
+/// The paths of the items of a list: the list is one array, or several arrays on lines of their own.
 #[derive(Debug, Default)]
 pub(in crate::model) struct ItemPaths(Vec<Run>);
 
@@ -44,7 +44,7 @@ impl ItemPaths {
         self.0.push(Run { first_item, line, n_lines: 1, n_each: n_items, is_in_model });
     }
 
-    /// Follows the path to the item `item` of the list called `list`.
+    /// Calls `follow` with the path of the item `item` of the list called `list`.
     pub(in crate::model) fn with_path<R>(&self, list: &str, item: usize, follow: impl FnOnce(&Path<'_>) -> R) -> R {
         let run = &self.0[self.0.partition_point(|run| run.first_item <= item) - 1];
         let within = item - run.first_item;
@@ -67,19 +67,20 @@ pub(in crate::model) struct RawStates {
     pub(in crate::model) cells: Vec<u32>,
     /// The length of the first row.
     pub(in crate::model) width: usize,
-    /// The length of each row, once one is not that of the first; [`Self::NO_ROW`] for what is no array.
+    /// The length of each row, once one differs from the first; [`Self::NO_ROW`] for a value that is not an array.
     pub(in crate::model) lens: Option<Vec<u32>>,
-    /// The first of those that are no arrays.
+    /// The first values that are not arrays.
     pub(in crate::model) no_rows: Vec<Raw>,
+    /// Where each row stands.
     pub(in crate::model) item_paths: ItemPaths,
 }
 
 impl RawStates {
     pub(in crate::model) const NO_ROW: u32 = u32::MAX;
 
-    /// About how much memory they take, in bytes, and will take.
+    /// About how much memory they take, in bytes, now and in the compiled model.
     pub(super) fn size_bytes(&self) -> usize {
-        /// Where the transitions of a state begin, in two lists.
+        /// The offset of the transitions of a state, in two lists.
         const STATE_BYTES: usize = 2 * size_of::<u32>();
         let columns: usize = self.columns.iter().map(Distinct::size_bytes).sum();
         columns + size_of_val(self.cells.as_slice()) + self.n_states * STATE_BYTES
@@ -98,7 +99,7 @@ impl RawStates {
         self.n_states += 1;
     }
 
-    /// Adds what should be a row and is not.
+    /// Adds a value that should be a row and is not.
     pub(super) fn add_no_row(&mut self, found: Raw<&str>) {
         self.lens().push(Self::NO_ROW);
         self.n_states += 1;
@@ -116,13 +117,13 @@ impl RawStates {
     }
 }
 
-/// What should be the index of a state.
+/// The index of a state, or what was found instead.
 pub(in crate::model) type RawIndex = Result<u32, Raw>;
 
-/// What is certainly no transition.
+/// A value that cannot be a transition.
 #[derive(Debug)]
 pub(in crate::model) enum NoTransition {
-    /// No array.
+    /// A value that is not an array.
     Other(Raw),
     /// An array of this many items, other than three.
     Array(usize),
@@ -135,25 +136,28 @@ pub(in crate::model) enum NoTransition {
 pub(in crate::model) struct RawTransitions {
     /// How many there are. Those beyond the limit are only counted.
     pub(in crate::model) n_transitions: usize,
-    /// [`Self::NOWHERE`] for what is no transition.
+    /// The state that each leaves; [`Self::NOWHERE`] for a value that cannot be a transition.
     pub(in crate::model) from: Vec<u32>,
-    /// Into `references`.
+    /// An index into `references` for each.
     pub(in crate::model) action: Vec<u16>,
+    /// The state that each leads to.
     pub(in crate::model) to: Vec<u32>,
     /// Distinct ways to refer to an action.
     pub(in crate::model) references: Distinct,
-    /// The first of what is no transition.
+    /// The first values that cannot be transitions.
     pub(in crate::model) faulty: Vec<NoTransition>,
+    /// How many values cannot be transitions.
     pub(in crate::model) n_faulty: usize,
+    /// Where each transition stands.
     pub(in crate::model) item_paths: ItemPaths,
 }
 
 impl RawTransitions {
     pub(in crate::model) const NOWHERE: u32 = u32::MAX;
 
-    /// About how much memory they take, in bytes, and will take.
+    /// About how much memory they take, in bytes, now and in the compiled model.
     pub(super) fn size_bytes(&self) -> usize {
-        /// Listed, and in the graph.
+        /// A transition is listed, and in the graph.
         const TRANSITION_BYTES: usize = 10 + size_of::<Transition>();
         self.from.len() * TRANSITION_BYTES
     }

@@ -1,9 +1,8 @@
-//! Reading the text of a model, of which there may be gigabytes, in one pass and without a tree of it.
+//! Reading the text of a model, which may be gigabytes long, in one pass and without a tree of JSON values.
 //!
-//! The long lists of a table, its states and transitions, are taken out as they are met, into compact arrays of what was
-//! found. What is left, the [`Skeleton`], is small: a JSON value with empty arrays where lists were taken out. What the
-//! cells of the lists ought to be is looked at when all is read, once per *distinct* value; so the members of the text may stand in
-//! any order, and faults come out in the same order whatever that is.
+//! The long lists of a table, its states and transitions, are parsed into compact arrays. The rest, the [`Skeleton`], is small: a JSON
+//! value with empty arrays in place of the lists. Values in the lists are checked after the whole text was parsed, once per *distinct*
+//! value. So the members of the text may stand in any order, and the order of faults does not depend on it.
 //!
 //! ```text
 //! JSON, NDJSON, Value --> Reader --> Skeleton { root, states, transitions } --> definition::of_skeleton, table::read
@@ -45,13 +44,13 @@ pub enum ReadError {
     /// It is JSON, but not a model.
     #[error(transparent)]
     Faults(#[from] Faults),
-    /// The caller lost interest.
+    /// The caller asked for it to be cancelled.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
-    /// It was not read to its end in the time that there was.
+    /// The caller's time was up.
     #[error("out of time")]
     OutOfTime,
-    /// What must be kept in memory is too large.
+    /// The model takes more memory than it may.
     #[error("{0}")]
     TooLarge(String),
     /// The text could not be read to its end.
@@ -84,7 +83,9 @@ pub(super) struct Skeleton {
     pub(super) root: Value,
     /// The line that it stands on, in a document of several.
     pub(super) line: Option<u64>,
+    /// The states, if the document lists any.
     pub(super) states: Option<RawStates>,
+    /// The transitions, if the document lists any.
     pub(super) transitions: Option<RawTransitions>,
     /// Faults of the lines after the first.
     pub(super) faults: Faults,
@@ -98,14 +99,14 @@ pub(super) struct Reader<'m, 'i> {
     transitions: Option<RawTransitions>,
     /// The line that is read, in a document of several.
     line: Option<u64>,
-    /// About how much memory the values take that are kept as they are.
+    /// About how much memory the values of the skeleton take, in bytes.
     n_held_bytes: usize,
     max_held_bytes: usize,
-    /// Members of the line that is read that stand on it twice, if it is not the model's.
+    /// Members that stand twice on the line that is read, if that is not the line of the model.
     twice: Vec<String>,
-    /// Why an error was raised that is not the text's.
+    /// Why reading was stopped, if not for a fault of the text.
     stop: Option<Stop>,
-    /// The way to where an error was met, innermost step first.
+    /// The path of the value at which an error occurred, innermost step first.
     trace: Vec<PathStep>,
 }
 
@@ -201,7 +202,7 @@ impl<'m, 'i> Reader<'m, 'i> {
             } else {
                 check_chunk(&read, number, &mut faults);
                 for name in self.twice.drain(..) {
-                    // What a list adds to those before it cannot be told from them later.
+                    // Items of the two lists could not be told apart later.
                     faults.note_at(&Path::Member(&Path::Line(number), &name), "stands twice on this line");
                 }
             }
@@ -229,7 +230,7 @@ impl<'m, 'i> Reader<'m, 'i> {
         Skeleton { root, line: self.line, states: self.states, transitions: self.transitions, faults }
     }
 
-    /// What an error means that was raised within a seed.
+    /// What an error of a seed means.
     fn explain(&mut self, error: serde_json::Error) -> ReadError {
         match self.stop.take() {
             Some(Stop::Interrupted(interrupted)) => return interrupted.into(),
@@ -245,7 +246,7 @@ impl<'m, 'i> Reader<'m, 'i> {
             faults
         };
         match (ParseError::of(&error, beyond_floats), self.line) {
-            // Within a line, all is on its first.
+            // The parser saw only this line, as line 1.
             (ParseError::Syntax { column, detail, .. }, Some(line)) => {
                 let line = usize::try_from(line).unwrap_or(usize::MAX);
                 ParseError::Syntax { line, column, detail }.into()

@@ -1,4 +1,4 @@
-//! JSON values as they stand in a text, interned before it is known what they ought to be.
+//! JSON values of a text, interned before the reader knows what they should be.
 
 use std::fmt;
 use std::hash::{BuildHasher, RandomState};
@@ -8,18 +8,18 @@ use hashbrown::HashTable;
 use crate::attribute::{Attribute, Value};
 use crate::document::{Excerpt, Quoted};
 
-/// A JSON value without what it contains; `T` is a text, borrowed or owned.
+/// A JSON value, without the items of an array and the members of an object. `T` is a text, borrowed or owned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(in crate::model) enum Raw<T = Box<str>> {
     Null,
     Boolean(bool),
     Whole(u64),
-    /// Below 0.
+    /// A whole number below 0.
     Negative(i64),
     /// The bits of a finite number.
     Float(u64),
     Text(T),
-    /// How many items it has.
+    /// An array of so many items.
     Array(usize),
     Object,
 }
@@ -42,7 +42,7 @@ impl<T: AsRef<str>> Raw<T> {
         }
     }
 
-    /// The value, if it contains no others.
+    /// The value; `None` if it is an array or an object.
     pub(in crate::model) fn scalar(&self) -> Option<serde_json::Value> {
         Some(match self {
             Self::Null => serde_json::Value::Null,
@@ -58,7 +58,7 @@ impl<T: AsRef<str>> Raw<T> {
 
 impl Raw<&str> {
     pub(super) fn owned(self) -> Raw {
-        /// Of a longer text only that it is too long, and how it begins, will matter.
+        /// A longer text is a fault, which shows only how the text begins.
         const MAX_KEPT_BYTES: usize = Attribute::MAX_TEXT_BYTES + 1;
         match self {
             Self::Null => Raw::Null,
@@ -89,7 +89,7 @@ impl<T: AsRef<str>> fmt::Display for Raw<T> {
 #[derive(Debug, Default)]
 pub(in crate::model) struct Distinct {
     values: Vec<Raw>,
-    /// Into `values`. Hashed with a seed, as clients choose the values; 5 bytes each.
+    /// Indices into `values`, 5 bytes each. Hashed with a seed, as clients choose the values.
     numbers: HashTable<u32>,
     hasher: RandomState,
     n_text_bytes: usize,
@@ -115,8 +115,8 @@ impl Distinct {
         number
     }
 
-    /// About how much memory they take, in bytes, and what they are read into: values of an attribute, which also ways between them
-    /// refer to.
+    /// About how much memory they take, in bytes, including the attribute values that they are read into, and the projected transitions
+    /// between those.
     pub(super) fn size_bytes(&self) -> usize {
         const VALUE_BYTES: usize = 2 * size_of::<Raw>() + 2 * size_of::<Value>();
         self.values.len() * VALUE_BYTES + 2 * self.n_text_bytes
@@ -127,7 +127,7 @@ impl Distinct {
         &self.values
     }
 
-    /// As [`Self::values`], without what was only needed to find them.
+    /// As [`Self::values`]; drops the index.
     pub(in crate::model) fn into_values(self) -> Vec<Raw> {
         self.values
     }

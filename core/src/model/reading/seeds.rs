@@ -1,4 +1,4 @@
-//! What is done with each value of a model's text as it is met.
+//! How each value of a model's text is taken in as the parser meets it.
 
 use std::fmt;
 
@@ -110,7 +110,7 @@ impl Position {
     }
 }
 
-/// Keeps a value as it is, but for the lists that are taken out.
+/// Keeps a value as it is, without the long lists.
 pub(super) struct Seed<'r, 'm, 'i> {
     reader: &'r mut Reader<'m, 'i>,
     position: Position,
@@ -161,7 +161,7 @@ impl<'de> Take<'de> for Seed<'_, '_, '_> {
     fn object<A: MapAccess<'de>>(self, mut members: A) -> Result<Value, A::Error> {
         let Self { reader, position } = self;
         if position == Position::Dynamics {
-            // Of members that stand twice the last one counts.
+            // The last of members with the same name counts.
             (reader.states, reader.transitions) = (None, None);
         }
         let mut held = Map::new();
@@ -179,7 +179,7 @@ impl<'de> Take<'de> for Seed<'_, '_, '_> {
 }
 
 impl Reader<'_, '_> {
-    /// Counts memory that is kept.
+    /// Counts memory of values that are kept.
     fn hold<E: Error>(&mut self, n_bytes: usize) -> Result<(), E> {
         self.n_held_bytes += n_bytes;
         if self.n_held_bytes <= self.max_held_bytes {
@@ -190,13 +190,13 @@ impl Reader<'_, '_> {
         Err(E::custom("too large"))
     }
 
-    /// Notes on the way out of an error where it was met.
+    /// Adds a step to the path of an error, as it is passed on to the caller.
     fn traced<T, E>(&mut self, read: Result<T, E>, step: impl FnOnce() -> PathStep) -> Result<T, E> {
         traced(&mut self.trace, read, step)
     }
 
     fn take_states<'de, A: SeqAccess<'de>>(&mut self, mut rows: A, is_in_model: bool) -> Result<Value, A::Error> {
-        /// How many are read between two looks at the memory: less than a megabyte of values.
+        /// How many are read between two checks of the memory: less than a megabyte of values.
         const LOOK_EVERY: usize = 16;
         let n_other_bytes = self.transitions.as_ref().map_or(0, RawTransitions::size_bytes);
         let Self { meter, limits, states, line, stop, trace, .. } = self;
@@ -359,7 +359,7 @@ impl<'de> Take<'de> for Entry<'_> {
     }
 }
 
-/// Takes the number of a value among the distinct ones.
+/// Takes a value, and gives its number among the distinct ones.
 struct Numbered<'r>(&'r mut Distinct);
 
 impl Take<'_> for Numbered<'_> {

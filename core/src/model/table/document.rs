@@ -7,7 +7,7 @@ use super::Table;
 use crate::attribute::Scalar;
 use crate::model::{ActionIdx, Start, StateIdx, Transition};
 
-/// Written as the [`TableDocument`] that it was read from, in canonical form, without a copy of it.
+/// Writes the [`TableDocument`] of a table in canonical form, without making one.
 impl Serialize for Table {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         use serde::ser::SerializeStruct;

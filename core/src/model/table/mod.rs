@@ -79,14 +79,13 @@ impl Dynamics for Table {
         Model::compiled_bytes(n_states, self.edges.len() as u64, self.schema.len() as u64)
     }
 
-    /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, which
-    /// a `skip` does for nothing.
+    /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, as a `skip` costs no action.
     fn compile(self: Arc<Self>, _: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted> {
         /// How many transitions are looked at between two looks at the interrupt: less than a millisecond.
         const POLL_EVERY: u64 = 1 << 14;
         let mut meter = Meter::new(interrupt, POLL_EVERY);
         let n_states = self.states.len() as usize;
-        // Where none is, none is noted.
+        // Without unsafe states, the list is empty.
         let n_noted = if self.unsafe_states.is_empty() { 0 } else { n_states };
         let mut is_unsafe = vec![false; n_noted];
         for state in &self.unsafe_states {

@@ -14,8 +14,7 @@ use crate::model::dynamics::{Description, Dynamics};
 use crate::model::reading::{Distinct, NoTransition, Raw, RawIndex, RawStates, RawTransitions};
 use crate::model::{ActionIdx, Limits, Start, StateIdx, States};
 
-/// Reads a model with listed states and transitions. What does not depend on attributes or actions that have faults of their own is checked
-/// all the same.
+/// Reads a model with listed states and transitions. If attributes or actions have faults, what does not depend on them is still checked.
 pub(in crate::model) fn read(
     description: &mut Description<'_, '_>,
     limits: Limits,
@@ -38,7 +37,7 @@ pub(in crate::model) fn read(
         }
         is_number_right
     });
-    // Where the states are missing, any index may be right.
+    // If the states are missing, any index may be right.
     let n_states = rows.as_ref().map_or(StateIdx::MAX as usize, |(_, rows)| rows.n_states);
     let states = match rows.zip(attributes.as_ref()) {
         Some(((_, rows), attributes)) => read_states(rows, attributes, meter, faults)?,
@@ -60,7 +59,7 @@ pub(in crate::model) fn read(
     };
     let unsafe_states = match object.optional("unsafe") {
         Some(place) => read_state_list(&place, n_states, faults).map(|mut states| {
-            // A set, however it is written.
+            // They are a set, in whatever order they are written.
             states.sort_unstable();
             states.dedup();
             states
@@ -81,11 +80,11 @@ pub(in crate::model) fn read(
     Ok(table().map(|table| Arc::new(table) as Arc<dyn Dynamics>))
 }
 
-/// The values of a column, as far as they are values of its attribute.
+/// The values of a column that are values of its attribute.
 struct Domain {
     /// Distinct values, in the order in which they were first met.
     values: Vec<Value>,
-    /// Where each of the column's distinct raw values stands in `values`; [`Self::NONE`] for what is none.
+    /// Where each of the column's distinct raw values stands in `values`; [`Self::NONE`] for one that is no value of the attribute.
     positions: Vec<u32>,
 }
 
@@ -94,7 +93,7 @@ impl Domain {
 
     fn read(column: &[Raw], attribute: &Attribute, meter: &mut Meter<'_>) -> Result<Self, Interrupted> {
         let mut values: Vec<Value> = Vec::with_capacity(column.len());
-        // Numbers that are written in several ways, such as 1 and 1.0, are one.
+        // A number may be written in several ways, such as 1 and 1.0.
         let mut known: HashTable<u32> = HashTable::with_capacity(column.len());
         let hasher = RandomState::default();
         let mut positions = Vec::with_capacity(column.len());
@@ -127,7 +126,7 @@ impl Domain {
         Ok(Self { values, positions })
     }
 
-    /// Whether every raw value is a value of its own.
+    /// Whether no two raw values are the same value.
     fn is_as_found(&self) -> bool {
         self.values.len() == self.positions.len()
     }
@@ -142,7 +141,7 @@ fn read_states(
     let RawStates { n_states, columns, mut cells, width, lens, no_rows, item_paths } = rows;
     let width_wanted = attributes.len();
     let is_even = lens.is_none() && width == width_wanted;
-    // As long as no fault is to be told, a column's raw values are let go as soon as they are read.
+    // The raw values of a column are dropped as soon as they are read, unless a fault must be explained.
     let mut columns: Vec<Vec<Raw>> = columns.into_iter().map(Distinct::into_values).collect();
     let mut domains = Vec::with_capacity(width_wanted);
     for (column, attribute) in columns.iter_mut().zip(attributes) {
@@ -234,7 +233,7 @@ fn read_transitions(
     // Of any length, so that the chunks are looked at in between.
     let are_states = |states: &[StateIdx]| states.iter().all(|state| (*state as usize) < n_states);
     let is_faultless = n_faulty == 0 && known.iter().all(Option::is_some) && are_states(&from) && are_states(&to);
-    // Where it leaves from, and by which action, of what is a transition.
+    // The state and the action of each value that is a transition.
     let key = |n: usize| {
         let action = known.get(usize::from(action[n])).copied().flatten()?;
         ((from[n] as usize) < n_states && (to[n] as usize) < n_states && from[n] != RawTransitions::NOWHERE)
@@ -284,19 +283,19 @@ fn read_transitions(
         return Ok(None);
     }
     for action in &mut action {
-        // All are known.
+        // All actions are known here.
         *action = known[usize::from(*action)].unwrap_or_default();
     }
     Ok(Some(Edges { from, action, to }))
 }
 
-/// Of `n_transitions` with these keys, those whose key an earlier one has, each with the last such one, in order.
+/// The transitions whose key an earlier transition has, each with the last such transition, in order.
 fn find_repeated(
     n_transitions: usize,
     key: impl Fn(usize) -> Option<(StateIdx, ActionIdx)>,
     meter: &mut Meter<'_>,
 ) -> Result<Vec<(u32, u32)>, Interrupted> {
-    // Most documents list transitions in order, which makes this simple.
+    // Most documents list transitions in ascending order, without repetitions.
     let mut last = None;
     let is_ascending = (0..n_transitions).all(|n| {
         let before = std::mem::replace(&mut last, key(n));

@@ -119,14 +119,21 @@ pub struct CaveState {
 /// A wumpus world, and a body in it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cave {
+    /// Cells from west to east.
     width: u16,
+    /// Cells from south to north.
     height: u16,
+    /// Cells with a pit.
     pits: Vec<Cell>,
     /// Whether there is a pit, by [`cell_index`]. Shape `[height, width]`.
     is_pit: Vec<bool>,
+    /// Cells with a wumpus, in the order of their attributes.
     wumpi: Vec<Cell>,
+    /// Cells with a piece of gold, in the order of their attributes.
     gold: Vec<Cell>,
+    /// Where the agent starts.
     start: (Cell, Heading),
+    /// How many arrows it starts with.
     arrows: u8,
     /// The body.
     actions: Vec<Action>,
