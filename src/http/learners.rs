@@ -14,7 +14,7 @@ use super::answer::json;
 use super::body::{NoForm, read_json};
 use super::paging::{List, Paging};
 use super::path::PathName;
-use super::problem::Problem;
+use super::problem::{BodyProblems, NoBodyProblems, Problem};
 use crate::service::{LearnerAnswer, Registered, WeightsAnswer};
 use etude_core::document::{Faults, Path};
 use etude_core::learning::LearnerDocument;
@@ -105,11 +105,8 @@ impl From<WeightsAnswer> for WeightsBody {
     responses(
         (status = 201, description = "It is new; its weights have version 0", body = LearnerBody),
         (status = 200, description = "The same content was there already, under this name", body = LearnerBody),
-        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
-        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
+        BodyProblems,
         (status = 409, description = "`conflict`: other content is there under this name", body = Problem, content_type = "application/problem+json"),
-        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
@@ -166,9 +163,7 @@ pub(super) async fn list_learners(State(context): State<SharedContext>, paging: 
     responses(
         (status = 204, description = "It is deleted"),
         (status = 404, description = "`unknown-learner`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`: it takes no body", body = Problem, content_type = "application/problem+json"),
-        (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+        NoBodyProblems,
     ),
 )]
 pub(super) async fn delete_learner(
@@ -279,9 +274,7 @@ pub(super) async fn list_weights(
         (status = 200, description = "The weights, with every reward that was accepted before", body = WeightsBody,
             headers(("etag" = String, description = "The version in quotes"))),
         (status = 404, description = "`unknown-learner`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`: it takes no body", body = Problem, content_type = "application/problem+json"),
-        (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+        NoBodyProblems,
     ),
 )]
 pub(super) async fn learn(

@@ -21,7 +21,7 @@ use super::body::{NoForm, SentLimit, SentModel, read_model};
 use super::encoding::DecodedLimit;
 use super::paging::{List, Paging};
 use super::path::PathName;
-use super::problem::Problem;
+use super::problem::{BodyProblems, NoBodyProblems, Problem};
 use crate::service::{Caller, DefinitionReader, Etude, ModelDefinition, Registered, ServiceError};
 use crate::store::{ModelSummary, PIECE_BYTES};
 use etude_core::attribute::AttributeDocument;
@@ -114,10 +114,8 @@ struct WholeModelBody {
     responses(
         (status = 201, description = "It is new", body = ModelBody),
         (status = 200, description = "The same content was there already, under this name", body = ModelBody),
-        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
-        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
+        BodyProblems,
         (status = 409, description = "`conflict`: other content is there under this name", body = Problem, content_type = "application/problem+json"),
-        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "`unsupported-media-type`; `unsupported-encoding`: see `Accept-Encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
@@ -213,9 +211,7 @@ pub(super) async fn list_models(State(context): State<SharedContext>, paging: Pa
     responses(
         (status = 204, description = "It is deleted"),
         (status = 404, description = "`unknown-model`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`: it takes no body", body = Problem, content_type = "application/problem+json"),
-        (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
+        NoBodyProblems,
     ),
 )]
 pub(super) async fn delete_model(

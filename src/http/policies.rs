@@ -12,7 +12,7 @@ use super::answer::{json, json_text};
 use super::body::read_json;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
-use super::problem::Problem;
+use super::problem::{BodyProblems, Problem};
 use super::request_id::RequestId;
 use super::{SharedContext, answer};
 use crate::service::{BatchRequest, Caller, ServiceError};
@@ -25,11 +25,8 @@ use etude_core::mapping::{Policy, PolicySummary, RequestDocument};
     responses(
         (status = 201, description = "The policy", body = Policy,
             headers(("location" = String, description = "Where it can be read again"))),
-        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
+        BodyProblems,
         (status = 404, description = "`unknown-model`, `unknown-learner`", body = Problem, content_type = "application/problem+json"),
-        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
-        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
@@ -59,11 +56,8 @@ pub(super) async fn make_policy(
     request_body = BatchRequest,
     responses(
         (status = 200, description = "For each item its policy, or what is wrong with it", body = BatchAnswer),
-        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
+        BodyProblems,
         (status = 404, description = "`unknown-model`, `unknown-learner`", body = Problem, content_type = "application/problem+json"),
-        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
-        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),

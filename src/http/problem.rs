@@ -7,7 +7,7 @@ use axum::http::header::{ACCEPT_ENCODING, CONTENT_TYPE, RETRY_AFTER, SEC_WEBSOCK
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
-use utoipa::ToSchema;
+use utoipa::{IntoResponses, ToSchema};
 
 use super::encoding::{BodyError, Encoding};
 use super::request_id::RequestId;
@@ -120,6 +120,48 @@ pub(super) struct Problem {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     #[schema(required = false)]
     errors: Vec<Fault>,
+}
+
+/// What a request may be told whose body is read, as the description of its path lists it.
+#[derive(IntoResponses)]
+#[expect(dead_code, reason = "it only describes what a `Problem` may be")]
+pub(super) enum BodyProblems {
+    #[response(
+        status = 400,
+        description = "`malformed-json`, `incomplete-body`, `broken-encoding`",
+        content_type = "application/problem+json"
+    )]
+    Unreadable(Problem),
+    #[response(status = 408, description = "`slow-body`", content_type = "application/problem+json")]
+    Slow(Problem),
+    #[response(status = 413, description = "`too-large`", content_type = "application/problem+json")]
+    TooLarge(Problem),
+    #[response(
+        status = 415,
+        description = "`unsupported-media-type`, `unsupported-encoding`",
+        content_type = "application/problem+json"
+    )]
+    Unsupported(Problem),
+}
+
+/// What a request may be told that changes what a name stands for, and takes no body.
+#[derive(IntoResponses)]
+#[expect(dead_code, reason = "it only describes what a `Problem` may be")]
+pub(super) enum NoBodyProblems {
+    #[response(
+        status = 415,
+        description = "`unsupported-media-type`: it takes no body",
+        content_type = "application/problem+json"
+    )]
+    HasBody(Problem),
+    #[response(status = 422, description = "`invalid`: not a name", content_type = "application/problem+json")]
+    NoName(Problem),
+    #[response(
+        status = 503,
+        description = "`not-ready`, `stopping`: see `Retry-After`",
+        content_type = "application/problem+json"
+    )]
+    NotReady(Problem),
 }
 
 impl Problem {

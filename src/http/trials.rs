@@ -14,7 +14,7 @@ use super::answer::json;
 use super::body::{read_json, read_small_json};
 use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
-use super::problem::Problem;
+use super::problem::{BodyProblems, Problem};
 use super::{SharedContext, answer};
 use crate::service::{Caller, TrialAnswer};
 use crate::store::{StoreError, TrialStatus};
@@ -128,11 +128,8 @@ pub(super) struct FailureBody {
     responses(
         (status = 201, description = "The trial, with its policy", body = TrialBody,
             headers(("location" = String, description = "Where it can be read again"))),
-        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
+        BodyProblems,
         (status = 404, description = "`unknown-learner`, `unknown-model`", body = Problem, content_type = "application/problem+json"),
-        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
-        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`; also if the model lacks an attribute of the learner", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
@@ -228,12 +225,9 @@ pub(super) async fn get_trial(State(context): State<SharedContext>, PathId(id): 
     request_body = RewardBody,
     responses(
         (status = 200, description = "The reward is the trial's, now or already", body = TrialBody),
-        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
+        BodyProblems,
         (status = 404, description = "`unknown-trial`: also if its learner was deleted", body = Problem, content_type = "application/problem+json"),
-        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "`already-rewarded`: it has another reward; `trial-failed`", body = Problem, content_type = "application/problem+json"),
-        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`: among others, not finite", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
@@ -255,12 +249,9 @@ pub(super) async fn put_reward(
     request_body = FailureBody,
     responses(
         (status = 200, description = "The trial has failed, now or already for this reason", body = TrialBody),
-        (status = 400, description = "`malformed-json`, `incomplete-body`, `broken-encoding`", body = Problem, content_type = "application/problem+json"),
+        BodyProblems,
         (status = 404, description = "`unknown-trial`: also if its learner was deleted", body = Problem, content_type = "application/problem+json"),
-        (status = 408, description = "`slow-body`", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "`already-rewarded`; `trial-failed`: for another reason", body = Problem, content_type = "application/problem+json"),
-        (status = 413, description = "`too-large`", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "`unsupported-media-type`, `unsupported-encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
