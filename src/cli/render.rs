@@ -1,4 +1,4 @@
-//! Policies and caves as text.
+//! Policies, weights and caves as text. What is a table is one of comfy-table; bars and maps are drawn.
 
 use std::fmt::Write;
 

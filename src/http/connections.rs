@@ -7,6 +7,9 @@
 //! ```
 //!
 //! A connection takes its place along when it becomes a websocket.
+//!
+//! This is not hyper-util's `GracefulShutdown`, which ends all connections together: here each can also be ended alone, when it makes
+//! room for another, and all are closed at once if the future that serves them is dropped.
 
 use std::io::{self, Write};
 use std::pin::{Pin, pin};

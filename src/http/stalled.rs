@@ -1,4 +1,4 @@
-//! Writing to whoever may not read.
+//! Writing to a client that may not read.
 
 use std::io::{self, IoSlice};
 use std::pin::Pin;
@@ -22,15 +22,17 @@ pub(super) trait Watcher: Unpin {
 pub(super) struct Stalled<S, W> {
     socket: S,
     watcher: W,
-    patience: Duration,
+    /// How long nothing may be read before the socket fails, besides what the watcher adds.
+    timeout: Duration,
+    /// Whether what was to be written last found no room.
     is_waiting: bool,
     /// Made when it is first needed, as most answers go at once.
     alarm: Option<Pin<Box<Sleep>>>,
 }
 
 impl<S, W: Watcher> Stalled<S, W> {
-    pub(super) fn new(socket: S, patience: Duration, watcher: W) -> Self {
-        Self { socket, watcher, patience, is_waiting: false, alarm: None }
+    pub(super) fn new(socket: S, timeout: Duration, watcher: W) -> Self {
+        Self { socket, watcher, timeout, is_waiting: false, alarm: None }
     }
 
     fn watch(&mut self, cx: &mut Context<'_>, written: Poll<io::Result<usize>>) -> Poll<io::Result<usize>> {
@@ -44,7 +46,7 @@ impl<S, W: Watcher> Stalled<S, W> {
         if !self.is_waiting {
             self.is_waiting = true;
             self.watcher.is_writing(true);
-            let deadline = Instant::now() + self.patience + self.watcher.grace();
+            let deadline = Instant::now() + self.timeout + self.watcher.grace();
             match &mut self.alarm {
                 Some(alarm) => alarm.as_mut().reset(deadline),
                 None => self.alarm = Some(Box::pin(tokio::time::sleep_until(deadline))),
@@ -114,13 +116,13 @@ mod tests {
 
     type Written = Stalled<DuplexStream, Rc<Cell<bool>>>;
 
-    const PATIENCE: Duration = Duration::from_secs(10);
+    const TIMEOUT: Duration = Duration::from_secs(10);
 
     /// An end that is written to, of a way that holds four bytes, the end that is read, and whether writing waits.
     fn way() -> (Written, DuplexStream, Rc<Cell<bool>>) {
         let (written, read) = duplex(4);
         let is_writing = Rc::default();
-        (Stalled::new(written, PATIENCE, Rc::clone(&is_writing)), read, is_writing)
+        (Stalled::new(written, TIMEOUT, Rc::clone(&is_writing)), read, is_writing)
     }
 
     #[tokio::test(start_paused = true)]
@@ -128,7 +130,7 @@ mod tests {
         let (mut written, read, is_writing) = way();
         let started = Instant::now();
         let error = written.write_all(b"hello").await.unwrap_err();
-        assert_eq!((error.kind(), started.elapsed()), (io::ErrorKind::TimedOut, PATIENCE));
+        assert_eq!((error.kind(), started.elapsed()), (io::ErrorKind::TimedOut, TIMEOUT));
         assert!(is_writing.get());
         drop(read);
     }
@@ -143,7 +145,7 @@ mod tests {
         let reading = async {
             let mut bytes = [0; 12];
             for byte in &mut bytes {
-                tokio::time::sleep(PATIENCE * 9 / 10).await;
+                tokio::time::sleep(TIMEOUT * 9 / 10).await;
                 *byte = read.read_u8().await.unwrap();
             }
             bytes
@@ -159,10 +161,10 @@ mod tests {
         let mut bytes = [0; 4];
         for _ in 0..3 {
             written.write_all(b"four").await.unwrap();
-            tokio::time::sleep(PATIENCE).await;
+            tokio::time::sleep(TIMEOUT).await;
             // It waits for room, which is made just in time.
             assert!(written.write_u8(b'!').now_or_never().is_none() && is_writing.get());
-            tokio::time::sleep(PATIENCE / 2).await;
+            tokio::time::sleep(TIMEOUT / 2).await;
             read.read_exact(&mut bytes).await.unwrap();
             written.write_all(b"room").await.unwrap();
             read.read_exact(&mut bytes).await.unwrap();

@@ -1,4 +1,7 @@
 //! Bytes on their way from an asynchronous task to a thread that reads them.
+//!
+//! This is not tokio-util's `SyncIoBridge`, by which the thread would own the body: here the task keeps it, measures how fast it comes,
+//! and throws the rest away once the reader has ended. A reader whose writer is gone fails, and takes what came for no whole.
 
 use std::io::{self, BufRead, Read};
 

@@ -17,7 +17,7 @@ use super::Failure;
 use crate::worlds::World;
 
 /// How long a client goes on trying.
-const PATIENCE: Duration = Duration::from_secs(30);
+const TIMEOUT: Duration = Duration::from_secs(30);
 
 /// When it tries again where it is not told.
 const PAUSE: Duration = Duration::from_secs(1);
@@ -137,8 +137,8 @@ impl Honest {
                 }
             }
         };
-        let asked = timeout(PATIENCE, asking).await;
-        asked.unwrap_or_else(|_| Err(format!("in {} s, last: {last}", PATIENCE.as_secs())))
+        let asked = timeout(TIMEOUT, asking).await;
+        asked.unwrap_or_else(|_| Err(format!("in {} s, last: {last}", TIMEOUT.as_secs())))
     }
 
     pub(crate) fn told(&self) -> MutexGuard<'_, BTreeMap<(Kind, String), u64>> {

@@ -23,7 +23,7 @@ use crate::stream::{Limits, Rooms};
 use etude_core::model::Format;
 
 /// Longer than anything here takes; a test that waits for this fails.
-const PATIENCE: Duration = Duration::from_secs(30);
+const TIMEOUT: Duration = Duration::from_secs(30);
 
 #[derive(Parser)]
 struct Flags {
@@ -83,7 +83,7 @@ async fn pongs_that_are_not_read_do_not_pile_up() {
         assert!(String::from_utf8_lossy(&all).contains("malformed-json"));
         all.len()
     });
-    let n_read = tokio::time::timeout(PATIENCE, n_read).await.unwrap();
+    let n_read = tokio::time::timeout(TIMEOUT, n_read).await.unwrap();
     let most = websocket::MAX_WRITE_BUFFER_BYTES + 4096;
     assert!(n_read <= most, "{n_read} of the {} bytes of all pongs were kept", 127 * N_PINGS);
     etude.close().await;
@@ -122,7 +122,7 @@ async fn a_large_frame_takes_its_memory_before_it_comes_and_leaves_nothing_of_it
         io.read_to_end(&mut all).await.unwrap();
         assert!(String::from_utf8_lossy(&all).contains("not-allowed"), "{}", String::from_utf8_lossy(&all));
     });
-    tokio::time::timeout(PATIENCE, spoken).await.unwrap();
+    tokio::time::timeout(TIMEOUT, spoken).await.unwrap();
     assert_eq!(taken(), 0);
     etude.close().await;
 }
@@ -185,7 +185,7 @@ async fn a_websocket_hears_of_large_frames_in_pieces_and_of_all_else_as_it_came(
             let mut all = Vec::new();
             answers.read_to_end(&mut all).await.unwrap();
         };
-        let sending = async { tokio::time::timeout(PATIENCE, sending).await };
+        let sending = async { tokio::time::timeout(TIMEOUT, sending).await };
         let came = tokio::select! { came = reading => came, _ = sending => panic!("it reads to the end") };
         let text = str::from_utf8(&large).unwrap();
         let ping = |text: &'static str| Message::Ping(text.into());
@@ -306,7 +306,7 @@ async fn what_websockets_do_not_allow_closes_them_with_1002_and_text_that_is_non
                 }
             }
         });
-        let (frames, code) = tokio::time::timeout(PATIENCE, told).await.unwrap();
+        let (frames, code) = tokio::time::timeout(TIMEOUT, told).await.unwrap();
         assert_eq!(code, expected, "{what}: {frames:?}");
         let kind = if code == 1002 { "/problems/bad-frame" } else { "/problems/malformed-json" };
         assert_eq!(frames.last().unwrap()["problem"]["type"], kind, "{what}");
@@ -323,7 +323,7 @@ async fn what_websockets_do_not_allow_closes_them_with_1002_and_text_that_is_non
             }
         }
     });
-    assert_eq!(tokio::time::timeout(PATIENCE, code).await.unwrap(), 1002);
+    assert_eq!(tokio::time::timeout(TIMEOUT, code).await.unwrap(), 1002);
     etude.close().await;
 }
 
@@ -336,7 +336,7 @@ async fn a_client_that_vanishes_is_not_told_of_a_violation() {
         io.read_to_end(&mut all).await.unwrap();
         assert!(!String::from_utf8_lossy(&all).contains("error"), "{}", String::from_utf8_lossy(&all));
     });
-    tokio::time::timeout(PATIENCE, vanished).await.unwrap();
+    tokio::time::timeout(TIMEOUT, vanished).await.unwrap();
     etude.close().await;
 }
 
@@ -360,7 +360,7 @@ async fn who_sends_lines_without_end_and_reads_none_is_let_go_and_gives_its_memo
     let (lines, mut answer) = mpsc::channel(1);
     let stopping = CancellationToken::new();
     let serving = Box::pin(ndjson::serve(&etude, Client::LOCAL, limits, body, lines, &room, &stopping));
-    tokio::time::timeout(PATIENCE, serving).await.unwrap();
+    tokio::time::timeout(TIMEOUT, serving).await.unwrap();
     drop(room);
     assert_eq!(etude.memory().free(), free);
     assert!(answer.recv().await.is_some_and(|line| line.unwrap().starts_with(b"{\"type\":\"hello\"")));
