@@ -9,6 +9,7 @@
 //!
 //! This file is longer than 400 lines because contenders that are compared are read side by side.
 
+#![expect(clippy::disallowed_methods, reason = "a benchmark measures by the system's clock")]
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
 
 #[path = "worlds/mod.rs"]

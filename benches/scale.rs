@@ -7,6 +7,7 @@
 //! share the machine: the time to generate and compress alone is given for comparison. A second process reads and compiles the same
 //! model by itself, step by step, to tell where time and memory go.
 
+#![expect(clippy::disallowed_methods, reason = "a benchmark measures by the system's clock")]
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
 
 use std::io::{self, BufRead, BufReader, Write};

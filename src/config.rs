@@ -8,6 +8,7 @@ use std::time::Duration;
 use axum::http::HeaderValue;
 use clap::Args;
 
+use crate::clock::{Clock, Ids};
 use crate::http::{self, ConnectionLimits};
 use crate::memory::{self, Memory};
 use crate::service::{PoolSettings, Settings, TimeLimits};
@@ -105,9 +106,9 @@ pub struct ServeConfig {
 }
 
 impl ServeConfig {
-    /// The settings of the application.
+    /// The settings of an application that goes by `clock` and makes `ids`.
     #[must_use]
-    pub fn settings(&self) -> Settings {
+    pub fn settings(&self, clock: Clock, ids: Ids) -> Settings {
         let n_cores = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
         let max_memory = self.max_memory.unwrap_or_else(memory::default_max_bytes);
         let memory = Memory::new(max_memory);
@@ -120,6 +121,8 @@ impl ServeConfig {
                 ..model::Limits::DEFAULT
             },
             memory,
+            clock,
+            ids,
             model_cache_bytes: self.model_cache_bytes.unwrap_or(MAX_MODEL_CACHE_BYTES.min(max_memory / 4)),
             session_idle_timeout: self.session_idle_timeout,
             time_limits: TimeLimits {

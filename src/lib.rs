@@ -37,6 +37,8 @@
 //! compact arrays, with all faults), [`etude_core::model::Model::compile`], and `store::definitions` (its canonical text, in pieces if it
 //! is long) before `store::writer` makes it visible.
 //!
+//! What time it is, and new ids, come from a [`clock`] that the server hands in.
+//!
 //! What is large takes its memory from [`memory`] before it begins, and whose turn it is to use a thread is told by `service::pool`. A
 //! model that is not at hand is made ready by `service::compiler`, once, however many ask for it.
 //!
@@ -45,6 +47,7 @@
 //! version of the weights.
 
 pub mod cli;
+pub mod clock;
 pub mod config;
 pub mod experiment;
 pub mod http;

@@ -9,13 +9,13 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::Timestamp;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::net::TcpListener;
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use crate::clock::{Clock, Ids};
 use crate::config::ServeConfig;
 use crate::http::{self, Access, ConnectionLimits, Context};
 use crate::memory::Memory;
@@ -82,8 +82,10 @@ impl Server {
         let (tasks, stopping, abort) = (TaskTracker::new(), CancellationToken::new(), CancellationToken::new());
         let metrics = telemetry::measurements()?;
         let not_usable = |source| ServerError::Store { database: config.database.display().to_string(), source };
-        let etude = Etude::open(&config.settings(), &tasks, abort.clone()).await.map_err(not_usable)?;
-        etude.begin(Timestamp::now()).await.map_err(not_usable)?;
+        let etude = Etude::open(&config.settings(Clock::system(), Ids::random()), &tasks, abort.clone())
+            .await
+            .map_err(not_usable)?;
+        etude.begin(etude.clock().now()).await.map_err(not_usable)?;
         let listen = |source| ServerError::Listen { listen: config.listen, source };
         let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
@@ -163,7 +165,7 @@ impl Server {
         }
         abort.cancel();
         stopping.cancel();
-        let noted = tokio::time::timeout(ABORT_GRACE, etude.note_alive(Timestamp::now())).await;
+        let noted = tokio::time::timeout(ABORT_GRACE, etude.note_alive(etude.clock().now())).await;
         if !matches!(noted, Ok(Ok(()))) {
             tracing::warn!("when the service ended could not be noted");
         }

@@ -5,6 +5,7 @@
 //! one thread of low priority, and the machine, with them. An argument that is a number says for how many seconds the attack goes on, 300
 //! if there is none; others are the attacks that there are to be, by their names, all if there are none.
 
+#![expect(clippy::disallowed_methods, reason = "a benchmark measures by the system's clock")]
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
 
 mod outside;

@@ -7,6 +7,7 @@
 //! the least and the most. What takes seconds is solved once. All solvers must come to the same cost, but for the paper's heuristic,
 //! which may cost more.
 
+#![expect(clippy::disallowed_methods, reason = "a benchmark measures by the system's clock")]
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
 #![expect(clippy::cast_precision_loss, reason = "counts and costs here are far below 2^52")]
 

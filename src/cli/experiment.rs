@@ -9,10 +9,10 @@ use clap::{Args, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 use tokio::runtime::Runtime;
-use uuid::Uuid;
 
 use super::client::Client;
 use super::{CliError, runtime};
+use crate::clock::Ids;
 use crate::experiment::{self, Attempt, CurvePlan, Followed, Laboratory, LearnerId, Local, LocalError, Scene, plot};
 use etude_core::learning::LearnerDocument;
 
@@ -149,7 +149,7 @@ impl Laboratory for Remote {
     type Error = CliError;
 
     fn start_learner(&mut self, definition: &LearnerDocument) -> Result<LearnerId, CliError> {
-        let name = format!("experiment-{}", Uuid::now_v7());
+        let name = format!("experiment-{}", Ids::random().next());
         let path = format!("/v1/learners/{name}");
         let _: Value = self.runtime.block_on(self.client.put(&path, definition))?;
         Ok(LearnerId(name))

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use clap::{Args, Subcommand};
-use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use tokio_util::sync::CancellationToken;
@@ -15,6 +14,7 @@ use tokio_util::task::TaskTracker;
 use super::client::Client;
 use super::map::read_json;
 use super::{CliError, runtime};
+use crate::clock::{Clock, Ids};
 use crate::memory::{self, Memory};
 use crate::service::{Etude, Name, PoolSettings, Replay, Settings, TimeLimits};
 use etude_core::document::{Faults, Place};
@@ -165,7 +165,7 @@ async fn import(name: &str, definition: &LearnerDocument, place: &Location) -> R
     }
     let text = definition.text();
     with_database(&place.database, Use::Write, async |etude| {
-        etude.put_learner(&name, text.as_bytes(), Timestamp::now()).await?;
+        etude.put_learner(&name, text.as_bytes(), etude.clock().now()).await?;
         Ok(())
     })
     .await
@@ -220,6 +220,8 @@ async fn with_database<T>(
         pool: PoolSettings { n_threads: 1, max_waiting: 0, max_long: 1 },
         session_idle_timeout: Duration::MAX,
         time_limits: TimeLimits::DEFAULT,
+        clock: Clock::system(),
+        ids: Ids::random(),
     };
     let tasks = TaskTracker::new();
     let etude = match usage {

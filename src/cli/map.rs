@@ -5,12 +5,13 @@ use std::io::{self, Read, Write};
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use serde_json::{Map as Members, Value, json};
 
 use super::{CliError, render};
+use crate::clock::Clock;
 use crate::service::hash_of;
 use etude_core::document::{self, Faults, Place};
 use etude_core::interrupt::{Interrupted, Signal, Uninterrupted, time_until_finish};
@@ -69,9 +70,10 @@ impl Map {
         let what = format!("the request made of {}", self.demonstration.display());
         let asked = faults.check(read).map_err(|faults| CliError::Faults { what, faults })?;
 
-        let started = Instant::now();
+        let clock = Clock::system();
+        let started = clock.instant();
         let mut interrupt = || match asked.deadline.map(time_until_finish) {
-            Some(deadline) if started.elapsed() >= deadline => Signal::Finish,
+            Some(deadline) if clock.elapsed(started) >= deadline => Signal::Finish,
             _ => Signal::Continue,
         };
         let mapping = asked.solve(&mapper, &mut interrupt)?;
@@ -80,7 +82,7 @@ impl Map {
             model: request["model"].as_str().unwrap_or_default().to_owned(),
             model_hash: hash_of(&definition.text()),
             lookahead: asked.lookahead.map(NonZeroU32::get),
-            elapsed_us: as_micros(started.elapsed()),
+            elapsed_us: as_micros(clock.elapsed(started)),
             ..Stamp::default()
         };
         let policy = Policy::new(stamp, &asked.problem, &mapping);

@@ -14,6 +14,7 @@ use serde::Serialize;
 use tokio::time::Instant;
 
 use super::problem::Problem;
+use crate::clock::timer_now;
 use crate::memory::{self, Held, Memory, NoRoom};
 use crate::service::ServiceError;
 
@@ -154,7 +155,7 @@ impl HttpBody for Paced {
         }
         let piece = this.rest.split_to(this.rest.len().min(UNCOUNTED_BYTES));
         this.n_given += piece.len() as u64;
-        this.given_at = Some(Instant::now());
+        this.given_at = Some(timer_now());
         Poll::Ready(Some(Ok(Frame::data(piece))))
     }
 
@@ -225,7 +226,7 @@ mod tests {
 
     /// Reads an answer, a piece after each `pause`. Gives what was read of it, and for how long.
     async fn read(body: Body, pause: Duration) -> (usize, Duration, bool) {
-        let (mut pieces, started, mut n_read) = (body.into_data_stream(), Instant::now(), 0);
+        let (mut pieces, started, mut n_read) = (body.into_data_stream(), timer_now(), 0);
         while let Some(piece) = pieces.next().await {
             let Ok(piece) = piece else { return (n_read, started.elapsed(), false) };
             n_read += piece.len();

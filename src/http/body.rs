@@ -13,12 +13,12 @@ use axum::http::HeaderMap;
 use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, EXPECT, TRANSFER_ENCODING};
 use axum::http::request::Parts;
 use futures_util::StreamExt;
-use tokio::time::Instant;
 
 use super::Context;
 use super::collected::Collected;
 use super::encoding::{BodyError, DecodedLimit, Encoding};
 use super::problem::{Problem, ProblemKind};
+use crate::clock::timer_now;
 use crate::memory::Held;
 use crate::service::{Client, ModelText, OpenText, PipeWriter, ServiceError, pipe};
 use etude_core::document::Quoted;
@@ -180,7 +180,7 @@ impl Arriving {
     async fn next(&mut self) -> Option<Result<Bytes, BodyError>> {
         let allowed = BODY_TIMEOUT + Duration::from_secs(self.n_bytes as u64 / MIN_BYTES_PER_S);
         // Only the client's time counts, not that of whoever asks.
-        let asked = Instant::now();
+        let asked = timer_now();
         let next = tokio::time::timeout(allowed.saturating_sub(self.waited), self.stream.next()).await;
         self.waited += asked.elapsed();
         Some(match next {
@@ -351,7 +351,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn a_body_that_comes_too_slowly_is_not_waited_for() {
-        let started = Instant::now();
+        let started = timer_now();
         let mut body = Arriving::new(trickling(1, Duration::from_secs(1)), LIMIT);
         let error = loop {
             if let Err(error) = body.next().await.unwrap() {
@@ -373,7 +373,7 @@ mod tests {
 
     #[tokio::test(start_paused = true)]
     async fn what_is_not_wanted_is_read_for_a_while_only() {
-        let started = Instant::now();
+        let started = timer_now();
         throw_away(trickling(1, Duration::from_secs(1)), 1 << 20).await;
         assert_eq!(started.elapsed(), DISCARD_TIMEOUT);
         throw_away(trickling(1 << 20, Duration::from_millis(1)), 1 << 20).await;

@@ -1,20 +1,19 @@
 //! Who sent a request.
 
 use std::convert::Infallible;
-use std::time::Instant;
 
+use super::SharedContext;
+use crate::service::{Caller, Client};
 use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
-use jiff::Timestamp;
-
-use crate::service::{Caller, Client};
 
 /// The client is known by its connection, which notes it with each request.
-impl<S: Send + Sync> FromRequestParts<S> for Caller {
+impl FromRequestParts<SharedContext> for Caller {
     type Rejection = Infallible;
 
-    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
+    async fn from_request_parts(parts: &mut Parts, context: &SharedContext) -> Result<Self, Infallible> {
         let client = parts.extensions.get::<Client>().copied().unwrap_or(Client::LOCAL);
-        Ok(Self { client, arrived: Instant::now(), now: Timestamp::now() })
+        let clock = context.etude.clock();
+        Ok(Self { client, arrived: clock.instant(), now: clock.now() })
     }
 }

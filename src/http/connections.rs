@@ -38,6 +38,7 @@ use super::answer::UNCOUNTED_BYTES;
 use super::places::{Activity, Busy, Place, Places};
 use super::problem::{Problem, ProblemKind};
 use super::stalled::Stalled;
+use crate::clock::timer_now;
 use crate::service::{self, Client};
 
 /// How much a connection may read ahead, also of a request's head: held by each, and not counted.
@@ -290,7 +291,7 @@ impl Tally {
         if let Some(logged_at) = self.logged_at {
             tokio::time::sleep_until(logged_at + LOG_EVERY).await;
         }
-        self.logged_at = Some(Instant::now());
+        self.logged_at = Some(timer_now());
         std::mem::take(&mut self.n_unlogged)
     }
 }
@@ -307,7 +308,7 @@ mod tests {
         assert!(poll!(pin!(tally.due())).is_pending());
         tally.note();
         assert_eq!(tally.due().await, 1);
-        let first = Instant::now();
+        let first = timer_now();
         for _ in 0..1000 {
             tally.note();
         }

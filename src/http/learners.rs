@@ -117,7 +117,7 @@ pub(super) async fn put_learner(
     request: Request,
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
-    let (registered, answer) = context.etude.put_learner(&name, &body, Timestamp::now()).await?;
+    let (registered, answer) = context.etude.put_learner(&name, &body, context.etude.clock().now()).await?;
     let status = match registered {
         Registered::New => StatusCode::CREATED,
         Registered::Already => StatusCode::OK,
@@ -282,7 +282,7 @@ pub(super) async fn learn(
     PathName(name): PathName,
     _: NoForm,
 ) -> Result<Response, Problem> {
-    let answer = context.etude.learn(name.as_str(), Timestamp::now()).await?;
+    let answer = context.etude.learn(name.as_str(), context.etude.clock().now()).await?;
     let tag = format!("\"{}\"", answer.version);
     Ok(with_tag(json(StatusCode::OK, &WeightsBody::from(answer)), &tag))
 }

@@ -22,16 +22,18 @@ use super::answer;
 use super::body::refuse;
 use super::problem::{Problem, ProblemKind};
 use super::request_id::{REQUEST_ID, RequestId, request_id};
+use crate::clock::Clock;
 
 /// Gives the request an id, lets it in or not, logs and measures it, turns panics into problems and problems into documents.
 pub(super) async fn observe(State(context): State<SharedContext>, mut request: Request, next: Next) -> Response {
-    let id = request_id(request.headers());
+    let id = request_id(request.headers(), context.etude.ids());
     request.extensions_mut().insert(RequestId(Arc::clone(&id)));
     let route: Arc<str> = request.extensions().get::<MatchedPath>().map_or("(none)", MatchedPath::as_str).into();
     let is_probe = matches!(&*route, "/livez" | "/readyz" | "/metrics");
     let method = request.method().clone();
     let span = tracing::info_span!("request", request_id = %id, %method, path = request.uri().path());
-    let mut unanswered = Unanswered { span: span.clone(), started: Instant::now(), is_answered: false };
+    let clock = context.etude.clock().clone();
+    let mut unanswered = Unanswered { span: span.clone(), started: clock.instant(), clock, is_answered: false };
 
     let let_in = context.access.check(&method, request.uri(), request.headers());
     let answering = async {
@@ -67,7 +69,7 @@ pub(super) async fn observe(State(context): State<SharedContext>, mut request: R
     }
 
     unanswered.is_answered = true;
-    let elapsed = unanswered.started.elapsed();
+    let elapsed = unanswered.clock.elapsed(unanswered.started);
     let status = response.status().as_u16();
     measure(method_label(&method), &route, response.status(), elapsed);
     let elapsed_us = u64::try_from(elapsed.as_micros()).unwrap_or(u64::MAX);
@@ -122,6 +124,7 @@ fn panic_message(panic: &(dyn Any + Send)) -> &str {
 /// Logs, when it is dropped, that the client went away before its answer.
 struct Unanswered {
     span: Span,
+    clock: Clock,
     started: Instant,
     is_answered: bool,
 }
@@ -129,7 +132,7 @@ struct Unanswered {
 impl Drop for Unanswered {
     fn drop(&mut self) {
         if !self.is_answered {
-            let elapsed_us = u64::try_from(self.started.elapsed().as_micros()).unwrap_or(u64::MAX);
+            let elapsed_us = u64::try_from(self.clock.elapsed(self.started).as_micros()).unwrap_or(u64::MAX);
             self.span.in_scope(|| tracing::info!(elapsed_us, "the client went away"));
             metrics::counter!("etude_http_requests_abandoned_total").increment(1);
         }

@@ -6,7 +6,6 @@ use axum::Router;
 use axum::extract::State;
 use axum::http::header::CONTENT_TYPE;
 use axum::response::IntoResponse;
-use jiff::Timestamp;
 use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use super::SharedContext;
@@ -35,7 +34,7 @@ pub(super) async fn readyz(State(context): State<SharedContext>) -> Result<&'sta
     if context.stopping.is_cancelled() {
         return Err(Problem::new(ProblemKind::Stopping, "the service is shutting down"));
     }
-    context.etude.check(Timestamp::now()).await.map_err(|error| {
+    context.etude.check().await.map_err(|error| {
         tracing::warn!(error = &error as &dyn std::error::Error, "not ready");
         match error {
             StoreError::Unavailable(_) => error.into(),

@@ -10,6 +10,7 @@ use tokio::sync::oneshot;
 use tokio::time::Instant;
 
 use super::stalled::Watcher;
+use crate::clock::timer_now;
 use crate::service::Client;
 
 /// Connections among which one that makes room is looked for: what a newcomer may cost when all places are taken.
@@ -53,7 +54,7 @@ struct Taken {
 impl Places {
     /// `max` places, of which one client may have three quarters.
     pub(super) fn new(max: usize) -> Self {
-        Self { table: Mutex::default(), max, max_each: (max - max / 4).max(1), opened: Instant::now() }
+        Self { table: Mutex::default(), max, max_each: (max - max / 4).max(1), opened: timer_now() }
     }
 
     /// A place for a connection of `client`, and what hears of its end; `None` if all are taken and nobody makes room. Who has

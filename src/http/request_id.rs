@@ -5,6 +5,8 @@ use std::sync::Arc;
 use axum::http::{HeaderMap, HeaderName};
 use uuid::Uuid;
 
+use crate::clock::Ids;
+
 /// The header that carries it, in both directions.
 pub(super) const REQUEST_ID: HeaderName = HeaderName::from_static("x-request-id");
 
@@ -16,7 +18,7 @@ const MAX_REQUEST_ID_BYTES: usize = 64;
 pub(super) struct RequestId(pub(super) Arc<str>);
 
 /// Takes the client's id if it is short and plain, else makes one.
-pub(super) fn request_id(headers: &HeaderMap) -> Arc<str> {
+pub(super) fn request_id(headers: &HeaderMap, ids: &Ids) -> Arc<str> {
     let is_plain = |id: &&str| {
         (1..=MAX_REQUEST_ID_BYTES).contains(&id.len())
             && id.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._-".contains(&byte))
@@ -24,6 +26,6 @@ pub(super) fn request_id(headers: &HeaderMap) -> Arc<str> {
     let given = headers.get(REQUEST_ID).and_then(|id| id.to_str().ok()).filter(is_plain);
     match given {
         Some(given) => given.into(),
-        None => Arc::from(&*Uuid::now_v7().hyphenated().encode_lower(&mut Uuid::encode_buffer())),
+        None => Arc::from(&*ids.next().hyphenated().encode_lower(&mut Uuid::encode_buffer())),
     }
 }

@@ -5,8 +5,9 @@ use std::pin::Pin;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
+use crate::clock::timer_now;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
-use tokio::time::{Instant, Sleep};
+use tokio::time::Sleep;
 
 /// What is told when writing begins to wait, and when it goes on.
 pub(super) trait Watcher: Unpin {
@@ -46,7 +47,7 @@ impl<S, W: Watcher> Stalled<S, W> {
         if !self.is_waiting {
             self.is_waiting = true;
             self.watcher.is_writing(true);
-            let deadline = Instant::now() + self.timeout + self.watcher.grace();
+            let deadline = timer_now() + self.timeout + self.watcher.grace();
             match &mut self.alarm {
                 Some(alarm) => alarm.as_mut().reset(deadline),
                 None => self.alarm = Some(Box::pin(tokio::time::sleep_until(deadline))),
@@ -128,7 +129,7 @@ mod tests {
     #[tokio::test(start_paused = true)]
     async fn what_nobody_reads_is_not_written_for_ever() {
         let (mut written, read, is_writing) = way();
-        let started = Instant::now();
+        let started = timer_now();
         let error = written.write_all(b"hello").await.unwrap_err();
         assert_eq!((error.kind(), started.elapsed()), (io::ErrorKind::TimedOut, TIMEOUT));
         assert!(is_writing.get());

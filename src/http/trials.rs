@@ -198,7 +198,7 @@ pub(super) async fn list_trials(
     TrialsQuery(which, paging): TrialsQuery,
 ) -> Result<Response, Problem> {
     let after = paging.after_number()?.unwrap_or(0);
-    let page = context.etude.trials(&name, which.status, Timestamp::now(), after, paging.limit).await?;
+    let page = context.etude.trials(&name, which.status, context.etude.clock().now(), after, paging.limit).await?;
     let page = page.try_map(|answer| &answer.row.id, TrialBody::of)?;
     Ok(json(StatusCode::OK, &List::of(page, |trial| trial)))
 }
@@ -213,7 +213,7 @@ pub(super) async fn list_trials(
     ),
 )]
 pub(super) async fn get_trial(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
-    let mut trial = context.etude.trial(&id, Timestamp::now()).await?;
+    let mut trial = context.etude.trial(&id, context.etude.clock().now()).await?;
     let held = trial.held.take();
     Ok(answer::counted(json(StatusCode::OK, &TrialBody::of(trial)?), held))
 }
@@ -238,7 +238,7 @@ pub(super) async fn put_reward(
     request: Request,
 ) -> Result<Response, Problem> {
     let body = read_small_json(request, &context).await?;
-    let trial = context.etude.reward_trial(&id, &body, Timestamp::now()).await?;
+    let trial = context.etude.reward_trial(&id, &body, context.etude.clock().now()).await?;
     Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
 }
 
@@ -262,6 +262,6 @@ pub(super) async fn fail_trial(
     request: Request,
 ) -> Result<Response, Problem> {
     let body = read_small_json(request, &context).await?;
-    let trial = context.etude.fail_trial(&id, &body, Timestamp::now()).await?;
+    let trial = context.etude.fail_trial(&id, &body, context.etude.clock().now()).await?;
     Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
 }

@@ -23,6 +23,7 @@ use super::hash::hex;
 use super::models::{DefinitionReader, ModelText, check_hash, corrupt_definition, unknown};
 use super::pool::Admission;
 use super::{Client, Etude, PipeWriter, PoolError, SearchPool, ServiceError, Settings, pipe};
+use crate::clock::Clock;
 use crate::memory::{Held, Memory, NoRoom};
 use crate::store::{ModelKey, ModelSize, ModelSummary, Store, StoreError, StoredDefinition};
 use etude_core::document::Faults;
@@ -35,6 +36,7 @@ use etude_core::model::{Definition, Format, Limits, Model, ReadError};
 pub(super) struct Compiler {
     store: Arc<Store>,
     pool: SearchPool,
+    clock: Clock,
     pub(super) cache: Arc<MapperCache>,
     memory: Memory,
     max_time: Duration,
@@ -63,6 +65,7 @@ impl Compiler {
         Self {
             store,
             pool,
+            clock: settings.clock.clone(),
             cache: Arc::new(MapperCache::new(settings.model_cache_bytes)),
             memory: settings.memory.clone(),
             max_time: settings.time_limits.compile,
@@ -108,7 +111,7 @@ impl Compiler {
         /// What was taken is a good guess, not more.
         const SLACK_BYTES: u64 = 16 << 20;
         let max_bytes = usize::try_from(held.n_bytes() + SLACK_BYTES).unwrap_or(usize::MAX);
-        let mut limited = LimitedTime::new(interrupt, self.max_time);
+        let mut limited = LimitedTime::new(interrupt, self.max_time, self.clock.clone());
         let model = Model::compile(&definition, limits, &mut limited)?;
         drop(definition);
         let mapper = Mapper::within(model, max_bytes, &mut limited)?;
@@ -252,21 +255,22 @@ async fn feed(store: &Store, mut pieces: DefinitionReader, to_reader: PipeWriter
 /// Ends what takes too long, not counting the time in which it makes way for others.
 pub(super) struct LimitedTime<'i> {
     inner: &'i mut dyn Interrupt,
+    clock: Clock,
     left: Duration,
     last: Instant,
 }
 
 impl<'i> LimitedTime<'i> {
-    pub(super) fn new(inner: &'i mut dyn Interrupt, max_time: Duration) -> Self {
-        Self { inner, left: max_time, last: Instant::now() }
+    pub(super) fn new(inner: &'i mut dyn Interrupt, max_time: Duration, clock: Clock) -> Self {
+        Self { inner, left: max_time, last: clock.instant(), clock }
     }
 }
 
 impl Interrupt for LimitedTime<'_> {
     fn poll(&mut self) -> Signal {
-        self.left = self.left.saturating_sub(self.last.elapsed());
+        self.left = self.left.saturating_sub(self.clock.elapsed(self.last));
         let signal = self.inner.poll();
-        self.last = Instant::now();
+        self.last = self.clock.instant();
         if signal == Signal::Continue && self.left.is_zero() { Signal::Finish } else { signal }
     }
 }
@@ -338,6 +342,8 @@ mod tests {
             model_cache_bytes: 1 << 20,
             session_idle_timeout: Duration::MAX,
             time_limits: TimeLimits::DEFAULT,
+            clock: Clock::system(),
+            ids: crate::clock::Ids::random(),
             pool: PoolSettings { n_threads: 1, max_waiting: 100, max_long: 1 },
         }
     }
@@ -347,7 +353,8 @@ mod tests {
         let settings = settings(directory);
         let mut etude = Etude::open(&settings, tasks, CancellationToken::new()).await.unwrap();
         let world = ModelText::Whole(br#"{"dynamics": {"kind": "wumpus", "width": 4, "height": 4}}"#.to_vec());
-        let caller = Caller { client: Client::LOCAL, arrived: Instant::now(), now: jiff::Timestamp::UNIX_EPOCH };
+        let caller =
+            Caller { client: Client::LOCAL, arrived: Clock::system().instant(), now: jiff::Timestamp::UNIX_EPOCH };
         etude.put_model(&Name::new("world").unwrap(), world, Format::Json, caller).await.unwrap();
         etude.compiler.cache = Arc::new(MapperCache::new(settings.model_cache_bytes));
         etude
@@ -382,7 +389,7 @@ mod tests {
         let before = (tasks.len(), etude.pool().n_jobs());
         let mut others = Vec::new();
         for _ in 0..50 {
-            let deadline = Some(Instant::now());
+            let deadline = Some(Clock::system().instant());
             let place = etude.pool().admit_when_needed(Client::LOCAL).with_patience(deadline);
             let left = etude.mapper("world", "/model", Some(&place), deadline).await;
             assert!(matches!(left, Err(ServiceError::Compiling { .. })), "{left:?}");

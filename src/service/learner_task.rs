@@ -29,7 +29,7 @@ impl Etude {
                 _ = ticks.tick() => {}
                 () = stopping.cancelled() => return,
             }
-            match self.learn_all(Timestamp::now()).await {
+            match self.learn_all(self.clock.now()).await {
                 // The writer has told of it, once.
                 Ok(()) | Err(ServiceError::Store(StoreError::Unavailable(_))) => {}
                 Err(error) => tracing::error!(error = &error as &dyn std::error::Error, "learning failed"),

@@ -8,6 +8,7 @@
 //!
 //! Everything that is spawned is tracked, and ends with [`Etude::close`].
 
+#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod batch;
 mod cache;
 mod caller;
@@ -21,10 +22,13 @@ mod opening;
 mod outline;
 mod owners;
 mod pipe;
+#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod policies;
 mod pool;
+#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod refiner;
 mod sessions;
+#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod trials;
 
 use std::path::PathBuf;
@@ -48,6 +52,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 pub use trials::TrialAnswer;
 
+use crate::clock::{Clock, Ids};
 use crate::memory::{Memory, NoRoom};
 use crate::store::{Store, StoreError};
 use cache::ModelNames;
@@ -76,6 +81,10 @@ pub struct Settings {
     pub memory: Memory,
     /// How long things may take.
     pub time_limits: TimeLimits,
+    /// What time it is.
+    pub clock: Clock,
+    /// Where ids come from.
+    pub ids: Ids,
 }
 
 #[cfg(test)]
@@ -89,6 +98,8 @@ impl Settings {
             model_cache_bytes: 1 << 20,
             session_idle_timeout: Duration::MAX,
             time_limits: TimeLimits::DEFAULT,
+            clock: Clock::system(),
+            ids: Ids::random(),
             pool: PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
         }
     }
@@ -210,6 +221,8 @@ impl From<StoreError> for ServiceError {
 #[derive(Debug)]
 pub struct Etude {
     store: Arc<Store>,
+    clock: Clock,
+    ids: Ids,
     memory: Memory,
     pool: SearchPool,
     compiler: Compiler,
@@ -248,10 +261,12 @@ impl Etude {
 
     fn with(store: Store, settings: &Settings, tasks: &TaskTracker, abort: CancellationToken) -> Self {
         let store = Arc::new(store);
-        let pool = SearchPool::new(settings.pool, tasks.clone(), abort);
+        let pool = SearchPool::new(settings.pool, settings.clock.clone(), tasks.clone(), abort);
         Self {
             compiler: Compiler::new(Arc::clone(&store), pool.clone(), settings, tasks.clone()),
             store,
+            clock: settings.clock.clone(),
+            ids: settings.ids.clone(),
             memory: settings.memory.clone(),
             pool,
             time_limits: settings.time_limits,
@@ -266,13 +281,13 @@ impl Etude {
         }
     }
 
-    /// Whether the service can do its work at `now`: whether something can be written.
+    /// Whether the service can do its work: whether something can be written.
     ///
     /// # Errors
     ///
     /// If not.
-    pub async fn check(&self, now: Timestamp) -> Result<(), StoreError> {
-        self.store.check(now, self.alive_every()).await
+    pub async fn check(&self) -> Result<(), StoreError> {
+        self.store.check(&self.clock, self.alive_every()).await
     }
 
     /// Begins to serve at `now`: time since the service was last alive does not count for open sessions, and what a killed service has
@@ -301,6 +316,18 @@ impl Etude {
     /// Closes the store. Whoever still asks for something gets an error.
     pub async fn close(&self) {
         self.store.close().await;
+    }
+
+    /// What time it is.
+    #[must_use]
+    pub fn clock(&self) -> &Clock {
+        &self.clock
+    }
+
+    /// Where ids come from.
+    #[must_use]
+    pub fn ids(&self) -> &Ids {
+        &self.ids
     }
 
     /// The budget of memory.

@@ -250,9 +250,9 @@ impl Etude {
             (self.pool.run_here(None, job), Ok(None))
         } else {
             let place = self.pool.admit(caller.client)?;
-            let max_time = self.time_limits.compile;
+            let (max_time, clock) = (self.time_limits.compile, self.clock.clone());
             let job = move |interrupt: &mut dyn Interrupt| {
-                let read = text.read(format, limits, &mut LimitedTime::new(interrupt, max_time));
+                let read = text.read(format, limits, &mut LimitedTime::new(interrupt, max_time, clock));
                 Ok(prepare(read, interrupt))
             };
             tokio::join!(place.run(None, job), self.store_pieces(pieces))

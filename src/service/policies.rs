@@ -625,6 +625,7 @@ mod tests {
     async fn a_small_body_that_becomes_much_is_counted() {
         let pool = crate::service::SearchPool::new(
             PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
+            crate::clock::Clock::system(),
             TaskTracker::new(),
             CancellationToken::new(),
         );

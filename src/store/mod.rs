@@ -31,6 +31,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use crate::clock::Clock;
 use alive::NoteAlive;
 use database::{Database, Locking, Readers};
 use definitions::Sweeper;
@@ -164,26 +165,26 @@ impl Store {
         self.writer.write(NoteAlive { now, every }).await
     }
 
-    /// Whether something can be written, as [`Self::note_alive`] is; tried at most once a second, and known within two.
+    /// Whether something can be written by `clock`, as [`Self::note_alive`] is; tried at most once a second, and known within two.
     ///
     /// # Errors
     ///
     /// If not.
-    pub async fn check(&self, now: Timestamp, every: Duration) -> Result<(), StoreError> {
+    pub async fn check(&self, clock: &Clock, every: Duration) -> Result<(), StoreError> {
         // Whoever asks meanwhile is told the same.
         let mut checked = self.checked.lock().await;
         if let Some((at, known)) = *checked
-            && at.elapsed() < CHECK_EVERY
+            && clock.elapsed(at) < CHECK_EVERY
         {
             return Ok(known?);
         }
-        let noted = tokio::time::timeout(CHECK_TIMEOUT, self.note_alive(now, every)).await;
+        let noted = tokio::time::timeout(CHECK_TIMEOUT, self.note_alive(clock.now(), every)).await;
         let found = match noted.unwrap_or(Err(Unavailable::Slow.into())) {
             Ok(()) => Ok(()),
             Err(StoreError::Unavailable(unavailable)) => Err(unavailable),
             Err(error) => return Err(error),
         };
-        *checked = Some((Instant::now(), found));
+        *checked = Some((clock.instant(), found));
         Ok(found?)
     }
 }
@@ -257,7 +258,8 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let tasks = TaskTracker::new();
         let store = Store::open(&directory.path().join("etude.db"), &tasks).await.unwrap();
-        let check = || store.check(Timestamp::UNIX_EPOCH, Duration::ZERO);
+        let clock = Clock::stepped(Timestamp::UNIX_EPOCH);
+        let check = || store.check(&clock, Duration::ZERO);
         store.writer.close();
         tasks.close();
         tasks.wait().await;

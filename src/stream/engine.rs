@@ -1,9 +1,8 @@
 //! The protocol, one connection at a time.
 
 use std::error::Error;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use jiff::Timestamp;
 use serde_json::Value;
 use tokio::sync::SetOnce;
 use tokio_util::bytes::Bytes;
@@ -274,8 +273,9 @@ impl Connection<'_> {
 
     /// Answers a frame, whose memory is `memory`. Gives how the connection ends, if it does.
     async fn answer(&mut self, frame: ClientFrame, memory: Option<Taken>) -> Result<Option<Closed>, Over> {
-        let now = Timestamp::now();
-        let caller = Caller { client: self.client, arrived: Instant::now(), now };
+        let (clock, client) = (self.etude.clock(), self.client);
+        let caller = Caller { client, arrived: clock.instant(), now: clock.now() };
+        let now = caller.now;
         match (frame, &mut self.session) {
             (ClientFrame::Open(_) | ClientFrame::Resume { .. }, Some(_)) => {
                 Err(not_allowed("a session is open already"))

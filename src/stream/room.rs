@@ -237,7 +237,7 @@ mod tests {
             rooms.admit(Client::LOCAL).is_err_and(|error| error != NotAdmitted::NoPlace),
             "its place is given back"
         );
-        let started = tokio::time::Instant::now();
+        let started = crate::clock::timer_now();
         assert_eq!(room.take_to_read(20 * KIB).await, Err(Crowded));
         assert_eq!(started.elapsed(), LIMITS.slow_after);
         let mut waiting = Box::pin(room.take_to_read(20 * KIB));

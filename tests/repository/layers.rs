@@ -10,7 +10,7 @@ const CORE: [&[&str]; 6] =
 
 /// Modules of the service.
 const SERVICE: [&[&str]; 9] = [
-    &["memory", "telemetry", "experiment"],
+    &["clock", "memory", "telemetry", "experiment"],
     &["store"],
     &["service"],
     &["stream"],

@@ -1,9 +1,8 @@
 //! What one request may take of the service: time, memory, and the patience of others.
 
-use std::time::Instant;
-
 use crate::harness::service::{Service, answer, example, flags, long_way, to_and_fro};
 use crate::harness::waiting::until;
+use etude::clock::{Clock, Ids};
 use etude::memory::SMALL_BYTES;
 use etude::service::{Caller, Client, Etude, ModelText, Name, Registered, ServiceError};
 use etude_core::model::Format;
@@ -102,14 +101,17 @@ async fn a_model_that_is_there_already_is_not_compiled_again() {
     let directory = with_hard_model(&[]).await.stop().await;
     let database = directory.path().join("etude.db");
     let flags = flags(&["--database", database.to_str().unwrap()]);
-    let etude = Etude::open(&flags.settings(), &TaskTracker::new(), CancellationToken::new()).await.unwrap();
+    let etude =
+        Etude::open(&flags.settings(Clock::system(), Ids::random()), &TaskTracker::new(), CancellationToken::new())
+            .await
+            .unwrap();
     // Without memory, nothing can be compiled.
     let memory = etude.memory();
     let mut taken = vec![memory.try_take(memory.free_for_large()).unwrap()];
     taken.extend(std::iter::from_fn(|| memory.try_take(SMALL_BYTES).or_else(|_| memory.try_take(4096)).ok()));
     let put = async |name: &str, n_states: usize| {
         let text = ModelText::Whole(hard_model(n_states).to_string().into_bytes());
-        let caller = Caller { client: Client::LOCAL, arrived: Instant::now(), now: Timestamp::UNIX_EPOCH };
+        let caller = Caller { client: Client::LOCAL, arrived: Clock::system().instant(), now: Timestamp::UNIX_EPOCH };
         etude.put_model(&Name::new(name).unwrap(), text, Format::Json, caller).await.map(|(registered, _)| registered)
     };
     assert_eq!(put("hard", 5_000).await.unwrap(), Registered::Already);

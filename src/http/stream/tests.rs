@@ -9,7 +9,6 @@ use futures_util::{StreamExt, stream};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream};
-use tokio::time::Instant;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::tungstenite::protocol::Role;
@@ -17,6 +16,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::*;
+use crate::clock::{Clock, Ids, timer_now};
 use crate::config::ServeConfig;
 use crate::service::{Client, Etude, ModelText, Name};
 use crate::stream::{Limits, Rooms};
@@ -37,7 +37,10 @@ async fn application(flags: &[&str]) -> (Etude, Limits, TempDir) {
     let database = directory.path().join("etude.db");
     let own = ["etude", "--database", database.to_str().unwrap()];
     let config = Flags::parse_from(own.iter().chain(flags)).config;
-    let etude = Etude::open(&config.settings(), &TaskTracker::new(), CancellationToken::new()).await.unwrap();
+    let etude =
+        Etude::open(&config.settings(Clock::system(), Ids::random()), &TaskTracker::new(), CancellationToken::new())
+            .await
+            .unwrap();
     (etude, config.stream_limits(), directory)
 }
 
@@ -206,7 +209,7 @@ async fn a_websocket_hears_of_large_frames_in_pieces_and_of_all_else_as_it_came(
 async fn time_to_answer(quiet: &[u8], n_times: usize, then: &[u8]) -> Duration {
     let (etude, limits, _directory) = application(&[]).await;
     tokio::time::pause();
-    let started = Instant::now();
+    let started = timer_now();
     let took = speak((&etude, limits), 1 << 20, async |mut io| {
         io.write_all(&[&quiet.repeat(n_times), then].concat()).await.unwrap();
         let mut all = Vec::new();
@@ -240,7 +243,7 @@ async fn pings_and_parts_that_say_nothing_are_read_slowly_where_there_are_many()
 async fn a_client_that_gives_no_sign_of_life_is_asked_for_one_and_let_go() {
     let (etude, limits, _directory) = application(&[]).await;
     tokio::time::pause();
-    let started = Instant::now();
+    let started = timer_now();
     speak((&etude, limits), 4096, async |mut io| {
         let mut all = Vec::new();
         io.read_to_end(&mut all).await.unwrap();
@@ -349,7 +352,7 @@ async fn who_sends_lines_without_end_and_reads_none_is_let_go_and_gives_its_memo
         "dynamics": {"kind": "table", "states": [[0], [1]], "transitions": [[0, "on", 1], [1, "on", 0]], "start": 0},
     });
     let (text, format) = (ModelText::Whole(model.to_string().into_bytes()), Format::Json);
-    let caller = Caller { client: Client::LOCAL, arrived: std::time::Instant::now(), now: Timestamp::now() };
+    let caller = Caller { client: Client::LOCAL, arrived: Clock::system().instant(), now: Clock::system().now() };
     etude.put_model(&Name::new("m").unwrap(), text, format, caller).await.unwrap();
     let free = etude.memory().free();
     let room = Rooms::new(etude.memory(), limits).admit(Client::LOCAL).unwrap();
@@ -377,7 +380,7 @@ async fn blank_lines_are_read_slowly_where_there_are_many() {
         let (came, mut incoming) = crate::stream::queue(crate::stream::QUEUE_BYTES);
         let lines = Body::from("\n".repeat(n_blank) + "{}\n");
         let body = ndjson::begin_reading(Request::new(lines)).await;
-        let started = Instant::now();
+        let started = timer_now();
         ndjson::read(body, limits.frame_bytes, Inlet { came, room: &room }).await;
         assert_eq!(started.elapsed(), expected);
         assert!(matches!(incoming.recv().await.unwrap().item, Incoming::Frame { .. }));

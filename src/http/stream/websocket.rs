@@ -5,7 +5,7 @@ use futures_util::stream::{SplitSink, SplitStream};
 use futures_util::{SinkExt, StreamExt};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::{SetOnce, mpsc};
-use tokio::time::{Instant, MissedTickBehavior};
+use tokio::time::MissedTickBehavior;
 use tokio_tungstenite::WebSocketStream;
 use tokio_tungstenite::tungstenite::error::ProtocolError;
 use tokio_tungstenite::tungstenite::protocol::frame::coding::{Data, OpCode};
@@ -16,6 +16,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::metered::Metered;
 use super::{CLOSE_TIMEOUT, Inlet};
+use crate::clock::timer_now;
 use crate::service::{Client, Etude};
 use crate::stream::{
     self, Closed, Crowded, Incoming, Limits, Outgoing, QUEUE_BYTES, READ_BUFFER_BYTES, Receiver, Room,
@@ -116,7 +117,7 @@ async fn read<S>(
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
-    let mut ticks = tokio::time::interval_at(Instant::now() + limits.ping_every, limits.ping_every);
+    let mut ticks = tokio::time::interval_at(timer_now() + limits.ping_every, limits.ping_every);
     // While the client's frames wait for us, its silence is not counted.
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     let (mut has_come, mut n_silent) = (false, 0);

@@ -30,6 +30,7 @@ use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
 use super::Client;
+use crate::clock::Clock;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
 pub(crate) use turns::Places;
 use turns::{Class, LENT_AFTER, Level, Ticket, Turns};
@@ -88,6 +89,7 @@ struct Shared {
     reading: Arc<Threads>,
     tasks: TaskTracker,
     abort: CancellationToken,
+    clock: Clock,
 }
 
 /// Threads that jobs take turns on.
@@ -96,6 +98,7 @@ struct Threads(Mutex<Lines>);
 
 #[derive(Debug)]
 struct Lines {
+    clock: Clock,
     turns: Turns,
     /// How to tell those who wait.
     waiting: FxHashMap<Ticket, oneshot::Sender<()>>,
@@ -106,7 +109,7 @@ struct Lines {
 impl Lines {
     /// Tells those whose turn it is.
     fn pass_on(&mut self) {
-        while let Some(ticket) = self.turns.next(Instant::now()) {
+        while let Some(ticket) = self.turns.next(self.clock.instant()) {
             if let Some(waiting) = self.waiting.remove(&ticket) {
                 // Whoever has gone gives the thread back.
                 let _ = waiting.send(());
@@ -116,10 +119,10 @@ impl Lines {
 }
 
 impl Threads {
-    fn new(settings: PoolSettings) -> Self {
+    fn new(settings: PoolSettings, clock: Clock) -> Self {
         let n_short = settings.n_threads.max(1) + settings.max_waiting;
         let turns = Turns::new(settings.n_threads, n_short, settings.max_long);
-        Self(Mutex::new(Lines { turns, waiting: FxHashMap::default(), n_parked: 0 }))
+        Self(Mutex::new(Lines { clock, turns, waiting: FxHashMap::default(), n_parked: 0 }))
     }
 
     /// What a panic has left behind is whole.
@@ -130,7 +133,8 @@ impl Threads {
     /// Takes a thread, or lines up for one.
     fn start_or_wait(self: &Arc<Self>, client: Client, class: Class, level: Level) -> Result<Turn, Waiting> {
         let mut lines = self.lines();
-        if lines.turns.try_start(class, Instant::now()) {
+        let now = lines.clock.instant();
+        if lines.turns.try_start(class, now) {
             return Ok(Turn { threads: Arc::clone(self), class });
         }
         Err(self.line_up(&mut lines, client, class, level))
@@ -200,11 +204,11 @@ impl Drop for Waiting {
 }
 
 impl SearchPool {
-    /// A pool whose jobs run in `tasks` and stop when `abort` is cancelled.
+    /// A pool whose jobs run in `tasks`, by `clock`, and stop when `abort` is cancelled.
     #[must_use]
-    pub fn new(settings: PoolSettings, tasks: TaskTracker, abort: CancellationToken) -> Self {
-        let threads = || Arc::new(Threads::new(settings));
-        Self(Arc::new(Shared { searching: threads(), reading: threads(), tasks, abort }))
+    pub fn new(settings: PoolSettings, clock: Clock, tasks: TaskTracker, abort: CancellationToken) -> Self {
+        let threads = || Arc::new(Threads::new(settings, clock.clone()));
+        Self(Arc::new(Shared { searching: threads(), reading: threads(), tasks, abort, clock }))
     }
 
     /// How many jobs are in the pool, waiting or running.
@@ -292,12 +296,13 @@ impl SearchPool {
             return Err(PoolError::Busy);
         }
         let turn = Turn { threads: Arc::clone(&threads), class: Class::Long };
+        let clock = self.0.clock.clone();
         let yielding = move |watch: &mut dyn Interrupt| {
             let mut last_since: Option<Instant> = None;
             let mut is_needed = || {
                 let turns = &threads.lines().turns;
-                last_since = if turns.are_all_taken() { last_since.or_else(|| Some(Instant::now())) } else { None };
-                turns.is_waited_for() || last_since.is_some_and(|since| since.elapsed() >= LAST_THREAD_KEPT)
+                last_since = if turns.are_all_taken() { last_since.or_else(|| Some(clock.instant())) } else { None };
+                turns.is_waited_for() || last_since.is_some_and(|since| clock.elapsed(since) >= LAST_THREAD_KEPT)
             };
             job(&mut || if is_needed() { Signal::Cancel } else { watch.poll() })
         };
@@ -334,11 +339,11 @@ impl SearchPool {
         deadline: Option<Instant>,
         job: impl FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled>,
     ) -> Result<T, PoolError> {
-        self.0.searching.lines().turns.note_short(Instant::now());
+        self.0.searching.lines().turns.note_short(self.0.clock.instant());
         job(&mut || {
             if self.0.abort.is_cancelled() {
                 Signal::Cancel
-            } else if deadline.is_some_and(|deadline| Instant::now() >= deadline) {
+            } else if deadline.is_some_and(|deadline| self.0.clock.instant() >= deadline) {
                 Signal::Finish
             } else {
                 Signal::Continue
@@ -379,11 +384,11 @@ impl SearchPool {
         // Dropped with this future: whoever waited is gone.
         let _gone: DropGuard = cancel.clone().drop_guard();
         let span = tracing::Span::current();
-        let runtime = Handle::current();
+        let (runtime, clock) = (Handle::current(), self.0.clock.clone());
         let running = self.0.tasks.spawn_blocking(move || {
             let _held = held;
             give_way();
-            let mut watch = Watch::new(job, cancel, runtime);
+            let mut watch = Watch::new(job, cancel, runtime, clock);
             let done = span.in_scope(|| run(&mut watch));
             (done, watch.is_refused)
         });
@@ -554,6 +559,7 @@ struct Watch {
     job: Job,
     cancel: CancellationToken,
     runtime: Handle,
+    clock: Clock,
     /// When its turn began.
     began: Instant,
     /// How long it had run before.
@@ -564,12 +570,12 @@ struct Watch {
 }
 
 impl Watch {
-    fn new(job: Job, cancel: CancellationToken, runtime: Handle) -> Self {
-        let began = Instant::now();
+    fn new(job: Job, cancel: CancellationToken, runtime: Handle, clock: Clock) -> Self {
+        let began = clock.instant();
         let before = job.place.as_ref().map_or(0, |place| place.spent_us.load(Ordering::Relaxed));
         let before = Duration::from_micros(before);
         let next_look = began + MOMENT.saturating_sub(before);
-        Self { job, cancel, runtime, began, before, next_look, is_refused: false }
+        Self { job, cancel, runtime, clock, began, before, next_look, is_refused: false }
     }
 
     /// Becomes long, or makes way if it should.
@@ -623,7 +629,7 @@ impl Watch {
                 turn = waiting.turn() => Ok(turn),
             }
         });
-        self.began = Instant::now();
+        self.began = self.clock.instant();
         threads.lines().n_parked -= 1;
         match waited {
             Ok(turn) => {
@@ -637,7 +643,7 @@ impl Watch {
     /// Adds to the place what this turn has taken.
     fn count(&self) {
         if let Some(place) = &self.job.place {
-            let ran_us = u64::try_from(self.began.elapsed().as_micros()).unwrap_or(u64::MAX);
+            let ran_us = u64::try_from(self.clock.elapsed(self.began).as_micros()).unwrap_or(u64::MAX);
             place.spent_us.fetch_add(ran_us, Ordering::Relaxed);
         }
     }
@@ -654,7 +660,7 @@ impl Interrupt for Watch {
         if self.cancel.is_cancelled() {
             return Signal::Cancel;
         }
-        let now = Instant::now();
+        let now = self.clock.instant();
         if self.job.deadline.is_some_and(|deadline| now >= deadline) {
             return Signal::Finish;
         }
@@ -679,6 +685,7 @@ mod tests {
         (
             SearchPool::new(
                 PoolSettings { n_threads, max_waiting, max_long: n_threads + max_waiting },
+                Clock::system(),
                 TaskTracker::new(),
                 abort.clone(),
             ),
@@ -744,7 +751,7 @@ mod tests {
             busy(&pool).await;
         }
         assert_eq!(pool.run_here(None, |_| Ok(7)), Ok(7));
-        assert_eq!(pool.run_here(Some(Instant::now()), until_cancelled), Ok(()));
+        assert_eq!(pool.run_here(Some(Clock::system().instant()), until_cancelled), Ok(()));
         abort.cancel();
         assert_eq!(pool.run_here(None, until_cancelled), Err(PoolError::Stopped));
     }
@@ -818,10 +825,10 @@ mod tests {
         }
         until_long(&pool, 2).await;
         let place = pool.admit(client(2)).unwrap();
-        let deadline = Instant::now() + 10 * MOMENT;
+        let deadline = Clock::system().instant() + 10 * MOMENT;
         assert_eq!(place.clone().run(Some(deadline), until_cancelled).await, Ok(()));
         // Its request is long now, and would wait for the others.
-        let impatient = place.with_patience(Some(Instant::now()));
+        let impatient = place.with_patience(Some(Clock::system().instant()));
         assert_eq!(impatient.run(Some(deadline), until_cancelled).await, Ok(()));
         assert_eq!(pool.n_jobs(), 3, "the others still run");
     }
@@ -866,6 +873,6 @@ mod tests {
     #[tokio::test]
     async fn a_passed_deadline_asks_the_job_to_finish() {
         let (pool, _abort) = pool(1, 0);
-        assert_eq!(pool.admit(client(0)).unwrap().run(Some(Instant::now()), until_cancelled).await, Ok(()));
+        assert_eq!(pool.admit(client(0)).unwrap().run(Some(Clock::system().instant()), until_cancelled).await, Ok(()));
     }
 }

@@ -319,9 +319,15 @@ impl Queue {
 mod tests {
     use std::net::{IpAddr, Ipv4Addr};
 
+    use jiff::Timestamp;
     use proptest::prelude::*;
 
     use super::*;
+    use crate::clock::Clock;
+
+    fn any_instant() -> Instant {
+        Clock::stepped(Timestamp::UNIX_EPOCH).instant()
+    }
 
     fn client(n: u8) -> Client {
         IpAddr::from(Ipv4Addr::new(10, 0, 0, n)).into()
@@ -340,7 +346,7 @@ mod tests {
 
     #[test]
     fn clients_take_turns_and_a_clients_jobs_keep_their_order() {
-        let now = Instant::now();
+        let now = any_instant();
         let mut turns = Turns::new(2, 10, 10);
         while turns.try_start(Class::Short, now) {}
         let tickets = [0, 0, 0, 1, 1, 2].map(|n| turns.wait(client(n), Class::Short, 0));
@@ -350,7 +356,7 @@ mod tests {
 
     #[test]
     fn short_jobs_come_before_long_ones_which_leave_them_a_thread() {
-        let now = Instant::now();
+        let now = any_instant();
         let mut turns = Turns::new(3, 10, 10);
         assert!(turns.try_start(Class::Short, now));
         assert!(turns.become_long(now) && turns.try_start(Class::Long, now));
@@ -367,7 +373,7 @@ mod tests {
 
     #[test]
     fn the_last_thread_is_lent_while_nothing_short_comes() {
-        let now = Instant::now();
+        let now = any_instant();
         let later = now + LENT_AFTER;
         let mut turns = Turns::new(2, 10, 10);
         turns.note_short(now);
@@ -385,7 +391,7 @@ mod tests {
 
     #[test]
     fn of_a_clients_long_jobs_the_one_that_has_run_least_is_next() {
-        let now = Instant::now();
+        let now = any_instant();
         let mut turns = Turns::new(2, 10, 10);
         turns.note_short(now);
         assert!(turns.try_start(Class::Long, now));
@@ -428,7 +434,7 @@ mod tests {
     proptest! {
         #[test]
         fn no_thread_is_lost_or_given_twice_and_none_idles_while_a_short_job_waits(actions in actions(), n_threads in 2..5_usize) {
-            let mut now = Instant::now();
+            let mut now = any_instant();
             let mut turns = Turns::new(n_threads, 10, 10);
             let mut running = Vec::new();
             let mut waiting = Vec::new();

@@ -3,6 +3,7 @@
 //! Of a session only what it was opened with and its observations are stored. Whoever resumes it gets the same steps
 //! again, because they follow from those. A session belongs to one connection at a time; resuming takes it over.
 
+#[expect(clippy::disallowed_methods, reason = "to be handed the clock")]
 mod session;
 
 use std::num::NonZeroU32;
@@ -12,7 +13,6 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde_json::Value;
 use tokio_util::sync::CancellationToken;
-use uuid::Uuid;
 
 use session::Source;
 pub use session::{CommittedSteps, Ended, Observation, Received, RewardState, Session};
@@ -144,7 +144,7 @@ impl Etude {
             weights = draw.weights;
             trial = Some(draw.trial);
         }
-        let id = Uuid::now_v7().to_string();
+        let id = self.ids.next().to_string();
         let ownership = self.owners.take(&id).await?;
         let source = Source {
             learner: learner.as_ref().map(|ready| ready.name.clone()),
@@ -342,7 +342,7 @@ impl Etude {
                 _ = ticks.tick() => {}
                 () = stopping.cancelled() => return,
             }
-            if let Err(error) = self.expire_sessions(Timestamp::now()).await {
+            if let Err(error) = self.expire_sessions(self.clock.now()).await {
                 tracing::warn!(error = &error as &dyn std::error::Error, "idle sessions could not be expired");
             }
         }
@@ -420,12 +420,12 @@ fn read_stored(
 
 #[cfg(test)]
 mod tests {
-    use std::time::Instant;
 
     use serde_json::json;
     use tokio_util::task::TaskTracker;
 
     use super::*;
+    use crate::clock::{Clock, Ids};
     use crate::memory::Memory;
     use crate::service::{Client, ModelText, Name, PoolSettings, Settings, TimeLimits};
     use etude_core::model::{Format, Limits};
@@ -433,7 +433,7 @@ mod tests {
     const NOW: Timestamp = Timestamp::UNIX_EPOCH;
 
     fn caller() -> Caller {
-        Caller { client: Client::LOCAL, arrived: Instant::now(), now: NOW }
+        Caller { client: Client::LOCAL, arrived: Clock::system().instant(), now: NOW }
     }
 
     async fn open(directory: &std::path::Path, time_limits: TimeLimits, tasks: &TaskTracker) -> Etude {
@@ -444,6 +444,8 @@ mod tests {
             model_cache_bytes: 1 << 20,
             session_idle_timeout: Duration::MAX,
             time_limits,
+            clock: Clock::system(),
+            ids: Ids::random(),
             pool: PoolSettings { n_threads: 1, max_waiting: 1, max_long: 1 },
         };
         Etude::open(&settings, tasks, CancellationToken::new()).await.unwrap()

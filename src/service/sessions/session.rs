@@ -7,7 +7,6 @@ use std::time::Instant;
 
 use jiff::Timestamp;
 use tokio_util::sync::CancellationToken;
-use uuid::Uuid;
 
 use super::{SessionError, read_stored};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
@@ -352,7 +351,7 @@ impl Session {
             None => None,
         };
         let stamp = Stamp {
-            id: Some(policy_id.unwrap_or_else(|| Uuid::now_v7().to_string())),
+            id: Some(policy_id.unwrap_or_else(|| etude.ids.next().to_string())),
             model: self.model.clone(),
             model_hash: self.model_hash.clone(),
             learner: self.source.learner.clone(),

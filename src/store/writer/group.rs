@@ -23,11 +23,11 @@ pub(super) async fn write(
 
 /// The observations in a group, in order.
 fn observations(group: &[Job]) -> Vec<&NewObservations> {
-    let new = |job| match job {
-        &Job::Observations(ref asked) => Some(&asked.request),
+    let new = group.iter().filter_map(|job| match job {
+        Job::Observations(asked) => Some(&asked.request),
         _ => None,
-    };
-    group.iter().filter_map(new).collect()
+    });
+    new.collect()
 }
 
 /// Appends observations in one statement, if there is nothing else in the group, all of them come next as far as is known, and nobody
@@ -74,11 +74,11 @@ async fn add_policies_at_once(connection: &mut SqliteConnection, group: &mut [Jo
 
 /// The policies that come by themselves in a group, in order.
 fn added_policies(group: &[Job]) -> Vec<&NewPolicy> {
-    let added = |job| match job {
-        &Job::Policies(ref asked) => asked.request.policies.as_slice(),
-        _ => &[],
-    };
-    group.iter().flat_map(added).collect()
+    let added = group.iter().filter_map(|job| match job {
+        Job::Policies(asked) => Some(&asked.request.policies),
+        _ => None,
+    });
+    added.flatten().collect()
 }
 
 fn answer_policies(group: &mut [Job]) {

@@ -1,8 +1,8 @@
 //! The protocol without a connection: the application alone, asked as a transport asks it.
 
 use std::sync::Arc;
-use std::time::Instant;
 
+use etude::clock::{Clock, Ids};
 use etude::service::{Caller, Etude};
 use etude::stream::{Closed, Incoming, Outgoing, Receiver, Sender, queue};
 use etude_core::document::Place;
@@ -25,7 +25,10 @@ async fn without_service(service: Service, abort: &CancellationToken) -> (Etude,
     let directory = service.stop().await;
     let database = directory.path().join("etude.db");
     let flags = flags(&["--database", database.to_str().unwrap()]);
-    (Etude::open(&flags.settings(), &TaskTracker::new(), abort.clone()).await.unwrap(), directory)
+    (
+        Etude::open(&flags.settings(Clock::system(), Ids::random()), &TaskTracker::new(), abort.clone()).await.unwrap(),
+        directory,
+    )
 }
 
 #[tokio::test]
@@ -33,7 +36,7 @@ async fn resuming_and_repeating_keep_a_session_from_expiring() {
     let (service, demonstration) = figure_4().await;
     let (etude, _directory) = without_service(service, &CancellationToken::new()).await;
     let at = |minute: i64| Timestamp::from_second(60 * minute).unwrap();
-    let caller = |minute| Caller { client: CLIENT, arrived: Instant::now(), now: at(minute) };
+    let caller = |minute| Caller { client: CLIENT, arrived: Clock::system().instant(), now: at(minute) };
     let states = json!(demonstration);
     let states = Place::root(&states);
     let open = json!({"type": "open", "model": "figure-4"});
