@@ -27,11 +27,14 @@
 //! | [`cli`] | the subcommands |
 //! | [`config`], [`telemetry`] | settings, logs and measurements |
 //!
-//! A request for a policy passes `http::policies` (body), `service::policies` (a place in `service::pool`), `service::outline` (its
-//! demonstration, for the model from `service::cache`), [`etude_core::mapping::Request`] (faults), [`etude_core::mapping::Mapper`]
-//! (search), [`etude_core::mapping::WrittenPolicy`] (the answer, and what is stored of it), and `store::writer` (disk) before it is
-//! answered. An observation of a stream passes `http::stream` (transport), [`stream::run`] (frames), `service::sessions` (durable before it
-//! is acknowledged) and [`etude_core::mapping::OnlineMapping`] (committed steps).
+//! A request for a policy passes `http::policies` (body), `service::policies` and `service::requests` (its members, taken apart; the model
+//! from `service::cache`), [`etude_core::mapping::Options`] and [`etude_core::mapping::Request`] (read against the model), `service::search`
+//! in `service::pool`, [`etude_core::mapping::Mapper`] (search), [`etude_core::mapping::WrittenPolicy`] (the answer, and what is stored of
+//! it), and `store::writer` (disk) before it is answered. If anything is wrong with it, `service::requests` reads it once more, as a
+//! document, and tells all its faults. Batches, trials and sessions are read by the same two.
+//!
+//! An observation of a stream passes `http::stream` (transport), [`stream::run`] (frames), `service::sessions` (durable before it is
+//! acknowledged) and [`etude_core::mapping::OnlineMapping`] (committed steps). A refinement refers to the session for its observations.
 //!
 //! A model passes `http::body` (decompressed, and read as it comes if it is large), [`etude_core::model::Definition::parse_from`] (into
 //! compact arrays, with all faults), [`etude_core::model::Model::compile`], and `store::definitions` (its canonical text, in pieces if it

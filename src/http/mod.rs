@@ -25,6 +25,7 @@ mod places;
 mod policies;
 mod problem;
 mod request_id;
+mod requests;
 mod stalled;
 mod stream;
 mod trials;

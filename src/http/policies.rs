@@ -14,14 +14,15 @@ use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{BodyProblems, Problem};
 use super::request_id::RequestId;
+use super::requests::{BatchRequest, PolicyRequest};
 use super::{SharedContext, answer};
-use crate::service::{BatchRequest, Caller, ServiceError};
-use etude_core::mapping::{Policy, PolicySummary, RequestDocument};
+use crate::service::{Caller, ServiceError};
+use etude_core::mapping::{Policy, PolicySummary};
 
 /// Follow a demonstration: the policy whose effects come closest to it, stored.
 #[utoipa::path(
     post, path = "/v1/policies", tag = "policies",
-    request_body = RequestDocument,
+    request_body = PolicyRequest,
     responses(
         (status = 201, description = "The policy", body = Policy,
             headers(("location" = String, description = "Where it can be read again"))),

@@ -6,7 +6,7 @@ use axum::http::request::Parts;
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::Response;
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 use serde_json::value::RawValue;
 use utoipa::{IntoParams, ToSchema};
 
@@ -15,28 +15,11 @@ use super::body::{read_json, read_small_json};
 use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
 use super::problem::{BodyProblems, Problem};
+use super::requests::TrialRequest;
 use super::{SharedContext, answer};
 use crate::service::{Caller, TrialAnswer};
 use crate::store::{StoreError, TrialStatus};
-use etude_core::mapping::{ObservationDocument, Policy, StartReference};
-
-/// A request for a trial.
-#[derive(Debug, Serialize, Deserialize, ToSchema)]
-#[schema(as = TrialRequest)]
-pub(super) struct TrialRequestBody {
-    /// Name of the imitator's model. It must have the attributes of the learner.
-    #[schema(example = "figure-6")]
-    model: String,
-    /// The observed states, in order: 1 to 100,000. Attributes may be missing or null: not observed.
-    demonstration: Vec<ObservationDocument>,
-    /// Where the imitator starts; the model's start if left out.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    start: Option<StartReference>,
-    /// How many observations past the current one a decision may wait for; `null`: all.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schema(minimum = 1)]
-    lookahead: Option<u32>,
-}
+use etude_core::mapping::Policy;
 
 /// A trial: weights drawn from a learner, the policy that they gave, and the reward that it earned.
 #[derive(Debug, Serialize, ToSchema)]
@@ -124,7 +107,7 @@ pub(super) struct FailureBody {
 #[utoipa::path(
     post, path = "/v1/learners/{learner}/trials", tag = "trials",
     params(("learner" = String, Path, description = "The learner's name")),
-    request_body = TrialRequestBody,
+    request_body = TrialRequest,
     responses(
         (status = 201, description = "The trial, with its policy", body = TrialBody,
             headers(("location" = String, description = "Where it can be read again"))),

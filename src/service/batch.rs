@@ -6,35 +6,31 @@
 //!                                                  +---- lines up again --------+    (as many at a time as the pool has threads)
 //! ```
 //!
-//! A batch of well-formed items is read in one pass (`outline`), any other as a document: what comes of an item is the same.
-//!
 //! A batch takes one place in the pool, whatever its size, and gives its threads back after every slice: a request that
 //! comes meanwhile waits for a slice, not for the batch.
 
-use std::collections::BTreeMap;
+use std::fmt;
 use std::iter::Enumerate;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use futures_util::future::try_join_all;
-use serde::{Deserialize, Serialize};
-use serde_json::{Map, Value};
-use utoipa::ToSchema;
+use serde::de::{Deserializer, Error as _, SeqAccess, Visitor};
+use serde_json::Value;
+use serde_json::value::RawValue;
+use tokio_util::bytes::Bytes;
 use uuid::Uuid;
 
-use super::outline::{AtHand, BatchOutline};
-use super::policies::{
-    Envelope, Extent, MAX_INLINE_BYTES, Named, Searched, base_weights, follow, parse, take_for_demonstration,
-};
-use super::{Admission, Caller, Etude, MadePolicy, ServiceError};
+use super::learners::Ready;
+use super::requests::{Named, Names, SentRequest, base_weights, most_demonstration_bytes, n_observations};
+use super::search::{Extent, Searched, follow, take_for_demonstration};
+use super::{Caller, Etude, MadePolicy, ServiceError};
 use crate::memory::{Held, Memory};
 use etude_core::attribute::Weights;
-use etude_core::document::{self, Faults, Object, Path, Place};
+use etude_core::document::{self, Faults, Members, Object, Path, Place};
 use etude_core::interrupt::{Cancelled, Interrupt};
-use etude_core::mapping::{
-    Conditions, Demonstration, HeuristicName, Mapper, ObservationDocument, Policy, Request, Stamp, StartReference,
-};
-use etude_core::model::{Model, Origin};
+use etude_core::mapping::{Demonstration, Mapper, Options, Policy, Request, RequestKind, Stamp, WellFormed};
+use etude_core::model::Model;
 
 /// Most items of a batch: as large a data set as most, while an answer full of short policies stays at some ten megabytes.
 pub const MAX_BATCH_ITEMS: usize = 10_000;
@@ -46,16 +42,6 @@ const MAX_ANSWER_BYTES: usize = 64 << 20;
 /// costs, short beside what a client notices.
 const SLICE: Duration = Duration::from_millis(5);
 
-/// Every field of a batch.
-const BATCH_FIELDS: [&str; 9] =
-    ["model", "items", "weights", "learner", "lookahead", "start", "heuristic", "max_expansions", "deadline_ms"];
-
-/// Every field of an item.
-const ITEM_FIELDS: [&str; 6] = ["demonstration", "weights", "lookahead", "start", "heuristic", "max_expansions"];
-
-/// Options that an item has from its batch unless it has its own; weights are shared attribute by attribute.
-const SHARED_OPTIONS: [&str; 4] = ["lookahead", "start", "heuristic", "max_expansions"];
-
 /// What became of a batch.
 #[derive(Debug)]
 pub struct MadePolicies {
@@ -66,35 +52,34 @@ pub struct MadePolicies {
 }
 
 impl Etude {
-    /// Makes a policy for every item of the batch in `body` (JSON, cheap to clone), and stores them all at once. Gives for each item,
-    /// in order, its policy or what is wrong with it.
+    /// Makes a policy for every item of the batch in `body` (JSON), and stores them all at once. Gives for each item, in order, its policy
+    /// or what is wrong with it.
     ///
     /// # Errors
     ///
     /// If the body is no batch, names no model, or the service cannot do it now; then nothing is stored.
-    pub async fn make_policies(
-        self: &Arc<Self>,
-        body: impl AsRef<[u8]> + Clone + Send + 'static,
-        caller: Caller,
-    ) -> Result<MadePolicies, ServiceError> {
+    pub async fn make_policies(&self, body: impl Into<Bytes>, caller: Caller) -> Result<MadePolicies, ServiceError> {
+        let body = body.into();
+        match self.follow_batch(&body, caller).await? {
+            Some(made) => Ok(made),
+            None => Err(Box::pin(self.explain(RequestKind::Batch, body, caller, check_batch)).await),
+        }
+    }
+
+    /// Nothing if something is wrong with the batch itself.
+    async fn follow_batch(&self, body: &Bytes, caller: Caller) -> Result<Option<MadePolicies>, ServiceError> {
         let place = self.pool.admit(caller.client)?;
-        let sent = self.read_batch(body.clone(), &place).await?;
-        let (envelope, faults) = self.read_envelope(&sent.document, &BATCH_FIELDS, "items");
-        let Some(envelope) = envelope else { return Err(faults.into()) };
-        let deadline = self.deadline(&envelope, caller.arrived);
+        let Some(sent) = self.read_sent(RequestKind::Batch, body, &place).await? else { return Ok(None) };
+        let (names, faults) = self.read_names(&sent.rest, RequestKind::Batch, None);
+        let names = names.filter(|names| faults.is_empty() && names.over_limits.is_empty());
+        let Some(names) = names else { return Ok(None) };
+        let deadline = self.deadline(&names, caller.arrived);
         let place = place.with_patience(deadline);
-        let named = self.find(&envelope, faults, &place, deadline).await?;
-        let sent = if sent.is_for(&named.mapper) {
-            drop(body);
-            sent
-        } else {
-            // Another model was given this name meanwhile.
-            let (document, held) = parse(body, &place, &self.memory).await?;
-            SentBatch { document, read: None, held }
-        };
+        let named = self.find(&names, faults, &place, deadline).await?;
         let memory = self.memory.clone();
-        let read = move |_: &mut dyn Interrupt| Ok(Batch::read(sent, envelope, named, memory));
-        let batch = Arc::new(place.run(None, read).await??);
+        let read = move |_: &mut dyn Interrupt| Ok(Batch::read(sent, &names, named, memory));
+        let Some(batch) = place.run(None, read).await?? else { return Ok(None) };
+        let batch = Arc::new(batch);
         let runners = (0..self.n_search_threads).map(|_| async {
             let mut made = Vec::new();
             loop {
@@ -132,68 +117,80 @@ impl Etude {
         }
         // Once they are stored, they are answered, whatever else is told.
         let held = batch.answer().held.take().or_else(|| self.memory.try_take(0).ok().filter(|_| is_any_stored));
-        Ok(MadePolicies { items, held })
-    }
-
-    /// Reads a batch, by its `place` in the pool if it is large.
-    async fn read_batch(
-        self: &Arc<Self>,
-        body: impl AsRef<[u8]> + Send + 'static,
-        place: &Admission,
-    ) -> Result<SentBatch, ServiceError> {
-        let etude = Arc::clone(self);
-        let n_bytes = body.as_ref().len();
-        let read = move || {
-            let at_hand = |model: &str| etude.mapper_at_hand(model).map(|(_, mapper)| mapper);
-            SentBatch::read(body.as_ref(), &at_hand, &etude.memory)
-        };
-        if n_bytes <= MAX_INLINE_BYTES { read() } else { place.run_reading(n_bytes, read).await? }
-    }
-}
-
-/// A batch as it was sent.
-struct SentBatch {
-    /// With something else in place of the items, if they were read already.
-    document: Value,
-    /// The items that were read for a model.
-    read: Option<(Arc<Mapper>, Vec<Item>)>,
-    /// For both, if they are much.
-    held: Option<Held>,
-}
-
-impl SentBatch {
-    /// Reads a batch in one pass if that can be, else as a document. Items with a lookahead need documents: their requests are stored, to
-    /// be refined.
-    fn read(body: &[u8], at_hand: AtHand<'_>, memory: &Memory) -> Result<Self, ServiceError> {
-        let outline = BatchOutline::read(body, at_hand, memory).filter(|BatchOutline { document, items, .. }| {
-            document["lookahead"].is_null() && items.iter().all(|(item, _)| item["lookahead"].is_null())
-        });
-        let Some(BatchOutline { document, items, mapper, held }) = outline else {
-            let held = memory.try_take(document::parsed_bytes(body) as u64)?;
-            return Ok(Self { document: document::parse(body)?, read: None, held: Some(held) });
-        };
-        let as_item = |(document, demonstration)| Item { document, demonstration: Some(demonstration) };
-        Ok(Self { document, read: Some((mapper, items.into_iter().map(as_item).collect())), held })
-    }
-
-    /// Whether it can be followed by this model.
-    fn is_for(&self, mapper: &Arc<Mapper>) -> bool {
-        self.read.as_ref().is_none_or(|(read_for, _)| Arc::ptr_eq(read_for, mapper))
+        Ok(Some(MadePolicies { items, held }))
     }
 }
 
 /// An item that waits.
 #[derive(Debug)]
 struct Item {
+    /// Its options; all of it, if its demonstration is still to be read.
     document: Value,
-    /// If it was read already; then the document has something else in its place.
-    demonstration: Option<Demonstration>,
+    read: Option<ReadItem>,
+}
+
+/// An item whose demonstration was read.
+#[derive(Debug)]
+struct ReadItem {
+    demonstration: Demonstration,
+    /// Its text.
+    observed: Bytes,
 }
 
 impl Item {
-    fn n_observations(&self) -> usize {
-        self.demonstration.as_ref().map_or_else(|| n_observations(&self.document), Demonstration::len)
+    /// Reads the item in `text`, of about `n_values` and no more than `max_len` observations. Nothing if it cannot even be read as a document.
+    fn read(sent: &SentRequest, text: &str, model: &Model, max_len: usize, n_values: usize) -> Option<Self> {
+        let members = Members::split(text, RequestKind::Item.fields());
+        let read = members.and_then(|mut members| {
+            let observed = members.take("demonstration")?;
+            let well_formed = WellFormed { schema: model.schema(), n_values, max_len };
+            let read =
+                ReadItem { demonstration: well_formed.read(observed).ok()?, observed: sent.observed_part(observed) };
+            Some(Self { document: members.parse()?, read: Some(read) })
+        });
+        read.or_else(|| Self::parse(text))
     }
+
+    /// The item in `text` as a document.
+    fn parse(text: &str) -> Option<Self> {
+        Some(Self { document: document::parse(text.as_bytes()).ok()?, read: None })
+    }
+
+    fn n_observations(&self) -> usize {
+        match &self.read {
+            Some(read) => read.demonstration.len(),
+            None => n_observations(&self.document),
+        }
+    }
+
+    fn size_bytes(&self) -> usize {
+        let demonstration_bytes = self.read.as_ref().map_or(0, |read| read.demonstration.size_bytes());
+        document::size_bytes(&self.document) + 2 * size_of_val(self) + demonstration_bytes
+    }
+}
+
+/// The texts of the items of a batch, of which there must not be too many.
+fn item_texts(items: &str) -> Option<Vec<&str>> {
+    struct Texts;
+    impl<'de> Visitor<'de> for Texts {
+        type Value = Vec<&'de str>;
+
+        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+            f.write_str("an array of items")
+        }
+
+        fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Self::Value, A::Error> {
+            let mut texts = Vec::new();
+            while let Some(item) = items.next_element::<&RawValue>()? {
+                texts.push(item.get());
+                if texts.len() > MAX_BATCH_ITEMS {
+                    return Err(A::Error::custom("too many items"));
+                }
+            }
+            Ok(texts)
+        }
+    }
+    serde_json::Deserializer::from_str(items).deserialize_seq(Texts).ok().filter(|texts| !texts.is_empty())
 }
 
 /// A batch that was checked, but for its items.
@@ -205,7 +202,7 @@ struct Batch {
     /// What an item's own weights are written over.
     weights: Weights,
     /// What an item has unless it has its own.
-    options: Map<String, Value>,
+    shared: Options,
     memory: Memory,
     /// For what waits.
     _sent_held: Option<Held>,
@@ -219,48 +216,46 @@ struct Batch {
 type Outcome = (usize, Result<Searched, ServiceError>);
 
 impl Batch {
-    /// Reads all but the items against the model.
-    fn read(sent: SentBatch, envelope: Envelope, named: Named, memory: Memory) -> Result<Self, ServiceError> {
-        let Envelope { model, over_limits: mut faults, .. } = envelope;
-        let SentBatch { mut document, read, held } = sent;
-        let Named { learner, model_hash, mapper } = named;
-        let root = Place::root(&document);
-        let object = root.object(&BATCH_FIELDS, &mut faults);
-        let shared = object.and_then(|object| {
-            let items = object.required("items", &mut faults);
-            let items = items.and_then(|place| {
-                let lengths: Vec<_> = match &read {
-                    Some((_, items)) => items.iter().map(Item::n_observations).collect(),
-                    None => place.array(&mut faults)?.iter().map(n_observations).collect(),
-                };
-                check_items(mapper.model(), &lengths, &place, &mut faults)
-            });
-            let shared = read_shared(
-                mapper.model(),
-                &object,
-                |faults| base_weights(mapper.model(), learner.as_ref(), faults),
-                &mut faults,
-            );
-            items.and(shared)
-        });
-        let (weights, options) = faults.check(shared)?;
-        let items = match (read, document["items"].take()) {
-            (Some((_, items)), _) => items,
-            (None, Value::Array(items)) => {
-                items.into_iter().map(|document| Item { document, demonstration: None }).collect()
-            }
-            (None, _) => Vec::new(),
-        };
-        let stamp = Stamp {
-            model,
-            model_hash,
-            learner: learner.as_ref().map(|ready| ready.name.clone()),
-            weights_version: learner.as_ref().map(|ready| ready.weights.version),
-            ..Stamp::default()
-        };
+    /// Reads a batch against its model: what its items share, and their demonstrations. Nothing if something is wrong with the batch
+    /// itself.
+    fn read(sent: SentRequest, names: &Names, named: Named, memory: Memory) -> Result<Option<Self>, ServiceError> {
+        let model = named.mapper.model();
+        let mut faults = Faults::default();
+        let object = Place::root(&sent.rest).object(RequestKind::Batch.fields(), &mut faults);
+        let shared = object.and_then(|object| read_shared(&object, model, named.learner.as_ref(), &mut faults));
+        let shared = shared.filter(|_| faults.is_empty());
+        let Some(((weights, shared), texts)) = shared.zip(item_texts(sent.observed())) else { return Ok(None) };
+        let mut held = None;
+        let most_bytes = most_demonstration_bytes(model, sent.observed());
+        // Where all demonstrations have no room together, they are read one by one, once it is their turn.
+        let have_room = memory.hold(&mut held, most_bytes).is_ok();
+        let most_bytes = if have_room { most_bytes } else { document::parsed_bytes(sent.observed().as_bytes()) };
+        memory.hold(&mut held, most_bytes)?;
+        let (mut items, mut n_bytes) = (Vec::with_capacity(texts.len()), 0);
+        let (mut n_left, mut n_values) = (Policy::max_observations(model), 0);
+        for text in texts {
+            let item = if have_room {
+                Item::read(&sent, text, model, n_left.min(Demonstration::MAX_OBSERVATIONS), n_values)
+            } else {
+                Item::parse(text)
+            };
+            let Some(item) = item else { return Ok(None) };
+            // What is told of too many observations is told of the batch.
+            let Some(left) = n_left.checked_sub(item.n_observations()) else { return Ok(None) };
+            n_left = left;
+            // Most are about as long as the one before.
+            n_values = item.n_observations() * model.schema().len();
+            n_bytes += item.size_bytes();
+            memory.hold(&mut held, most_bytes + n_bytes)?;
+            items.push(item);
+        }
+        if let Some(held) = &mut held {
+            held.shrink_to(n_bytes as u64);
+        }
+        let stamp = names.stamp(Stamp::default(), &named);
         let answer = Mutex::new(Answer { held: None, n_bytes: 0, n_other_bytes: 0, is_full: false });
         let waiting = Mutex::new(items.into_iter().enumerate());
-        Ok(Self { _sent_held: held, mapper, stamp, weights, options, memory, answer, waiting })
+        Ok(Some(Self { _sent_held: held, mapper: named.mapper, stamp, weights, shared, memory, answer, waiting }))
     }
 
     /// Follows items that wait, one after the other, until a slice is over. Nothing if none waits any more.
@@ -296,44 +291,36 @@ impl Batch {
     ) -> Result<Result<Searched, ServiceError>, Cancelled> {
         let items = Path::Member(&Path::Root, "items");
         let path = Path::Item(&items, n);
+        let demonstration_path = Path::Member(&path, "demonstration");
         let mut faults = Faults::default();
-        let Item { document, demonstration } = item;
-        if (Place { value: &document, path }).object(&ITEM_FIELDS, &mut faults).is_none() {
-            return Ok(Err(faults.into()));
-        }
-        let document = self.as_single(document);
-        let unread = if demonstration.is_none() { n_observations(&document) } else { 0 };
-        let _demonstration_held = match take_for_demonstration(self.mapper.model(), unread, &self.memory) {
-            Ok(held) => held,
-            Err(no_room) => return Ok(Err(no_room.into())),
-        };
-        let request = document.as_object().and_then(|members| {
-            let (model, object) = (self.mapper.model(), Object { members, path });
-            let base = |_: &mut Faults| Some(self.weights.clone());
-            match demonstration {
-                // It is not too long, as all of them together are not.
-                Some(read) => Request::read_beside(Some(read), model, &object, base, &mut faults),
-                None => Request::read_over(model, &object, base, &mut faults),
+        let Item { document, read } = item;
+        let (model, place) = (self.mapper.model(), Place { value: &document, path });
+        let Some(object) = place.object(RequestKind::Item.fields(), &mut faults) else { return Ok(Err(faults.into())) };
+        let weights = |_: &mut Faults| Some(self.weights.clone());
+        let (demonstration, observed, _held) = match read {
+            Some(ReadItem { demonstration, observed }) => (Some(demonstration), Some(observed), None),
+            None => {
+                let held = match take_for_demonstration(model, n_observations(&document), &self.memory) {
+                    Ok(held) => held,
+                    Err(no_room) => return Ok(Err(no_room.into())),
+                };
+                (Request::read_demonstration(model, &object, &mut faults), None, held)
             }
-        });
+        };
+        let request = Request::of(demonstration, model, &object, &self.shared, weights, &mut faults);
         let request = match faults.check(request) {
             Ok(request) => request,
             Err(faults) => return Ok(Err(faults.into())),
         };
         let stamp = Stamp { id: Some(Uuid::now_v7().to_string()), ..self.stamp.clone() };
-        let place = Path::Member(&path, "demonstration");
-        follow(&self.mapper, request, (&document, &place), stamp, &self.memory, Extent::Any, interrupt)
-    }
-
-    /// The item as a request of its own.
-    fn as_single(&self, mut item: Value) -> Value {
-        item["model"] = self.stamp.model.clone().into();
-        for (name, shared) in &self.options {
-            if item[name].is_null() {
-                item[name] = shared.clone();
-            }
-        }
-        item
+        let observed = match observed {
+            Some(observed) => observed,
+            // To be refined, it is stored as text.
+            None if request.lookahead.is_some() => document["demonstration"].to_string().into(),
+            None => Bytes::new(),
+        };
+        let observed = (std::str::from_utf8(&observed).unwrap_or_default(), &demonstration_path);
+        follow(&self.mapper, request, observed, stamp, &self.memory, Extent::Any, interrupt)
     }
 }
 
@@ -380,111 +367,44 @@ impl Answer {
     }
 }
 
-/// How many observations an item has, as far as can be told without its faults.
-fn n_observations(item: &Value) -> usize {
-    item.get("demonstration").and_then(Value::as_array).map_or(0, Vec::len)
+/// Notes what is wrong with a batch, but for its items.
+fn check_batch(object: &Object<'_, '_>, model: &Model, learner: Option<&Ready>, faults: &mut Faults) {
+    if let Some(place) = object.required("items", faults)
+        && let Some(items) = place.array(faults)
+    {
+        check_items(model, items, &place, faults);
+    }
+    read_shared(object, model, learner, faults);
 }
 
-/// Checks how many items there are, and that their policies would not be too large together. `lengths` is how many observations each
-/// of them has.
-fn check_items(model: &Model, lengths: &[usize], place: &Place<'_, '_>, faults: &mut Faults) -> Option<()> {
-    if !(1..=MAX_BATCH_ITEMS).contains(&lengths.len()) {
-        faults.note(place, format!("expected 1 to {MAX_BATCH_ITEMS} items, found {}", lengths.len()));
-        return None;
+/// Notes that there are too many items, or that their policies would be too large together.
+fn check_items(model: &Model, items: &[Value], place: &Place<'_, '_>, faults: &mut Faults) {
+    if !(1..=MAX_BATCH_ITEMS).contains(&items.len()) {
+        faults.note(place, format!("expected 1 to {MAX_BATCH_ITEMS} items, found {}", items.len()));
+        return;
     }
-    let n_observations = lengths.iter().sum();
+    let n_observations = items.iter().map(n_observations).sum();
     if !Policy::check_size(model, n_observations, place, &mut Faults::default()) {
         let detail = format!(
             "the policies of {n_observations} observations together would be larger than that of a single demonstration may \
              be: send fewer items at a time"
         );
         faults.note(place, detail);
-        return None;
     }
-    Some(())
 }
 
-/// Reads the options that the items share: the weights, and the others by name, in a form that is quick to read again.
+/// Reads what the items share: the weights, and the other options.
 fn read_shared(
-    model: &Model,
     object: &Object<'_, '_>,
-    base: impl FnOnce(&mut Faults) -> Option<Weights>,
+    model: &Model,
+    learner: Option<&Ready>,
     faults: &mut Faults,
-) -> Option<(Weights, Map<String, Value>)> {
-    let conditions = Conditions::read(model, object, faults);
-    let options = Request::read_options(object, faults);
-    Request::check_lookahead(model, object, faults);
-    let base = base(faults)?;
-    let (conditions, _) = (conditions?, options?);
-    let mut shared = Map::new();
-    for name in SHARED_OPTIONS {
-        let value = match conditions.start {
-            // Values would be looked up among all states, for every item.
-            Some(Origin::State(start)) if name == "start" => Some(start.into()),
-            _ => object.optional(name).map(|place| place.value.clone()),
-        };
-        shared.extend(value.map(|value| (name.to_owned(), value)));
-    }
-    Some((conditions.weights_over(base), shared))
-}
-
-/// A request for policies, as it is written in JSON.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct BatchRequest {
-    /// Name of the imitator's model.
-    #[schema(example = "figure-4")]
-    pub model: String,
-    /// What is to be followed. With more observations together than a single policy may have, the batch is refused.
-    #[schema(min_items = 1, max_items = 10_000)]
-    pub items: Vec<BatchItemRequest>,
-    /// Weights by attribute name, each at least 0; attributes not named keep the learner's or the model's.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub weights: Option<BTreeMap<String, f64>>,
-    /// Name of a learner whose mean weights are used, for attributes that no `weights` name.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub learner: Option<String>,
-    /// As in a single request, for items without their own.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schema(minimum = 1, maximum = 100_000)]
-    pub lookahead: Option<u32>,
-    /// As in a single request, for items without their own.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub start: Option<StartReference>,
-    /// As in a single request, for items without their own.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub heuristic: Option<HeuristicName>,
-    /// Most nodes to expand for an item without its own; then the best mapping found so far is answered, with `status`
-    /// `bounded`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub max_expansions: Option<u64>,
-    /// Most milliseconds for the whole batch, waiting included; items that are not done by then get the best mapping found,
-    /// with `status` `bounded`, or `local` if they have a lookahead. At most a day.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schema(maximum = 86_400_000)]
-    pub deadline_ms: Option<u64>,
-}
-
-/// An item of a batch: a demonstration, with options of its own where it needs them.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, ToSchema)]
-pub struct BatchItemRequest {
-    /// The observed states, as in a single request.
-    pub demonstration: Vec<ObservationDocument>,
-    /// Weights by attribute name, each at least 0; attributes not named keep the batch's.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub weights: Option<BTreeMap<String, f64>>,
-    /// Instead of the batch's.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schema(minimum = 1, maximum = 100_000)]
-    pub lookahead: Option<u32>,
-    /// Instead of the batch's.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub start: Option<StartReference>,
-    /// Instead of the batch's.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub heuristic: Option<HeuristicName>,
-    /// Instead of the batch's.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub max_expansions: Option<u64>,
+) -> Option<(Weights, Options)> {
+    let options = Options::read(object, model, &Options::default(), faults);
+    Options::check_lookahead_is_possible(model, object, faults);
+    let base = base_weights(model, learner, faults)?;
+    let options = options?;
+    Some((options.weights_over(base), Options { weights: Vec::new(), ..options }))
 }
 
 #[cfg(test)]
@@ -499,29 +419,33 @@ mod tests {
     const DEMONSTRATION: &str = include_str!("../../examples/figure-4/demonstration.json");
 
     fn mapper() -> Arc<Mapper> {
-        let model = serde_json::from_str(MODEL).unwrap();
-        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        mapper_of(&serde_json::from_str(MODEL).unwrap())
+    }
+
+    fn mapper_of(model: &Value) -> Arc<Mapper> {
+        let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         Arc::new(Mapper::new(model, &mut Uninterrupted).unwrap())
     }
 
-    /// What comes of the items, but for ids and times, and whether they were read in one pass if the model is at hand.
-    fn follow(text: &str, mapper: &Arc<Mapper>, is_at_hand: bool) -> (Vec<Result<Value, String>>, bool) {
-        let at_hand = |model: &str| (is_at_hand && model == "figure-4").then(|| Arc::clone(mapper));
-        let sent = SentBatch::read(text.as_bytes(), &at_hand, &Memory::with_room(1 << 30)).unwrap();
-        let is_read = sent.read.is_some();
-        let (envelope, _) = Envelope::read(&sent.document, &BATCH_FIELDS, "items");
-        let Some(envelope) = envelope else { return (Vec::new(), is_read) };
+    /// The batch in `text`, if nothing is wrong with the batch itself.
+    fn read(text: &str, mapper: &Arc<Mapper>, memory: &Memory) -> Result<Option<Batch>, ServiceError> {
+        let sent = SentRequest::read(RequestKind::Batch, &Bytes::from(text.to_owned()), memory)?;
+        let Some(sent) = sent else { return Ok(None) };
+        let model = sent.rest["model"].as_str().unwrap_or_default().to_owned();
+        let names = Names { model, learner: None, deadline: None, over_limits: Faults::default() };
         let named = Named { learner: None, model_hash: "hash".to_owned(), mapper: Arc::clone(mapper) };
-        let batch = match Batch::read(sent, envelope, named, Memory::with_room(1 << 30)) {
-            Ok(batch) => batch,
-            Err(faults) => return (vec![Err(format!("{faults:?}"))], is_read),
-        };
+        Batch::read(sent, &names, named, memory.clone())
+    }
+
+    /// What comes of the items, but for ids and times.
+    fn follow(text: &str, mapper: &Arc<Mapper>) -> Option<Vec<Result<Value, String>>> {
+        let batch = read(text, mapper, &Memory::with_room(1 << 30)).unwrap()?;
         let mut outcomes = Vec::new();
         loop {
             let slice = batch.run_slice(&mut Uninterrupted).unwrap();
             if slice.is_empty() {
-                return (outcomes, is_read);
+                return Some(outcomes);
             }
             outcomes.extend(slice.into_iter().map(|(_, outcome)| match outcome {
                 Ok(Searched { policy, .. }) => {
@@ -536,7 +460,7 @@ mod tests {
     }
 
     #[test]
-    fn what_comes_of_an_item_does_not_depend_on_how_the_batch_was_read() {
+    fn what_comes_of_an_item_does_not_depend_on_the_others_or_on_the_order_of_members() {
         let mapper = mapper();
         let demonstration: Value = serde_json::from_str(DEMONSTRATION).unwrap();
         let good = json!({"demonstration": demonstration});
@@ -545,8 +469,8 @@ mod tests {
             item[name] = value;
             item
         };
-        let items = json!([
-            good,
+        let items = [
+            good.clone(),
             with("weights", json!({"gold": 3, "x": 0})),
             with("weights", json!({"gold": -1, "mood": 1})),
             with("start", json!(7)),
@@ -554,40 +478,102 @@ mod tests {
             with("max_expansions", json!(5)),
             with("heuristic", json!("paper")),
             with("heuristic", json!("magic")),
+            with("lookahead", json!(2)),
             with("lookahead", Value::Null),
             with("model", json!("other")),
-            {"demonstration": [demonstration[0]]},
-        ]);
-        let n_items = items.as_array().unwrap().len();
-        let shared = r#""weights": {"x": 2}, "start": 3, "heuristic": "none""#;
-        for options in [r#""deadline_ms": null"#, shared, r#""weights": {"mood": 1}"#, r#""speed": 1"#] {
-            let model_first = format!(r#"{{"model": "figure-4", {options}, "items": {items}}}"#);
-            let items_first = format!(r#"{{"items": {items}, {options}, "model": "figure-4"}}"#);
-            let (expected, is_read) = follow(&model_first, &mapper, false);
-            assert!(!is_read, "no model was at hand");
-            assert!(expected.len() == n_items || expected.len() == 1);
-            for text in [&model_first, &items_first] {
-                assert_eq!(follow(text, &mapper, true), (expected.clone(), true), "{text}");
+            json!({"demonstration": [demonstration[0]]}),
+            json!({"demonstration": [{"speed": 1}]}),
+            json!({}),
+            json!(7),
+        ];
+        for options in [r#""deadline_ms": null"#, r#""weights": {"x": 2}, "start": 3, "heuristic": "none""#] {
+            let all = json!(items);
+            let model_first = format!(r#"{{"model": "figure-4", {options}, "items": {all}}}"#);
+            let items_first = format!(r#"{{"items": {all}, {options}, "model": "figure-4"}}"#);
+            let together = follow(&model_first, &mapper).unwrap();
+            assert_eq!(together.len(), items.len());
+            assert_eq!(together.iter().filter(|outcome| outcome.is_err()).count(), 7);
+            assert_eq!(follow(&items_first, &mapper), Some(together.clone()));
+            for (item, outcome) in items.iter().zip(&together) {
+                let alone = follow(&format!(r#"{{"model": "figure-4", {options}, "items": [{item}]}}"#), &mapper);
+                let at_its_place = |error: &String| error.replace("/items/0", "");
+                let [alone] = <[_; 1]>::try_from(alone.unwrap()).unwrap();
+                match (&alone, outcome) {
+                    (Ok(alone), Ok(outcome)) => assert_eq!(alone, outcome, "{item}"),
+                    (Err(alone), Err(outcome)) => {
+                        let n = items.iter().position(|other| other == item).unwrap();
+                        assert_eq!(at_its_place(alone), outcome.replace(&format!("/items/{n}"), ""), "{item}");
+                    }
+                    _ => panic!("{item}: {alone:?} is not {outcome:?}"),
+                }
             }
         }
     }
 
     #[test]
-    fn a_batch_with_anything_out_of_the_ordinary_is_read_as_a_document() {
+    fn a_batch_with_something_wrong_is_not_followed() {
         let mapper = mapper();
         let good = format!(r#"{{"demonstration": {DEMONSTRATION}}}"#);
-        let lookahead = format!(r#"{{"demonstration": {DEMONSTRATION}, "lookahead": 2}}"#);
         for (items, options) in [
-            (format!("[{good}, {{}}]"), ""),
-            (format!("[{good}, 7]"), ""),
-            (format!(r#"[{{"demonstration": [{{"speed": 1}}]}}, {good}]"#), ""),
-            (format!("[{good}, {lookahead}]"), ""),
-            (format!("[{good}]"), r#""lookahead": 2, "#),
+            (format!("[{good}]"), r#""weights": {"mood": 1}, "#),
+            (format!("[{good}]"), r#""speed": 1, "#),
+            (format!("[{good}]"), r#""lookahead": 0, "#),
+            (format!(r#"[{{"demonstration": [{{"x": 1e999}}]}}, {good}]"#), ""),
+            ("[]".to_owned(), ""),
             ("{}".to_owned(), ""),
         ] {
-            let text = format!(r#"{{{options}"items": {items}, "model": "figure-4"}}"#);
-            assert_eq!(follow(&text, &mapper, true), follow(&text, &mapper, false), "{text}");
+            assert_eq!(follow(&format!(r#"{{{options}"items": {items}, "model": "figure-4"}}"#), &mapper), None);
         }
+    }
+
+    #[test]
+    fn a_batch_of_too_many_items_or_observations_is_not_read_to_its_end() {
+        let attribute = |n: usize| json!({"name": format!("{n:0>64}"), "kind": "number"});
+        let mapper = mapper_of(&json!({
+            "attributes": (0..256).map(attribute).collect::<Vec<_>>(), "actions": [],
+            "dynamics": {"kind": "table", "states": [vec![0; 256]], "transitions": []},
+        }));
+        let memory = Memory::with_room(1 << 30);
+        let is_read = |lengths: &[usize]| {
+            let items = lengths.iter().map(|len| format!(r#"{{"demonstration": [{}]}}"#, vec!["{}"; *len].join(",")));
+            let items = items.collect::<Vec<_>>().join(",");
+            read(&format!(r#"{{"model": "wide", "items": [{items}]}}"#), &mapper, &memory).unwrap().is_some()
+        };
+        let most = Policy::max_observations(mapper.model());
+        assert!((100..Demonstration::MAX_OBSERVATIONS).contains(&most));
+        assert!(is_read(&[most]) && is_read(&[most - 100, 99, 1]));
+        assert!(!is_read(&[most + 1]) && !is_read(&[most - 100, 99, 1, 1]));
+        assert!(is_read(&[0; MAX_BATCH_ITEMS]) && !is_read(&[0; MAX_BATCH_ITEMS + 1]));
+    }
+
+    #[test]
+    fn the_items_of_a_batch_hold_their_memory_and_are_not_read_without() {
+        let attribute = |n: usize| json!({"name": format!("{n}"), "kind": "number"});
+        let mapper = mapper_of(&json!({
+            "attributes": (0..256).map(attribute).collect::<Vec<_>>(), "actions": [],
+            "dynamics": {"kind": "table", "states": [vec![0; 256]], "transitions": []},
+        }));
+        let items = vec![format!(r#"{{"demonstration": [{}]}}"#, vec!["{}"; 100].join(",")); 100].join(",");
+        let text = format!(r#"{{"model": "wide", "items": [{items}]}}"#);
+        let memory = Memory::with_room(1 << 30);
+        let batch = read(&text, &mapper, &memory).unwrap();
+        let taken = (1 << 30) - memory.free();
+        // 30 kB of text.
+        let values = (100 * 100 * 256 * size_of::<Option<etude_core::attribute::Value>>()) as u64;
+        assert!((values..values * 5 / 4).contains(&taken), "{taken} for {values}");
+        drop(batch);
+        assert_eq!(memory.free(), 1 << 30);
+        let read_one_by_one = read(&text, &mapper, &Memory::with_room(values)).unwrap().unwrap();
+        assert!(read_one_by_one.waiting.into_inner().unwrap().all(|(_, item)| item.read.is_none()));
+    }
+
+    #[test]
+    fn what_items_say_besides_their_demonstrations_is_counted() {
+        let item = r#"{"demonstration": [{}], "weights": {"a": {"": {"": {"": {"": 0}}}}}}"#;
+        let text = format!(r#"{{"model": "a", "items": [{}]}}"#, vec![item; 5000].join(","));
+        let memory = Memory::with_room(1 << 30);
+        let batch = read(&text, &mapper(), &memory).unwrap();
+        assert!(batch.is_some() && (1 << 30) - memory.free() > 5000 * 6 * 600, "{}", memory.free());
     }
 
     #[test]
@@ -597,10 +583,8 @@ mod tests {
         let text = format!(r#"{{"model": "figure-4", "items": [{}]}}"#, vec![item.as_str(); 100].join(","));
         let told = |room: u64| {
             let memory = Memory::with_room(room);
-            let sent = SentBatch::read(text.as_bytes(), &|_| None, &Memory::with_room(1 << 30)).unwrap();
-            let (envelope, _) = Envelope::read(&sent.document, &BATCH_FIELDS, "items");
-            let named = Named { learner: None, model_hash: "hash".to_owned(), mapper: Arc::clone(&mapper) };
-            let batch = Batch::read(sent, envelope.unwrap(), named, memory.clone()).unwrap();
+            let batch = read(&text, &mapper, &Memory::with_room(1 << 30)).unwrap().unwrap();
+            let batch = Batch { memory: memory.clone(), ..batch };
             let mut n_told = 0;
             loop {
                 let slice = batch.run_slice(&mut Uninterrupted).unwrap();

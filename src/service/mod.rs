@@ -19,14 +19,17 @@ mod learners;
 mod models;
 mod name;
 mod opening;
-mod outline;
 mod owners;
 mod pipe;
 #[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod policies;
 mod pool;
+mod refined;
 #[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod refiner;
+mod requests;
+#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
+mod search;
 mod sessions;
 #[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod trials;
@@ -37,7 +40,7 @@ use std::time::Duration;
 
 use jiff::{Timestamp, Unit};
 
-pub use batch::{BatchItemRequest, BatchRequest, MAX_BATCH_ITEMS, MadePolicies};
+pub use batch::{MAX_BATCH_ITEMS, MadePolicies};
 pub use caller::{Caller, Client};
 pub use hash::hash_of;
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};

@@ -9,8 +9,8 @@ use tokio::sync::mpsc;
 
 use super::compiler::{Compiler, LimitedTime};
 use super::hash::{hash_of, hex};
-use super::policies::MAX_INLINE_BYTES;
 use super::pool::Places;
+use super::search::MAX_INLINE_BYTES;
 use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::store::{

@@ -10,25 +10,27 @@
 //!
 //! Each attempt is counted before it begins, durably, and one that ends is taken back or the last: so what ends the process is given up
 //! after some times. A search that made way begins anew. So while all threads are needed all the time, policies stay what they are.
+//!
+//! This file is longer than 400 lines because its tests stand with it.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
-use serde::Deserialize;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 use uuid::Uuid;
 
-use super::policies::{
-    PolicyText, as_micros, read_weighted_request, report, take_for_demonstration, take_for_search, write_policy,
-};
+use super::refined::RefinedRequest;
+use super::requests::most_demonstration_bytes;
+use super::search::{PolicyText, as_micros, report, take_for_search, write_policy};
 use super::{Etude, PoolError, ServiceError};
 use crate::memory::Memory;
 use crate::store::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError};
-use etude_core::document;
+use etude_core::attribute::Weights;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
-use etude_core::mapping::{Cost, Mapper, Policy, Settings, Stamp, Status};
+use etude_core::mapping::{Demonstration, Mapper, Policy, Problem, Request, Settings, Stamp, Status};
+use etude_core::model::{Model, Origin, StateIdx};
 
 /// The first pause after a refinement that did not come to its end.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
@@ -170,38 +172,63 @@ impl Etude {
 
     /// The refined policy; `None` if the budget does not suffice to find it.
     async fn refine(&self, refinement: NewRefinement) -> Result<Option<PolicyText>, ServiceError> {
-        /// All that is wanted of the policy.
-        #[derive(Deserialize)]
-        struct Local {
-            cost: Cost,
-        }
-        let NewRefinement { policy_id, model_hash, session_id: _, request } = refinement;
-        let mut held = None;
-        self.memory.hold(&mut held, request.len() + document::parsed_bytes(request.as_bytes()))?;
-        let document = document::parse(request.as_bytes())?;
-        drop(request);
-        let model = document["model"].as_str().unwrap_or_default().to_owned();
-        let (hash, mapper) = self.mapper(&model, "/model", None, None).await?;
+        let NewRefinement { policy_id, model_hash, session_id, request } = refinement;
+        let refined: RefinedRequest<'_> = serde_json::from_str(&request).map_err(ServiceError::Write)?;
+        let (hash, mapper) = self.mapper(&refined.model, "/model", None, None).await?;
         if hash != model_hash {
             // Another one is there under its name.
-            return Err(ServiceError::Unknown { kind: "model", name: model, pointer: None });
+            let name = refined.model.into_owned();
+            return Err(ServiceError::Unknown { kind: "model", name, pointer: None });
         }
-        let local: Local = {
-            let (local, _held) = self.policy(&policy_id).await?;
-            serde_json::from_str(&local).map_err(ServiceError::Write)?
+        let (texts, held) = match (&session_id, refined.demonstration) {
+            (Some(session), _) => {
+                let n_observations = self.session(session).await?.n_observations;
+                self.stored_observations(session, n_observations, mapper.model()).await?
+            }
+            (None, Some(text)) => {
+                let mut held = None;
+                let n_bytes = request.len() + text.get().len() + most_demonstration_bytes(mapper.model(), text.get());
+                self.memory.hold(&mut held, n_bytes)?;
+                (vec![text.get().to_owned()], held)
+            }
+            (None, None) => (Vec::new(), None),
         };
-        let id = Uuid::now_v7().to_string();
-        let stamp = Stamp { id: Some(id), model, model_hash, refines: Some(policy_id), ..Stamp::default() };
-        let local_cost = local.cost.total;
+        let RefinedRequest { model, weights, start, cost, .. } = refined;
+        let stamp = Stamp {
+            id: Some(Uuid::now_v7().to_string()),
+            model: model.into_owned(),
+            model_hash,
+            refines: Some(policy_id.clone()),
+            ..Stamp::default()
+        };
+        drop(request);
         let (memory, limit) = (self.memory.clone(), self.time_limits.max_deadline);
         let job = move |interrupt: &mut dyn Interrupt| {
             let _held = held;
+            let corrupt = |error| StoreError::corrupt("refinements", "request", policy_id, error);
+            let schema = mapper.model().schema();
+            let weights = schema.attributes().iter().map(|attribute| weights.get(&attribute.name).copied());
+            let demonstration = Demonstration::read_again(schema, &texts, 0);
+            let problem = match (demonstration, weights.collect::<Option<Vec<f64>>>()) {
+                (Err(error), _) => return Ok(Err(corrupt(error.to_string()).into())),
+                (Ok(Some(demonstration)), Some(weights)) if has_state(mapper.model(), start) => {
+                    let start = Some(Origin::State(start));
+                    Problem::new(mapper.model(), demonstration, Weights::of(weights), start)
+                }
+                _ => return Ok(Err(corrupt("it does not fit its model".to_owned()).into())),
+            };
+            drop(texts);
             let began = Instant::now();
             let mut limited = || if began.elapsed() < limit { interrupt.poll() } else { Signal::Finish };
-            optimum(&mapper, &document, local_cost, stamp, &memory, &mut limited)
+            optimum(&mapper, problem, cost, stamp, &memory, &mut limited)
         };
         self.pool.run_to_spare(job).await?
     }
+}
+
+/// Whether a model, which was registered anew perhaps, has this state.
+fn has_state(model: &Model, state: StateIdx) -> bool {
+    !model.is_lazy() && state < model.states().len()
 }
 
 /// Whether what has failed may go through later: nothing is wrong with the refinement itself.
@@ -218,21 +245,13 @@ fn is_passing(error: &ServiceError) -> bool {
 /// or if its policy is too large.
 fn optimum(
     mapper: &Mapper,
-    document: &serde_json::Value,
+    problem: Problem<'_>,
     local_cost: f64,
     stamp: Stamp,
     memory: &Memory,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Option<PolicyText>, ServiceError>, Cancelled> {
-    let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
-    let _demonstration_held = match take_for_demonstration(mapper.model(), n_observations, memory) {
-        Ok(held) => held,
-        Err(no_room) => return Ok(Err(no_room.into())),
-    };
-    let mut request = match read_weighted_request(mapper.model(), document) {
-        Ok(request) => request,
-        Err(faults) => return Ok(Err(faults.into())),
-    };
+    let mut request = Request { problem, settings: Settings::default(), lookahead: None, deadline: None };
     let _held = take_for_search(mapper, &mut request, memory);
     let started = Instant::now();
     let settings = Settings { upper_bound: Some(local_cost), ..request.settings };
@@ -253,7 +272,6 @@ mod tests {
     use super::*;
     use crate::service::{Caller, Client, ModelText, Name};
     use crate::store::NewPolicy;
-    use etude_core::interrupt::Uninterrupted;
     use etude_core::model::Format;
 
     const NOW: Timestamp = Timestamp::UNIX_EPOCH;
@@ -289,7 +307,7 @@ mod tests {
         let etude = etude(directory.path()).await;
         let (hash, _) = etude.mapper("world", "/model", None, None).await.unwrap();
         for (id, policy, request) in [
-            ("unreadable", "{}", request().to_string()),
+            ("unreadable", "{}", json!({"model": "world", "weights": {}, "start": 0, "cost": 1}).to_string()),
             ("garbled", "{}", "{".to_owned()),
             ("gone", "{}", "{}".to_owned()),
         ] {
@@ -383,8 +401,11 @@ mod tests {
 
         // What is better, but not proven to be the best, is not it.
         let (_, mapper) = etude.mapper("world", "/model", None, None).await.unwrap();
-        (request["heuristic"], request["lookahead"]) = (Value::Null, Value::Null);
-        let refined = optimum(&mapper, &request, 1e9, Stamp::default(), &etude.memory, &mut Uninterrupted);
+        let schema = mapper.model().schema();
+        let text = request["demonstration"].to_string();
+        let demonstration = Demonstration::read_again(schema, &[text], 3).unwrap().unwrap();
+        let problem = Problem::new(mapper.model(), demonstration, schema.weights(), None);
+        let refined = optimum(&mapper, problem, 1e9, Stamp::default(), &etude.memory, &mut || Signal::Finish);
         assert!(refined.unwrap().unwrap().is_none());
     }
 }

@@ -1,20 +1,24 @@
 //! Trials: drawn, mapped, rewarded.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
 use serde_json::value::RawValue;
+use tokio_util::bytes::Bytes;
 use uuid::Uuid;
 
 use super::learners::{Ready, unknown};
-use super::policies::{self, Named, Searched};
+use super::requests::check_request;
+use super::search::{Searched, write};
 use super::{Caller, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::memory::Held;
 use crate::store::{FailureAnswer, NewReward, NewTrial, Opened, Page, RewardAnswer, StoreError, TrialRow, TrialStatus};
 use etude_core::attribute::{Schema, Weights};
-use etude_core::document::{Faults, Path, Place, Range};
-use etude_core::interrupt::Interrupt;
-use etude_core::mapping::Stamp;
+use etude_core::document::{Faults, Object, Path, Place, Range};
+use etude_core::learning::Learner;
+use etude_core::mapping::{RequestKind, Stamp};
+use etude_core::model::Model;
 
 /// Longest reason for a failure, in characters.
 const MAX_REASON_CHARS: usize = 1000;
@@ -43,66 +47,48 @@ impl Etude {
     pub async fn make_trial(
         &self,
         name: &Name,
-        body: impl AsRef<[u8]> + Send + 'static,
+        body: impl Into<Bytes>,
         caller: Caller,
     ) -> Result<TrialAnswer, ServiceError> {
+        let body = body.into();
         let Ready { sequence, name, learner, weights } = self.ready(name.as_str(), None).await?;
-        let place = self.pool.admit_when_needed(caller.client);
-        let is_small = body.as_ref().len() <= policies::MAX_INLINE_BYTES;
-        let (document, held) = policies::parse(body, &place, &self.memory).await?;
-        let (envelope, faults) = self.read_envelope(&document, &TRIAL_FIELDS, "demonstration");
-        let Some(envelope) = envelope else { return Err(faults.into()) };
-        let deadline = self.deadline(&envelope, caller.arrived);
-        let place = place.with_patience(deadline);
-        let Named { model_hash, mapper, .. } = self.find(&envelope, faults, &place, deadline).await?;
-
         let numbers = self.store.trial_numbers(sequence).await?;
         let id = Uuid::now_v7().to_string();
         let (policy_id, weights_version) = (Uuid::now_v7().to_string(), weights.version);
         let stamp = Stamp {
             id: Some(policy_id.clone()),
-            model: envelope.model,
-            model_hash,
             learner: Some(name.clone()),
             weights_version: Some(weights_version),
             ..Stamp::default()
         };
-        let lease_s = learner.lease_s();
-        let n_observations = document["demonstration"].as_array().map_or(0, Vec::len);
-        let is_quick = is_small && policies::is_quick(mapper.model(), &document, n_observations);
-        let memory = self.memory.clone();
-        let job = move |interrupt: &mut dyn Interrupt| {
-            let _held = held;
-            let mut drawn = None;
-            let base = |faults: &mut Faults| {
-                let schema = mapper.model().schema();
-                if let Err(missing) = learner.weights_for(schema, &learner.initial().mean) {
-                    faults.note_at(&Path::Member(&Path::Root, "model"), missing.to_string());
-                }
+        let (lease_s, learner) = (learner.lease_s(), Arc::new(learner));
+        let draw = {
+            let learner = Arc::clone(&learner);
+            move |model: &Model, _: Option<&Ready>, faults: &mut Faults| {
+                check_attributes(&learner, model, faults);
                 // A request with faults takes no number: the next trial is the same as if it had not been made.
                 if !faults.is_empty() {
                     return None;
                 }
                 let number = numbers.take();
-                let weights = learner.draw(&weights.distribution, number);
-                let all = learner.weights_for(schema, &weights).ok();
-                drawn = Some((number, policies::write(&learner.by_attribute(weights))));
-                all
-            };
-            let searched = policies::search(
-                &mapper,
-                (&document, &TRIAL_FIELDS, Faults::default()),
-                base,
-                stamp,
-                &memory,
-                interrupt,
-            )?;
-            Ok(searched.map(|searched| (searched, drawn)))
+                let drawn = learner.draw(&weights.distribution, number);
+                let all = learner.weights_for(model.schema(), &drawn).ok()?;
+                Some((all, (number, write(&learner.by_attribute(drawn)))))
+            }
         };
-        let made = if is_quick { self.pool.run_here(deadline, job)? } else { place.run(deadline, job).await? };
-        let (Searched { policy, row, refinement, held }, drawn) = made?;
-        drop(place);
-        let (number, weights) = drawn.ok_or(StoreError::Closed)?;
+        let searched = self.search(RequestKind::Trial, &body, stamp, caller, draw).await?;
+        let Some((searched, (number, weights))) = searched else {
+            let check = move |object: &Object<'_, '_>, model: &Model, _: Option<&Ready>, faults: &mut Faults| {
+                let weights = |faults: &mut Faults| {
+                    check_attributes(&learner, model, faults);
+                    None
+                };
+                check_request(object, model, weights, faults);
+            };
+            return Err(Box::pin(self.explain(RequestKind::Trial, body, caller, check)).await);
+        };
+        drop(body);
+        let Searched { policy, row, refinement, held } = searched;
         let weights = weights?;
 
         let now = as_stored(caller.now);
@@ -159,7 +145,7 @@ impl Etude {
             id: Uuid::now_v7().to_string(),
             learner: *sequence,
             number,
-            weights: policies::write(&learner.by_attribute(drawn))?,
+            weights: write(&learner.by_attribute(drawn))?,
             weights_version: weights.version,
             policy_id: Uuid::now_v7().to_string(),
             policy: None,
@@ -278,8 +264,12 @@ pub(super) struct Draw {
     pub(super) weights: Weights,
 }
 
-/// Every field of a request for a trial.
-const TRIAL_FIELDS: [&str; 4] = ["model", "demonstration", "start", "lookahead"];
+/// Notes which attributes of the learner the model lacks.
+fn check_attributes(learner: &Learner, model: &Model, faults: &mut Faults) {
+    if let Err(missing) = learner.weights_for(model.schema(), &learner.initial().mean) {
+        faults.note_at(&Path::Member(&Path::Root, "model"), missing.to_string());
+    }
+}
 
 fn unknown_trial(id: &str) -> ServiceError {
     ServiceError::Unknown { kind: "trial", name: id.to_owned(), pointer: None }

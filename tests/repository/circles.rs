@@ -9,21 +9,15 @@ use crate::sources::{Module, modules, references, uses};
 
 /// Circles of the core that are still to be opened.
 const CORE: &[&str] = &[
-    "mapping/mapper, mapping/request",
     "mapping/mapper, mapping/search",
     "mapping/mapper, mapping/search/best_first",
     "mapping/mapper, mapping/search/layered",
-    "mapping/online, mapping/request",
-    "mapping/policy, mapping/request",
-    "mapping/request, mapping/search",
     "mapping/search/nodes, mapping/search/seen",
 ];
 
 /// Circles of the service that are still to be opened.
 const SERVICE: &[&str] = &[
-    "service/batch, service/outline",
     "service/compiler, service/models",
-    "service/outline, service/policies",
     "store/alive, store/sessions",
     "store/arrivals, store/sessions",
     "store/arrivals, store/sessions/verbs",

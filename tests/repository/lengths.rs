@@ -24,8 +24,6 @@ const TO_DO: &[&str] = &[
     "src/service/batch.rs",
     "src/service/compiler.rs",
     "src/service/models.rs",
-    "src/service/outline.rs",
-    "src/service/policies.rs",
     "src/service/pool/mod.rs",
     "src/service/pool/turns.rs",
     "src/service/sessions/mod.rs",

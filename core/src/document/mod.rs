@@ -8,11 +8,13 @@
 //! A reader returns `Option`: `None` means that it noted at least one fault. [`Faults::check`] turns the two
 //! into a `Result` at the end.
 //!
-//! Hot paths deserialize valid input directly (such as a small demonstration), and use this reader to report faults.
+//! Hot paths deserialize valid input directly: they tell the [`Members`] of a request apart, and read its demonstration as what it is.
+//! They use this reader to report faults.
 //!
 //! This module knows no document in particular; those live beside the types that they describe.
 
 mod fault;
+mod members;
 mod parsing;
 mod path;
 mod place;
@@ -20,6 +22,7 @@ mod shown;
 mod size;
 
 pub use fault::{Fault, Faults};
+pub use members::Members;
 pub(crate) use parsing::BEYOND_FLOATS;
 pub use parsing::{ParseError, parse};
 pub use path::Path;

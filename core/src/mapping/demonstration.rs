@@ -86,10 +86,7 @@ impl Demonstration {
     ) -> Result<Option<Self>, serde_json::Error> {
         let mut values = Vec::with_capacity(n_observations * schema.len());
         for text in texts {
-            let mut deserializer = serde_json::Deserializer::from_str(text);
-            let read = WellFormed::in_text(schema, text.len()).deserialize(&mut deserializer)?;
-            deserializer.end()?;
-            values.extend(read.values);
+            values.extend(WellFormed::in_text(schema, text.len()).read(text)?.values);
         }
         Ok((!values.is_empty()).then_some(Self { values, n_attributes: schema.len() }))
     }
@@ -153,6 +150,18 @@ impl<'s> WellFormed<'s> {
         /// About what a value takes, with the name of its attribute.
         const VALUE_BYTES: usize = 12;
         Self { schema, n_values: n_bytes / VALUE_BYTES, max_len: Demonstration::MAX_OBSERVATIONS }
+    }
+
+    /// Reads all of `text`.
+    ///
+    /// # Errors
+    ///
+    /// If it is not well-formed.
+    pub fn read(self, text: &str) -> Result<Demonstration, serde_json::Error> {
+        let mut deserializer = serde_json::Deserializer::from_str(text);
+        let read = self.deserialize(&mut deserializer)?;
+        deserializer.end()?;
+        Ok(read)
     }
 }
 
@@ -286,10 +295,7 @@ mod tests {
     }
 
     fn read_well_formed(schema: &Schema, text: &str) -> Option<Demonstration> {
-        let mut deserializer = serde_json::Deserializer::from_str(text);
-        let read = WellFormed::in_text(schema, text.len()).deserialize(&mut deserializer).ok()?;
-        deserializer.end().ok()?;
-        Some(read)
+        WellFormed::in_text(schema, text.len()).read(text).ok()
     }
 
     /// A value that some attribute may have, and others may not.

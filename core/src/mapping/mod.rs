@@ -58,9 +58,6 @@ pub(crate) use online::longest_lookahead;
 pub use online::{CommittedStep, OnlineMapping, Stopped};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
 pub use problem::Problem;
-pub use request::Conditions;
-pub use request::{
-    ObservationDocument, ObservedDocument, Options, Request, RequestDocument, StartReference, read_lookahead,
-};
+pub use request::{ObservationDocument, ObservedDocument, Options, Request, RequestKind, StartReference};
 pub use search::{Move, MoveKind};
 pub use written::{ShortSteps, StoredPolicy, WriteError, WrittenPolicy};

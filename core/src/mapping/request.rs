@@ -1,4 +1,10 @@
-//! What a client asks for: a demonstration, and how it is to be followed.
+//! Requests: what a client may say, and what it comes to for a model.
+//!
+//! [`Options`] is the one description of what requests of all kinds may say: its fields are documented as clients see them (OpenAPI is
+//! derived from it), [`Options::read`] reads each of them and notes what is wrong with it, and [`RequestKind::fields`] says which request
+//! may have which. A new option needs a line in each.
+//!
+//! This file is longer than 400 lines because all that is said of an option stands together.
 
 use std::collections::BTreeMap;
 use std::num::NonZeroU32;
@@ -12,9 +18,228 @@ use super::{
     Stopped, StoppedBy, longest_lookahead,
 };
 use crate::attribute::{Scalar, Weights};
-use crate::document::{Faults, Object, Place};
+use crate::document::{Faults, Object, Path, Place};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::model::{Model, Origin, StateIdx};
+
+/// What is requested.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RequestKind {
+    /// A policy.
+    Policy,
+    /// Policies for many demonstrations.
+    Batch,
+    /// One of them.
+    Item,
+    /// A trial of a learner.
+    Trial,
+    /// A session, which observations are streamed to.
+    Session,
+}
+
+/// The names of a request's fields: its own ones, and those that every request has that maps.
+macro_rules! fields {
+    ($($own:literal),*) => {
+        &[$($own),*]
+    };
+}
+
+impl RequestKind {
+    /// The names of the fields that a request may have, in the order in which they are listed where one is unknown.
+    #[must_use]
+    pub const fn fields(self) -> &'static [&'static str] {
+        match self {
+            Self::Policy => fields![
+                "model",
+                "demonstration",
+                "weights",
+                "learner",
+                "lookahead",
+                "start",
+                "heuristic",
+                "max_expansions",
+                "deadline_ms"
+            ],
+            Self::Batch => fields![
+                "model",
+                "items",
+                "weights",
+                "learner",
+                "lookahead",
+                "start",
+                "heuristic",
+                "max_expansions",
+                "deadline_ms"
+            ],
+            Self::Item => fields!["demonstration", "weights", "lookahead", "start", "heuristic", "max_expansions"],
+            Self::Trial => fields!["model", "demonstration", "start", "lookahead"],
+            Self::Session => fields!["type", "model", "learner", "explore", "weights", "lookahead", "start"],
+        }
+    }
+
+    /// The field with what is to be followed, if the request has it.
+    #[must_use]
+    pub const fn observed(self) -> Option<&'static str> {
+        match self {
+            Self::Policy | Self::Item | Self::Trial => Some("demonstration"),
+            Self::Batch => Some("items"),
+            Self::Session => None,
+        }
+    }
+}
+
+/// What a request says besides what is to be followed.
+#[derive(Clone, Debug, Default, PartialEq)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+pub struct Options {
+    /// Weights by attribute name, each at least 0; attributes not named keep the model's. No attribute adds more than 1e150 to
+    /// a distance, however large its weight.
+    // By the attributes' positions.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, f64>>))]
+    pub weights: Vec<(usize, f64)>,
+    /// Where the imitator starts; the model's start if left out.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<StartReference>))]
+    pub start: Option<Origin>,
+    /// How many observations past the current one a decision may wait for; `null`: all. With a number, the policy is what a
+    /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`). It may reach so far that
+    /// the observations it spans times the model's states are 134 million. Not for a world that is searched lazily.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<u32>, minimum = 1, maximum = 100_000))]
+    pub lookahead: Option<NonZeroU32>,
+    /// What guides the search.
+    pub heuristic: Option<HeuristicName>,
+    /// Most nodes to expand; then the best mapping found so far is answered, with `status` `bounded`. With a lookahead, each
+    /// observation expands every state once, and again where its layer is made anew; then the rest is followed greedily.
+    pub max_expansions: Option<u64>,
+    /// Most milliseconds to search, waiting included; then as above. At most a day.
+    #[cfg_attr(feature = "openapi", schema(maximum = 86_400_000))]
+    pub deadline_ms: Option<u64>,
+}
+
+impl Options {
+    /// Longest deadline: a day.
+    const MAX_DEADLINE_MS: u64 = 86_400_000;
+
+    /// Reads the options among the members of `object`. Those that it does not have are those of `base`.
+    pub fn read(object: &Object<'_, '_>, model: &Model, base: &Self, faults: &mut Faults) -> Option<Self> {
+        let of_model = base.read_of_model(object, model, faults);
+        let general = Self::read_general(object, base, faults);
+        let Self { weights, start, .. } = of_model?;
+        Some(Self { weights, start, ..general? })
+    }
+
+    /// These options, with those of `object` that depend on the model.
+    pub fn read_of_model(&self, object: &Object<'_, '_>, model: &Model, faults: &mut Faults) -> Option<Self> {
+        let weights = match object.optional("weights") {
+            Some(place) => model.schema().read_named_weights(&place, faults),
+            None => Some(Vec::new()),
+        };
+        let start = match object.optional("start") {
+            Some(place) => model.read_start(&place, faults).map(Some),
+            None => Some(self.start.clone()),
+        };
+        let weights = self.weights.iter().copied().chain(weights?).collect();
+        Some(Self { weights, start: start?, ..*self })
+    }
+
+    /// Reads the options that do not depend on the model.
+    pub fn read_general(object: &Object<'_, '_>, base: &Self, faults: &mut Faults) -> Option<Self> {
+        let mut or_base = OrBase { object, faults };
+        let heuristic = or_base.read("heuristic", base.heuristic, read_heuristic);
+        let lookahead = or_base.read("lookahead", base.lookahead, read_lookahead);
+        let max_expansions =
+            or_base.read("max_expansions", base.max_expansions, |place, faults| place.integer(0, u64::MAX, faults));
+        let deadline_ms = or_base
+            .read("deadline_ms", base.deadline_ms, |place, faults| place.integer(0, Self::MAX_DEADLINE_MS, faults));
+        Some(Self {
+            weights: base.weights.clone(),
+            start: base.start.clone(),
+            lookahead: lookahead?,
+            heuristic: heuristic?,
+            max_expansions: max_expansions?,
+            deadline_ms: deadline_ms?,
+        })
+    }
+
+    /// The weights that are named, and those of `base` for the others.
+    #[must_use]
+    pub fn weights_over(&self, mut base: Weights) -> Weights {
+        for (position, weight) in &self.weights {
+            base.set(*position, *weight);
+        }
+        base
+    }
+
+    /// How long the search may take, counted from when the request arrived.
+    #[must_use]
+    pub fn deadline(&self) -> Option<Duration> {
+        self.deadline_ms.map(Duration::from_millis)
+    }
+
+    /// How to search.
+    fn settings(&self) -> Settings {
+        let max_expansions = self.max_expansions.unwrap_or(Budget::DEFAULT.max_expansions);
+        Settings {
+            heuristic: self.heuristic.unwrap_or_default(),
+            budget: Budget { max_expansions, ..Budget::DEFAULT },
+            upper_bound: None,
+        }
+    }
+
+    /// Notes a lookahead at all in a world that is searched lazily.
+    pub fn check_lookahead_is_possible(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
+        if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {
+            faults.note(&place, "this world is searched lazily, which needs the whole demonstration: leave this out");
+        }
+    }
+
+    /// Notes what is wrong with the lookahead for a demonstration of so many observations, whose window may take about `max_bytes`.
+    /// `object` is what the options were read from.
+    pub fn check_lookahead(
+        &self,
+        model: &Model,
+        n_observations: usize,
+        max_bytes: usize,
+        object: &Object<'_, '_>,
+        faults: &mut Faults,
+    ) {
+        let path = Path::Member(&object.path, "lookahead");
+        let Some(lookahead) = self.lookahead else { return };
+        if model.is_lazy() {
+            return;
+        }
+        let longest = longest_lookahead(model, max_bytes);
+        let reach = usize::try_from(lookahead.get()).unwrap_or(usize::MAX).min(n_observations.saturating_sub(1));
+        if reach > longest as usize {
+            let n_states = model.states().len();
+            let detail = format!(
+                "a lookahead over {reach} observations is too far for a model of {n_states} states, where it may be {longest}: \
+                 make it shorter, or leave it out"
+            );
+            faults.note_at(&path, detail);
+        }
+    }
+}
+
+/// Reads options of an object.
+struct OrBase<'o, 'f> {
+    object: &'o Object<'o, 'o>,
+    faults: &'f mut Faults,
+}
+
+impl OrBase<'_, '_> {
+    /// Reads the option called `name`, which is that of the `base` if it is missing.
+    fn read<T>(
+        &mut self,
+        name: &str,
+        base: Option<T>,
+        read: impl FnOnce(&Place<'_, '_>, &mut Faults) -> Option<T>,
+    ) -> Option<Option<T>> {
+        match self.object.optional(name) {
+            Some(place) => read(&place, self.faults).map(Some),
+            None => Some(base),
+        }
+    }
+}
 
 /// A request for a policy, checked against its model.
 #[derive(Debug)]
@@ -30,67 +255,46 @@ pub struct Request<'m> {
 }
 
 impl<'m> Request<'m> {
-    /// Longest deadline: a day.
-    const MAX_DEADLINE_MS: u64 = 86_400_000;
-
-    /// Every field of a request.
-    pub const FIELDS: [&'static str; 9] = [
-        "model",
-        "demonstration",
-        "weights",
-        "learner",
-        "lookahead",
-        "start",
-        "heuristic",
-        "max_expansions",
-        "deadline_ms",
-    ];
+    /// Every field of a request for a policy.
+    pub const FIELDS: &'static [&'static str] = RequestKind::Policy.fields();
 
     /// Reads a request against the model that it names. The names themselves (`model`, `learner`) are the caller's.
     pub fn read(model: &'m Model, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
-        Self::read_over(model, object, |_| Some(model.schema().weights()), faults)
+        let demonstration = Self::read_demonstration(model, object, faults);
+        Self::of(demonstration, model, object, &Options::default(), |_| Some(model.schema().weights()), faults)
     }
 
-    /// Reads a request like [`Self::read`], with weights from `base` where it names none. `base` is called last, so that it
-    /// knows whether faults were noted.
-    pub fn read_over(
-        model: &'m Model,
-        object: &Object<'_, '_>,
-        base: impl FnOnce(&mut Faults) -> Option<Weights>,
-        faults: &mut Faults,
-    ) -> Option<Self> {
-        let demonstration = object.required("demonstration", faults);
-        let demonstration = demonstration.and_then(|place| {
-            // Before it is read: small observations make as large steps as others.
-            let n_observations = place.value.as_array().map_or(0, Vec::len);
-            let is_answerable = n_observations > Demonstration::MAX_OBSERVATIONS
-                || Policy::check_size(model, n_observations, &place, faults);
-            is_answerable.then(|| Demonstration::read(model.schema(), &place, faults)).flatten()
-        });
-        Self::read_beside(demonstration, model, object, base, faults)
+    /// Reads the demonstration of a request.
+    pub fn read_demonstration(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Demonstration> {
+        let place = object.required("demonstration", faults)?;
+        // Before it is read: small observations make as large steps as others.
+        let n_observations = place.value.as_array().map_or(0, Vec::len);
+        let is_answerable = n_observations > Demonstration::MAX_OBSERVATIONS
+            || Policy::check_size(model, n_observations, &place, faults);
+        is_answerable.then(|| Demonstration::read(model.schema(), &place, faults)).flatten()
     }
 
-    /// Reads a request like [`Self::read_over`], whose demonstration was read before; `None` if that has faults. It must be one whose
-    /// policy is not too large.
-    pub fn read_beside(
+    /// The request to follow `demonstration` with the options of `object`, and those of `shared` for what it does not say. `None` for a
+    /// demonstration with faults, which are noted. `weights` are those from which the request starts; they are asked for last, so that
+    /// it is known whether faults were noted.
+    pub fn of(
         demonstration: Option<Demonstration>,
         model: &'m Model,
         object: &Object<'_, '_>,
-        base: impl FnOnce(&mut Faults) -> Option<Weights>,
+        shared: &Options,
+        weights: impl FnOnce(&mut Faults) -> Option<Weights>,
         faults: &mut Faults,
     ) -> Option<Self> {
-        let conditions = Conditions::read(model, object, faults);
-        let options = Self::read_options(object, faults);
-        Self::check_lookahead(model, object, faults);
-        if let (Some(Options { lookahead: Some(lookahead), .. }), Some(place)) = (options, object.optional("lookahead"))
-        {
+        let options = Options::read(object, model, shared, faults);
+        Options::check_lookahead_is_possible(model, object, faults);
+        if let Some(options) = &options {
             let n_observations = demonstration.as_ref().map_or(0, Demonstration::len);
-            Self::check_window(model, lookahead, n_observations, Budget::DEFAULT.max_bytes, &place, faults);
+            options.check_lookahead(model, n_observations, Budget::DEFAULT.max_bytes, object, faults);
         }
-        let base = base(faults)?;
-        let conditions = conditions?;
-        let Options { settings, lookahead, deadline } = options?;
-        let problem = Problem::new(model, demonstration?, conditions.weights_over(base), conditions.start);
+        let weights = weights(faults)?;
+        let options = options?;
+        let (settings, lookahead, deadline) = (options.settings(), options.lookahead, options.deadline());
+        let problem = Problem::new(model, demonstration?, options.weights_over(weights), options.start);
         Some(Self { problem, settings, lookahead, deadline })
     }
 
@@ -180,105 +384,10 @@ impl<'m> Request<'m> {
         let mapping = mapper.complete(&self.problem, moves, stopped_by, interrupt)?;
         Ok(Mapping { n_expanded, n_generated, ..mapping })
     }
-
-    /// Notes a lookahead at all in a world that is searched lazily.
-    pub fn check_lookahead(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
-        if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {
-            faults.note(&place, "this world is searched lazily, which needs the whole demonstration: leave this out");
-        }
-    }
-
-    /// Notes at `place` a lookahead over so many observations, at most, that would take more than about `max_bytes`.
-    pub fn check_window(
-        model: &Model,
-        lookahead: NonZeroU32,
-        n_observations: usize,
-        max_bytes: usize,
-        place: &Place<'_, '_>,
-        faults: &mut Faults,
-    ) {
-        let longest = longest_lookahead(model, max_bytes);
-        let reach = usize::try_from(lookahead.get()).unwrap_or(usize::MAX).min(n_observations.saturating_sub(1));
-        if !model.is_lazy() && reach > longest as usize {
-            let n_states = model.states().len();
-            let detail = format!(
-                "a lookahead over {reach} observations is too far for a model of {n_states} states, where it may be {longest}: \
-                 make it shorter, or leave it out"
-            );
-            faults.note(place, detail);
-        }
-    }
-
-    /// Reads what does not depend on the model.
-    pub fn read_options(object: &Object<'_, '_>, faults: &mut Faults) -> Option<Options> {
-        let heuristic = match object.optional("heuristic") {
-            Some(place) => read_heuristic(&place, faults),
-            None => Some(HeuristicName::Default),
-        };
-        let lookahead = match object.optional("lookahead") {
-            Some(place) => read_lookahead(&place, faults).map(Some),
-            None => Some(None),
-        };
-        let max_expansions = match object.optional("max_expansions") {
-            Some(place) => place.integer(0, u64::MAX, faults),
-            None => Some(Budget::DEFAULT.max_expansions),
-        };
-        let deadline = match object.optional("deadline_ms") {
-            Some(place) => place.integer(0, Self::MAX_DEADLINE_MS, faults).map(|ms| Some(Duration::from_millis(ms))),
-            None => Some(None),
-        };
-        let budget = Budget { max_expansions: max_expansions?, ..Budget::DEFAULT };
-        let settings = Settings { heuristic: heuristic?, budget, upper_bound: None };
-        Some(Options { settings, lookahead: lookahead?, deadline: deadline? })
-    }
-}
-
-/// Under which weights a demonstration is to be followed, and from where: what requests of all kinds may say.
-#[derive(Debug)]
-pub struct Conditions {
-    /// Weights by the attributes' positions.
-    named: Vec<(usize, f64)>,
-    /// The start, if one is named.
-    pub start: Option<Origin>,
-}
-
-impl Conditions {
-    /// Reads the members `weights` and `start`.
-    pub fn read(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
-        let named = match object.optional("weights") {
-            Some(place) => model.schema().read_named_weights(&place, faults),
-            None => Some(Vec::new()),
-        };
-        let start = match object.optional("start") {
-            Some(place) => model.read_start(&place, faults).map(Some),
-            None => Some(None),
-        };
-        Some(Self { named: named?, start: start? })
-    }
-
-    /// The weights that are named, and those of `base` for the others.
-    #[must_use]
-    pub fn weights_over(&self, mut base: Weights) -> Weights {
-        for (position, weight) in &self.named {
-            base.set(*position, *weight);
-        }
-        base
-    }
-}
-
-/// What a request says besides its problem.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Options {
-    /// How to search.
-    pub settings: Settings,
-    /// How many observations past the current one a decision may wait for; `None` for all.
-    pub lookahead: Option<NonZeroU32>,
-    /// How long it may take, counted from when the request arrived.
-    pub deadline: Option<Duration>,
 }
 
 /// Reads a lookahead: 1 to the most observations that there can be.
-pub fn read_lookahead(place: &Place<'_, '_>, faults: &mut Faults) -> Option<NonZeroU32> {
+fn read_lookahead(place: &Place<'_, '_>, faults: &mut Faults) -> Option<NonZeroU32> {
     let lookahead = place.integer(1, Demonstration::MAX_OBSERVATIONS as u64, faults)?;
     u32::try_from(lookahead).ok().and_then(NonZeroU32::new)
 }
@@ -289,46 +398,6 @@ fn read_heuristic(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Heuristi
         Some((_, heuristic)) => Some(heuristic),
         None => place.mismatch("one of \"default\", \"paper\", \"none\"", faults),
     }
-}
-
-/// A request for a policy, as it is written in JSON.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[cfg_attr(feature = "openapi", schema(as = PolicyRequest))]
-pub struct RequestDocument {
-    /// Name of the imitator's model.
-    #[cfg_attr(feature = "openapi", schema(example = "figure-4"))]
-    pub model: String,
-    /// The observed states, in order: 1 to 100,000, or fewer if the policy's states would take more than 64 MB. Attributes
-    /// may be missing or null: not observed.
-    pub demonstration: Vec<ObservationDocument>,
-    /// Weights by attribute name, each at least 0; attributes not named keep the model's. No attribute adds more than 1e150 to
-    /// a distance, however large its weight.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub weights: Option<BTreeMap<String, f64>>,
-    /// Name of a learner whose mean weights are used, for attributes that `weights` does not name.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub learner: Option<String>,
-    /// How many observations past the current one a decision may wait for; `null`: all. With a number, the policy is what a
-    /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`). It may reach so far that
-    /// the observations it spans times the model's states are 134 million. Not for a world that is searched lazily.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "openapi", schema(minimum = 1, maximum = 100_000))]
-    pub lookahead: Option<u32>,
-    /// Where the imitator starts; the model's start if left out.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub start: Option<StartReference>,
-    /// What guides the search.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub heuristic: Option<HeuristicName>,
-    /// Most nodes to expand; then the best mapping found so far is answered, with `status` `bounded`. With a lookahead, each
-    /// observation expands every state once, and again where its layer is made anew; then the rest is followed greedily.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub max_expansions: Option<u64>,
-    /// Most milliseconds to search, waiting included; then as above. At most a day.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "openapi", schema(maximum = 86_400_000))]
-    pub deadline_ms: Option<u64>,
 }
 
 /// An observed state: an object by attribute name, or an array of values in attribute order.

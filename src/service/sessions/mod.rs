@@ -17,9 +17,10 @@ use tokio_util::sync::CancellationToken;
 use session::Source;
 pub use session::{CommittedSteps, Ended, Observation, Received, RewardState, Session};
 
-use super::opening::{Names, Opening};
+use super::opening::{self, SessionOptions};
 use super::owners::{Ownership, TakenOver};
-use super::policies::{MAX_INLINE_BYTES, Named};
+use super::requests::Named;
+use super::search::MAX_INLINE_BYTES;
 use super::{Caller, Etude, PoolError, ServiceError};
 use crate::memory::Held;
 use crate::store::{
@@ -28,7 +29,10 @@ use crate::store::{
 use etude_core::attribute::{ByAttribute, Schema, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, time_until_finish};
-use etude_core::mapping::{Budget, CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, TooManySteps};
+use etude_core::mapping::{
+    Budget, CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, RequestKind, TooManySteps,
+};
+use etude_core::model::Model;
 
 /// Why a session could not do as told.
 #[derive(Debug, thiserror::Error)]
@@ -114,7 +118,7 @@ pub struct Resumed {
 }
 
 impl Etude {
-    /// Opens a session as `request` says: an object with the fields [`Session::OPEN_FIELDS`].
+    /// Opens a session as `request` says: an object with the fields of [`RequestKind::Session`].
     ///
     /// # Errors
     ///
@@ -123,20 +127,21 @@ impl Etude {
         let now = caller.now;
         let place = self.pool.admit_when_needed(caller.client);
         let mut faults = Faults::default();
-        let object = Place::root(request).object(&Session::OPEN_FIELDS, &mut faults);
-        let names = object.as_ref().and_then(|object| Names::read(object, &mut faults));
+        let object = Place::root(request).object(RequestKind::Session.fields(), &mut faults);
+        let read = object.as_ref().and_then(|object| opening::read_names(object, &mut faults));
+        let general = object.as_ref().and_then(|object| opening::read_general(object, &mut faults));
         // With the help of the model, more faults may be found; so those found without it wait.
-        let Some(Names { envelope, explores, lookahead }) = names else { return Err(faults.into()) };
-        let deadline = self.deadline(&envelope, caller.arrived);
-        let Named { learner, model_hash, mapper } = self.find(&envelope, faults.clone(), &place, deadline).await?;
+        let Some((names, explores)) = read else { return Err(faults.into()) };
+        let deadline = self.deadline(&names, caller.arrived);
+        let Named { learner, model_hash, mapper } = self.find(&names, faults.clone(), &place, deadline).await?;
         drop(place);
         // As much as a search may take.
         let max_bytes = usize::try_from(self.memory.room() / 2).unwrap_or(usize::MAX).min(Budget::DEFAULT.max_bytes);
-        let opening = object
+        let read = object
             .as_ref()
-            .and_then(|object| Opening::read(&mapper, learner.as_ref(), lookahead, object, max_bytes, &mut faults));
-        let Opening { mut weights, start } = faults.check(opening)?;
-        let model = envelope.model;
+            .and_then(|object| opening::read(&mapper, learner.as_ref(), general, object, max_bytes, &mut faults));
+        let SessionOptions { mut weights, start, lookahead } = faults.check(read)?;
+        let model = names.model;
 
         let mut trial = None;
         if let (true, Some(ready)) = (explores, &learner) {
@@ -251,7 +256,8 @@ impl Etude {
         };
         let mut steps = CommittedSteps::default();
         if session.n_received > 0 {
-            let (texts, _held) = self.stored_observations(&session).await?;
+            let (texts, _held) =
+                self.stored_observations(&session.id, session.n_received, session.mapper.model()).await?;
             let reading = {
                 let (mapper, id, n_received) = (Arc::clone(&session.mapper), session.id.clone(), session.n_received);
                 move || -> Result<Vec<Observation>, SessionError> {
@@ -304,16 +310,22 @@ impl Etude {
 
     /// The observations of a session as they are stored, and the memory that these, what is read of them, and what is written of
     /// them take, if it is much: taken before they are read.
-    async fn stored_observations(&self, session: &Session) -> Result<(Vec<String>, Option<Held>), SessionError> {
-        /// In a row, as they are given, and in a request.
-        const COPIES: usize = 3;
-        let n_bytes = usize::try_from(self.store.observations_bytes(&session.id).await?).unwrap_or(usize::MAX);
-        let (schema, n_received) = (session.mapper.model().schema(), session.n_received as usize);
+    pub(super) async fn stored_observations(
+        &self,
+        session: &str,
+        n_observations: u32,
+        model: &Model,
+    ) -> Result<(Vec<String>, Option<Held>), ServiceError> {
+        /// In a row, and as they are given.
+        const COPIES: usize = 2;
+        let n_bytes = usize::try_from(self.store.observations_bytes(session).await?).unwrap_or(usize::MAX);
+        let (schema, n_observations) = (model.schema(), n_observations as usize);
         // All together, and one by one.
-        let read_bytes = 2 * Demonstration::bytes_of(schema, n_received) + n_received * size_of::<Observation>();
+        let read_bytes =
+            2 * Demonstration::bytes_of(schema, n_observations) + n_observations * size_of::<Observation>();
         let mut held = None;
-        self.memory.hold(&mut held, COPIES.saturating_mul(n_bytes) + read_bytes).map_err(ServiceError::from)?;
-        Ok((self.store.observations(&session.id).await?, held))
+        self.memory.hold(&mut held, COPIES.saturating_mul(n_bytes) + read_bytes)?;
+        Ok((self.store.observations(session).await?, held))
     }
 
     /// The session with this id.

@@ -11,7 +11,8 @@ use tokio_util::sync::CancellationToken;
 use super::{SessionError, read_stored};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::service::owners::Ownership;
-use crate::service::policies::{PolicyText, as_micros, report, take_beyond_small, write_policy};
+use crate::service::refined::RefinedRequest;
+use crate::service::search::{PolicyText, as_micros, report, take_beyond_small, write_policy};
 use crate::service::{Client, Etude, PoolError, ServiceError};
 use crate::store::{AcceptedReward, NewObservations, NewRefinement, Owner, SessionEnd, TrialRow};
 use etude_core::attribute::{ByAttribute, Weights};
@@ -139,9 +140,6 @@ pub enum RewardState {
 }
 
 impl Session {
-    /// Every field of a request to open a session.
-    pub const OPEN_FIELDS: [&'static str; 7] = ["type", "model", "learner", "explore", "weights", "lookahead", "start"];
-
     /// Its id.
     #[must_use]
     pub fn id(&self) -> &str {
@@ -342,7 +340,7 @@ impl Session {
         if seq == 0 {
             return Err(SessionError::Empty);
         }
-        let (texts, texts_held) = etude.stored_observations(self).await?;
+        let (texts, texts_held) = etude.stored_observations(&self.id, self.n_received, self.mapper.model()).await?;
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let (mapper, weights, start) = (Arc::clone(&self.mapper), self.weights.clone(), self.start);
         let (id, n_committed, memory) = (self.id.clone(), self.n_steps, etude.memory.clone());
@@ -364,17 +362,16 @@ impl Session {
             let concluded = steps
                 .map_err(|no_room| ServiceError::from(no_room).into())
                 .and_then(|steps| conclude(online, steps, &mapper, (&id, seq, &texts), weights, start, stamp));
-            // The request for a refinement is to be stored.
-            Ok(concluded.map(|concluded| (concluded, texts_held)))
+            drop(texts_held);
+            Ok(concluded)
         };
-        let ((mut steps, policy, row, refinement), texts_held) = etude.pool.run_patiently(self.client, job).await??;
+        let (mut steps, policy, row, refinement) = etude.pool.run_patiently(self.client, job).await??;
         let is_refined = refinement.is_some();
         let end = SessionEnd { session_id: self.id.clone(), owner: self.owner, policy: row.at(now), refinement };
         etude.store.end_session(end).await??;
         if is_refined {
             etude.refiner.wake();
         }
-        drop(texts_held);
         steps.give_back(written_bytes(policy.steps.len(), self.mapper.model()));
         self.n_steps += steps.len();
         Ok(Ended { steps, policy })
@@ -431,35 +428,11 @@ fn conclude(
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
     let policy = Policy::new(stamp.clone(), &problem, &mapping);
-    let (_, row) = write_policy(stamp, &problem, &mapping)?;
-    let refinement = (policy.status == Status::Local).then(|| {
-        let request = serde_json::json!({
-            "model": policy.model,
-            "weights": policy.weights,
-            "start": problem.start(),
-        });
-        NewRefinement {
-            policy_id: policy.id.clone().unwrap_or_default(),
-            model_hash: policy.model_hash.clone(),
-            session_id: None,
-            request: with_demonstration(&request.to_string(), texts),
-        }
-    });
+    let (_, row) = write_policy(stamp.clone(), &problem, &mapping)?;
+    let refinement = (mapping.status == Status::Local)
+        .then(|| RefinedRequest::of(&stamp.model, &problem, mapping.cost).waiting(&stamp, Some(id)));
+    let refinement = refinement.transpose()?;
     Ok((steps, policy, row, refinement))
-}
-
-/// The object `request` with the member `demonstration`: the items of arrays, one after the other. All of it JSON.
-fn with_demonstration(request: &str, texts: &[String]) -> String {
-    let (before, between, after) = (request.strip_suffix('}').unwrap_or(request), r#","demonstration":["#, "]}");
-    let n_bytes = texts.iter().map(String::len).sum::<usize>();
-    let mut text = String::with_capacity(before.len() + between.len() + n_bytes + after.len());
-    text.extend([before, between]);
-    for (n, items) in texts.iter().enumerate() {
-        let items = items.strip_prefix('[').and_then(|items| items.strip_suffix(']'));
-        text.extend([if n == 0 { "" } else { "," }, items.unwrap_or_default()]);
-    }
-    text.push_str(after);
-    text
 }
 
 #[cfg(test)]
