@@ -24,6 +24,21 @@
 //!
 //! [`OnlineMapping`] does the same while the demonstration is still running.
 //!
+//! Which search is chosen, by the problem and the budget alone:
+//!
+//! | search | chosen when | why |
+//! |---|---|---|
+//! | `search::layered` | default heuristic; at most 65,536 nodes (observations times states); expansions allowed for twice as many, and memory for all | an expansion takes less than half of the time: figure 4 takes 13 microseconds rather than 24 |
+//! | `search::best_first` | default heuristic, in all other problems, also where states are found as it goes; and no heuristic, where it has no estimates | it looks at a small part of the nodes |
+//! | `search::sweep` | best first has expanded 65,536 nodes, or one in 16 if that is more, or memory is used up; all states are known | it takes a sixteenth of the time for a node and two bytes of memory |
+//! | `search::astar` | the paper's heuristic | that one is not consistent, and which of its mappings is found is part of what is reproduced |
+//! | `online` | a lookahead, or the demonstration is still running | layers of all states, of which a lookahead needs the last few only |
+//! | `completion` | a budget ran out before the last observation | there is always an answer |
+//!
+//! Best first begins with those tables of estimates alone that are small, and makes the others once it has expanded a sixteenth of
+//! their entries, as large tables may take longer than the search (`mapper::by_default`). What moves cost is said in `recurrence`,
+//! for all of them.
+//!
 //! **Ties.** Among mappings of equal cost the search returns the one that it comes to first, which is determined: what was
 //! found is given up only for what costs less. Of a node's successors `skip` is found first, then, by action, `match` before `extra`;
 //! the first way found to a node at its least cost is kept; costs are compared as the sums of floats along the path. Small problems

@@ -2,7 +2,7 @@
 //!
 //! | name | admissible | consistent | made of |
 //! |---|---|---|---|
-//! | `default` | yes | yes | exact costs of small projected problems ([`projection`]) |
+//! | `default` | yes | yes | exact costs of the problem projected on each attribute ([`projection`]) |
 //! | `none` | yes | yes | nothing: A* becomes Dijkstra's algorithm |
 //! | `paper` | no | no | differences and least action cost ([`paper`]) |
 

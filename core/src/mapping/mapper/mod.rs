@@ -1,12 +1,12 @@
 //! A model prepared for mapping.
 
-mod escalation;
-mod foretold;
+mod buffers;
+mod by_default;
+mod search_bytes;
 
 use std::any::Any;
 use std::iter::repeat_n;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::thread::{self, ThreadId};
+use std::sync::Arc;
 
 use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
@@ -15,13 +15,14 @@ use super::Problem;
 use super::completion::{Allowance, Extras, complete};
 use super::cost::{Cost, ROUNDING, SLACK, cost_of};
 use super::heuristic::paper::Paper;
-use super::heuristic::projected::{self, Projected, TableRoom};
+use super::heuristic::projected::{Projected, TableRoom};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Blind, Heuristic, HeuristicName};
-use super::search::{Found, Move, astar, best_first, layered};
+use super::search::{Found, Move, astar, layered};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
 use crate::model::{Model, Space, StateIdx, States};
-use escalation::Patience;
+use buffers::{BufferPool, Buffers};
+use by_default::Patience;
 
 /// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -151,37 +152,11 @@ pub struct Mapping {
 pub struct Mapper {
     model: Arc<Model>,
     projections: Projections,
-    /// Of searches that have ended, for those that come: at most as many as ran at the same time, each with the thread that used it
-    /// last, whose processor may still have it in its cache.
-    buffers: Mutex<Vec<(ThreadId, Box<Buffers>)>>,
+    buffers: BufferPool,
     patience: Patience,
     /// See [`Self::keeping`].
     #[expect(dead_code, reason = "it is kept to be dropped")]
     kept: Option<Box<dyn Any + Send + Sync>>,
-}
-
-/// Buffers of a search, kept to be used again.
-#[derive(Debug, Default)]
-struct Buffers {
-    solving: projected::Buffers,
-    searching: best_first::Buffers,
-    layered: layered::Buffers,
-}
-
-impl Buffers {
-    /// Searches of which they are kept: as many as there are processors for, mostly.
-    const MAX_KEPT: usize = 4;
-
-    /// Most that are kept of a search.
-    const MAX_KEPT_BYTES: usize = 16 << 20;
-
-    /// And no more than this part of what it may take.
-    const PART_KEPT: usize = 8;
-
-    /// How much memory they take, in bytes.
-    fn size_bytes(&self) -> usize {
-        size_of::<Self>() + self.solving.kept_bytes() + self.searching.kept_bytes() + self.layered.kept_bytes()
-    }
 }
 
 impl Mapper {
@@ -203,7 +178,7 @@ impl Mapper {
     pub fn within(model: Model, max_bytes: usize, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
         let left = max_bytes.saturating_sub(model.size_bytes());
         let projections = Projections::new(&model, left, interrupt)?;
-        let (model, buffers) = (Arc::new(model), Mutex::default());
+        let (model, buffers) = (Arc::new(model), BufferPool::default());
         Ok(Self { model, projections, buffers, patience: Patience::DEFAULT, kept: None })
     }
 
@@ -227,17 +202,12 @@ impl Mapper {
     /// searches as ran at the same time, up to 16 MB each are kept.
     #[must_use]
     pub fn size_bytes(&self) -> usize {
-        let buffers: usize = self.buffers().iter().map(|(_, buffers)| buffers.size_bytes()).sum();
-        self.model.size_bytes() + self.projections.size_bytes() + buffers
+        self.model.size_bytes() + self.projections.size_bytes() + self.buffers.size_bytes()
     }
 
     /// Gives back what was kept of searches. The next ones take longer, and find the same.
     pub fn release(&self) {
-        drop(std::mem::take(&mut *self.buffers()));
-    }
-
-    fn buffers(&self) -> MutexGuard<'_, Vec<(ThreadId, Box<Buffers>)>> {
-        self.buffers.lock().unwrap_or_else(PoisonError::into_inner)
+        self.buffers.release();
     }
 
     /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the
@@ -337,7 +307,7 @@ impl Mapper {
         }
         let solved = self.solve(problem, TableRoom::within(budget.max_bytes), interrupt)?;
         let Some(projected) = solved.filter(Projected::are_all_in_columns) else { return Ok(None) };
-        let found = self.with_buffers(budget.max_bytes, |Buffers { layered, .. }| {
+        let found = self.buffers.lend(budget.max_bytes, |Buffers { layered, .. }| {
             layered::search(problem, &projected, budget, most_f, layered, interrupt)
         })?;
         conclude(problem, space, &projected, within(most_f, found, problem), interrupt).map(Some)
@@ -350,32 +320,9 @@ impl Mapper {
         room: TableRoom,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Projected<'p>>, Cancelled> {
-        self.with_buffers(room.max_bytes, |Buffers { solving, .. }| {
+        self.buffers.lend(room.max_bytes, |Buffers { solving, .. }| {
             Projected::solve(&self.projections, problem, room, solving, interrupt)
         })
-    }
-
-    /// Does `work`, which may take so much memory, with buffers of work that was done before, if there are any.
-    fn with_buffers<T>(
-        &self,
-        max_bytes: usize,
-        work: impl FnOnce(&mut Buffers) -> Result<T, Cancelled>,
-    ) -> Result<T, Cancelled> {
-        let thread = thread::current().id();
-        let take = |kept: &mut Vec<(ThreadId, Box<Buffers>)>| {
-            let own = kept.iter().position(|(user, _)| *user == thread);
-            own.or(kept.len().checked_sub(1)).map(|at| kept.swap_remove(at).1)
-        };
-        let mut buffers = take(&mut self.buffers()).unwrap_or_default();
-        let done = work(&mut buffers)?;
-        // What is kept is there beside what a search goes on to do.
-        if buffers.size_bytes() <= Buffers::MAX_KEPT_BYTES.min(max_bytes / Buffers::PART_KEPT) {
-            let mut kept = self.buffers();
-            if kept.len() < Buffers::MAX_KEPT {
-                kept.push((thread, buffers));
-            }
-        }
-        Ok(done)
     }
 
     fn check(&self, problem: &Problem<'_>) {

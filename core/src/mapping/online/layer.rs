@@ -64,14 +64,14 @@ pub(super) struct Layer {
     pub(super) observed: ObservedDistances,
     /// Costs of the ways; infinite where there is none. Shape `[n_states]`; empty once they were forgotten.
     pub(super) costs: Vec<f64>,
-    nodes: Nodes,
+    nodes: LayerNodes,
     n_alive: usize,
     /// How many states there may be a way to; nothing was written of others.
     n_reached: usize,
 }
 
 #[derive(Debug)]
-enum Nodes {
+enum LayerNodes {
     /// Shape `[n_states]`.
     Dense(Vec<Node>),
     /// Those that are alive.
@@ -114,16 +114,16 @@ impl Layer {
 
     pub(super) fn node(&self, state: StateIdx) -> Node {
         match &self.nodes {
-            Nodes::Dense(nodes) => nodes[state as usize],
-            Nodes::Sparse(nodes) => nodes.get(&state).copied().unwrap_or(Node::ABSENT),
+            LayerNodes::Dense(nodes) => nodes[state as usize],
+            LayerNodes::Sparse(nodes) => nodes.get(&state).copied().unwrap_or(Node::ABSENT),
         }
     }
 
     /// The node of a state that there is one of.
     fn node_mut(&mut self, state: StateIdx) -> &mut Node {
         match &mut self.nodes {
-            Nodes::Dense(nodes) => &mut nodes[state as usize],
-            Nodes::Sparse(nodes) => nodes.get_mut(&state).expect("what a survivor hangs on is kept"),
+            LayerNodes::Dense(nodes) => &mut nodes[state as usize],
+            LayerNodes::Sparse(nodes) => nodes.get_mut(&state).expect("what a survivor hangs on is kept"),
         }
     }
 
@@ -151,8 +151,8 @@ impl Layer {
     pub(super) fn kill(&mut self, state: StateIdx) {
         self.n_alive -= 1;
         match &mut self.nodes {
-            Nodes::Dense(nodes) => nodes[state as usize].n_children = Node::DEAD,
-            Nodes::Sparse(nodes) => drop(nodes.remove(&state)),
+            LayerNodes::Dense(nodes) => nodes[state as usize].n_children = Node::DEAD,
+            LayerNodes::Sparse(nodes) => drop(nodes.remove(&state)),
         }
     }
 
@@ -160,14 +160,14 @@ impl Layer {
     pub(super) fn kill_all(&mut self) {
         self.n_alive = 0;
         match &mut self.nodes {
-            Nodes::Dense(nodes) => nodes.iter_mut().for_each(|node| node.n_children = Node::DEAD),
-            Nodes::Sparse(nodes) => nodes.clear(),
+            LayerNodes::Dense(nodes) => nodes.iter_mut().for_each(|node| node.n_children = Node::DEAD),
+            LayerNodes::Sparse(nodes) => nodes.clear(),
         }
     }
 
     /// Lets every node that has a way live: the newest layer's are the survivors. There are none but at `reached`.
     pub(super) fn revive_all(&mut self, reached: &[StateIdx]) {
-        let Nodes::Dense(nodes) = &mut self.nodes else { return };
+        let LayerNodes::Dense(nodes) = &mut self.nodes else { return };
         self.n_alive = 0;
         for state in reached.iter().map(|state| *state as usize) {
             let is_reached = self.costs[state].is_finite();
@@ -181,8 +181,8 @@ impl Layer {
         /// Of a hash table, with the free ones beside it.
         const ENTRY_BYTES: usize = 16;
         let n_node_bytes = match &self.nodes {
-            Nodes::Dense(nodes) => nodes.len() * size_of::<Node>(),
-            Nodes::Sparse(nodes) => nodes.capacity() * ENTRY_BYTES,
+            LayerNodes::Dense(nodes) => nodes.len() * size_of::<Node>(),
+            LayerNodes::Sparse(nodes) => nodes.capacity() * ENTRY_BYTES,
         };
         size_of::<Self>() + n_node_bytes + self.costs.len() * size_of::<f64>() + self.observed.size_bytes()
     }
@@ -199,22 +199,22 @@ impl Layer {
     pub(super) fn thin(&mut self) -> Option<Vec<Node>> {
         /// A hash table's entry is taken for this many of an array's.
         const ENTRY: usize = 16;
-        let Nodes::Dense(nodes) = &self.nodes else { return None };
+        let LayerNodes::Dense(nodes) = &self.nodes else { return None };
         if self.n_alive * ENTRY > nodes.len() {
             return None;
         }
         let alive = (0..).zip(nodes.iter().copied()).filter(|(_, node)| node.is_alive()).collect();
-        match std::mem::replace(&mut self.nodes, Nodes::Sparse(alive)) {
-            Nodes::Dense(nodes) => Some(nodes),
-            Nodes::Sparse(_) => None,
+        match std::mem::replace(&mut self.nodes, LayerNodes::Sparse(alive)) {
+            LayerNodes::Dense(nodes) => Some(nodes),
+            LayerNodes::Sparse(_) => None,
         }
     }
 
     /// What can be filled again.
     pub(super) fn into_spare(self) -> (Spare, ObservedDistances) {
         let nodes = match self.nodes {
-            Nodes::Dense(nodes) => nodes,
-            Nodes::Sparse(_) => Vec::new(),
+            LayerNodes::Dense(nodes) => nodes,
+            LayerNodes::Sparse(_) => Vec::new(),
         };
         (Spare { costs: self.costs, nodes, n_reached: self.n_reached }, self.observed)
     }
@@ -270,7 +270,8 @@ impl Sweep {
                 self.extras(model, state, &mut costs, &mut nodes, |_, _| true);
             }
         }
-        let mut layer = Layer { observed, costs, nodes: Nodes::Dense(nodes), n_alive: 0, n_reached: reached.len() };
+        let mut layer =
+            Layer { observed, costs, nodes: LayerNodes::Dense(nodes), n_alive: 0, n_reached: reached.len() };
         layer.revive_all(reached);
         layer
     }
@@ -323,7 +324,7 @@ impl Sweep {
             }
         }
         let n_alive = reached.len();
-        Layer { observed, costs, nodes: Nodes::Dense(nodes), n_alive, n_reached: n_alive }
+        Layer { observed, costs, nodes: LayerNodes::Dense(nodes), n_alive, n_reached: n_alive }
     }
 
     /// Takes extras from `state`; what they improve is looked at later if `leads_on`.

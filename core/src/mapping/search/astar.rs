@@ -26,7 +26,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
 ) -> Result<Found, Cancelled> {
     let last = problem.last();
     let actions = problem.model.actions();
-    let mut nodes = Nodes::default();
+    let mut nodes = FoundNodes::default();
     let mut open = BinaryHeap::new();
     // With what was taken out.
     let mut most_open = 0;
@@ -35,7 +35,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
 
     let row = space.row(problem.start);
     let g = MoveKind::Start.arrive(0.0, problem.distances.distance(0, row));
-    let first = nodes.reach(Way { observation: 0, state: problem.start, g, action: NO_ACTION, parent: 0 });
+    let first = nodes.reach(CheapestWay { observation: 0, state: problem.start, g, action: NO_ACTION, parent: 0 });
     open.extend(first.map(|id| Open { f: g + heuristic.cost_to_go(0, row), g, observation: 0, id }));
     // The farthest expanded node, and among those the most promising: where a search out of budget goes on greedily.
     let mut farthest = Open { f: f64::INFINITY, g, observation: 0, id: 0 };
@@ -52,7 +52,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             return Ok(Found { paths, is_complete: true, stopped_by: None, least_f, n_expanded, n_generated });
         }
         // Whatever is left of an expansion that is broken off costs at least the `f` of its node.
-        let unfinished = |stopped_by, nodes: &Nodes, farthest: Open, n_expanded, n_generated| {
+        let unfinished = |stopped_by, nodes: &FoundNodes, farthest: Open, n_expanded, n_generated| {
             let paths = [entry.id, farthest.id, 0].map(|id| nodes.path(id)).to_vec();
             let (least_f, stopped_by) = (entry.f, Some(stopped_by));
             Ok(Found { paths, is_complete: false, stopped_by, least_f, n_expanded, n_generated })
@@ -94,7 +94,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             let g = kind.arrive(node.g + cost, problem.distances.distance(i, row));
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
             let observation = i as u32;
-            if let Some(id) = nodes.reach(Way { observation, state, g, action, parent: entry.id }) {
+            if let Some(id) = nodes.reach(CheapestWay { observation, state, g, action, parent: entry.id }) {
                 open.push(Open { f: g + heuristic.cost_to_go(i, row), g, observation, id });
             }
         }
@@ -106,7 +106,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
 /// Whether there is no memory left. `most_open` nodes were open at the same time.
 fn is_out_of_memory(
     budget: Budget,
-    nodes: &mut Nodes,
+    nodes: &mut FoundNodes,
     open: &mut BinaryHeap<Open>,
     most_open: usize,
     space: &mut impl Space,
@@ -127,7 +127,7 @@ fn is_out_of_memory(
 
 /// The cheapest way found so far to a node.
 #[derive(Clone, Copy, Debug)]
-struct Way {
+struct CheapestWay {
     /// Cost of the way, `g`.
     g: f64,
     /// Where it came from.
@@ -142,8 +142,8 @@ type NodeId = u32;
 
 /// The nodes that were found, and where each is.
 #[derive(Default)]
-struct Nodes {
-    ways: Vec<Way>,
+struct FoundNodes {
+    ways: Vec<CheapestWay>,
     /// By observation and state.
     ids: FxHashMap<(u32, StateIdx), NodeId>,
 }
@@ -155,22 +155,22 @@ const ENTRY_BYTES: usize = 4 * size_of::<((u32, StateIdx), NodeId)>();
 pub(in crate::mapping) fn most_bytes(n_nodes: usize) -> usize {
     /// How often a node is open, at different costs.
     const N_TIMES_OPEN: usize = 4;
-    n_nodes.saturating_mul(size_of::<Way>() + ENTRY_BYTES + N_TIMES_OPEN * size_of::<Open>())
+    n_nodes.saturating_mul(size_of::<CheapestWay>() + ENTRY_BYTES + N_TIMES_OPEN * size_of::<Open>())
 }
 
-impl Nodes {
+impl FoundNodes {
     /// How much memory they take, in bytes, with their places in the index.
     fn size_bytes(&self) -> usize {
         size_of_val(self.ways.as_slice()) + self.ids.len() * ENTRY_BYTES
     }
 
-    fn get(&self, id: NodeId) -> &Way {
+    fn get(&self, id: NodeId) -> &CheapestWay {
         &self.ways[id as usize]
     }
 
     /// Takes note of a way to a node. Gives the node's id if the way is cheaper than any before.
     #[inline]
-    fn reach(&mut self, way: Way) -> Option<NodeId> {
+    fn reach(&mut self, way: CheapestWay) -> Option<NodeId> {
         #[expect(clippy::cast_possible_truncation, reason = "budgets keep nodes far below 2^32")]
         let next = self.ways.len() as NodeId;
         let id = *self.ids.entry((way.observation, way.state)).or_insert(next);

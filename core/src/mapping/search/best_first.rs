@@ -11,12 +11,14 @@
 //! none of the many whose `f` equals it. As incumbents bound `f`, the open list needs no heap: costs are
 //! divided into [`Buckets`]. The order within a bucket is not that of `f`, so a node may be expanded before the cheapest way to it is
 //! known; it is then expanded again.
+//!
+//! Probes and the search share the expansion, its budget and what is found, so they stand in one file, however long.
 
 use std::collections::BinaryHeap;
 use std::ops::Range;
 
 use super::buckets::Buckets;
-use super::nodes::{Arrival, BlockIdx, NO_NODE, NodeId, Nodes, Reached, Step};
+use super::nodes::{Arrival, BlockIdx, NO_NODE, NodeId, Nodes, Position, Reached};
 use super::seen::{Estimates, Seen, SeenIdx, Way};
 use super::{End, Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
@@ -35,9 +37,9 @@ const PROBE_SHARE: u64 = 16;
 /// How a search ends that the interrupt said to finish.
 const OUT_OF_TIME: End = End::CutShort(StoppedBy::Deadline);
 
-/// Buffers of a search, kept to be used again.
+/// SearchBuffers of a search, kept to be used again.
 #[derive(Debug, Default)]
-pub(in crate::mapping) struct Buffers {
+pub(in crate::mapping) struct SearchBuffers {
     seen: Seen,
     nodes: Nodes,
     open: Open,
@@ -63,7 +65,7 @@ pub(in crate::mapping) fn most_bytes(model: &Model, n_observations: usize) -> us
     nodes.saturating_add(n_nodes.saturating_mul(N_TIMES_OPEN * Buckets::ENTRY_BYTES)).saturating_add(seen)
 }
 
-impl Buffers {
+impl SearchBuffers {
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
         self.seen.kept_bytes() + self.nodes.kept_bytes() + self.open.kept_bytes()
@@ -88,10 +90,10 @@ pub(in crate::mapping) fn search<S: Space>(
     projected: &Projected<'_>,
     budget: Budget,
     most: f64,
-    buffers: &mut Buffers,
+    buffers: &mut SearchBuffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
-    let Buffers { seen, nodes, open } = buffers;
+    let SearchBuffers { seen, nodes, open } = buffers;
     seen.prepare(space, projected);
     nodes.clear(problem.demonstration.len());
     open.buckets.clear();
@@ -332,8 +334,8 @@ impl<S: Space> Search<'_, '_, S> {
     /// Follows the moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper
     /// way.
     #[inline]
-    fn expand(&mut self, id: NodeId, g: f64, step: Step, ways: Range<usize>, mut found: impl FnMut(Reached, u32)) {
-        let Step { state, observation: here, kind } = step;
+    fn expand(&mut self, id: NodeId, g: f64, step: Position, ways: Range<usize>, mut found: impl FnMut(Reached, u32)) {
+        let Position { state, observation: here, kind } = step;
         let next = here + 1;
         let (may_skip, may_linger) = (MoveKind::Skip.may_follow(kind), MoveKind::Extra.may_follow(kind));
         self.nodes.close(id);

@@ -9,42 +9,43 @@
 //! What one pass has expanded the next ones do not expand again, unless they come to it more cheaply (Vadlamudi, Gaurav, Aine &
 //! Chakrabarti 2012, "Anytime Column Search"). These are the nodes that A* expands, and some more, as the limit is a little
 //! above the optimum in the last pass. But there is no open list to keep in order, and nodes are found without an index: an
-//! expansion takes less than half of the time that it takes [`best_first`](super::best_first). In larger problems beams miss the
+//! expansion takes less than half of the time that it takes [`best_first`](super::best_first): figure 4 takes that 1.8 times as long. In larger problems beams miss the
 //! optimum by more, and there are too many nodes for each to have a place.
 
-use rustc_hash::FxHashMap;
+mod joined;
 
 use super::{End, Found, Move, MoveKind, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
-use crate::mapping::heuristic::projected::{CHUNK_LEN, ChangingColumn, Estimate, Projected};
+use crate::mapping::heuristic::projected::{Estimate, Projected};
 use crate::mapping::{Budget, Problem, StoppedBy};
 use crate::model::{ActionIdx, Model, StateIdx};
+use joined::JoinedTables;
 
 /// How many nodes of each layer the beams expand, one beam after the other.
 const BEAM_WIDTHS: [usize; 2] = [1, 8];
 
 const WIDEST_BEAM: usize = BEAM_WIDTHS[BEAM_WIDTHS.len() - 1];
 
-/// Buffers of a search, kept to be used again by searches of the same model.
+/// LayeredBuffers of a search, kept to be used again by searches of the same model.
 #[derive(Debug, Default)]
-pub(in crate::mapping) struct Buffers {
-    body: Body,
-    parts: Parts,
-    nodes: Nodes,
+pub(in crate::mapping) struct LayeredBuffers {
+    ways_out: WaysOut,
+    tables: JoinedTables,
+    nodes: LayeredNodes,
 }
 
 /// The ways out of all states.
 #[derive(Debug, Default)]
-struct Body {
-    ways: Vec<Way>,
+struct WaysOut {
+    ways: Vec<WayOut>,
     /// By state, where its ways end.
     ends: Vec<usize>,
 }
 
 /// A way out of a state.
 #[derive(Clone, Copy, Debug)]
-struct Way {
+struct WayOut {
     cost: f64,
     from: StateIdx,
     to: StateIdx,
@@ -53,12 +54,12 @@ struct Way {
 
 /// All nodes, observation by observation. Shapes `[n_observations, n_states]`.
 #[derive(Debug, Default)]
-struct Nodes {
+struct LayeredNodes {
     n_states: usize,
     /// Of the cheapest way that was found, before the distance is paid; infinite if none was.
     costs: Vec<f64>,
     /// How that way ends; means nothing if there is none.
-    links: Vec<Link>,
+    links: Vec<LastStep>,
     /// Whether a way was found since the node was last expanded.
     are_open: Vec<bool>,
     /// The states of these nodes, by observation.
@@ -67,9 +68,9 @@ struct Nodes {
 
 /// How the way to a node ends: with an action, numbered as the way out of a state that it goes, or without one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Link(u32);
+struct LastStep(u32);
 
-impl Link {
+impl LastStep {
     const START: Self = Self(u32::MAX);
     const SKIP: Self = Self(u32::MAX - 1);
 
@@ -102,28 +103,26 @@ impl Link {
     }
 }
 
-impl Buffers {
+impl LayeredBuffers {
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
-        let Self { body, parts, nodes } = self;
-        let joined = parts.joined.len() * parts.columns.len() * size_of::<u32>();
-        body.ways.capacity() * size_of::<Way>()
-            + body.ends.capacity() * STATE_BYTES
-            + joined
-            + parts.entries.capacity() * size_of::<Estimate>()
+        let Self { ways_out, tables, nodes } = self;
+        ways_out.ways.capacity() * size_of::<WayOut>()
+            + ways_out.ends.capacity() * STATE_BYTES
+            + tables.kept_bytes()
             + nodes.costs.capacity() * NODE_BYTES
     }
 }
 
 /// How much memory a node takes, in bytes: with its place among those that are open, and with the room for more of these.
-const NODE_BYTES: usize = size_of::<f64>() + size_of::<Link>() + size_of::<bool>() + 2 * size_of::<StateIdx>();
+const NODE_BYTES: usize = size_of::<f64>() + size_of::<LastStep>() + size_of::<bool>() + 2 * size_of::<StateIdx>();
 
 /// How much memory a state takes, in bytes: where its ways end, its classes, and as many distinct ones.
 const STATE_BYTES: usize = size_of::<usize>() + size_of::<[u32; 2]>() + 2 * size_of::<Vec<u32>>();
 
 /// How much memory a search takes of `n_nodes` of `model`, in bytes.
 pub(in crate::mapping) fn bytes_for(model: &Model, n_nodes: usize) -> usize {
-    let ways = model.graph().n_transitions() * size_of::<Way>();
+    let ways = model.graph().n_transitions() * size_of::<WayOut>();
     // There are no more than two distinct classes of each state, and an entry of these for each observation.
     let nodes = n_nodes.saturating_mul(NODE_BYTES + 2 * size_of::<Estimate>());
     nodes.saturating_add(ways + model.graph().n_states() * STATE_BYTES)
@@ -156,17 +155,17 @@ pub(in crate::mapping) fn search(
     projected: &Projected<'_>,
     budget: Budget,
     most: f64,
-    buffers: &mut Buffers,
+    buffers: &mut LayeredBuffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
-    let Buffers { body, parts, nodes } = buffers;
-    body.prepare(problem.model);
-    parts.prepare(problem, projected);
+    let LayeredBuffers { ways_out, tables, nodes } = buffers;
+    ways_out.prepare(problem.model);
+    tables.prepare(problem, projected);
     nodes.prepare(problem);
     let mut search = Search {
         last: problem.last(),
-        body,
-        parts,
+        ways_out,
+        tables,
         nodes,
         limit: most.next_up(),
         rounding: rounding_of_sums(problem.demonstration.len()),
@@ -186,10 +185,10 @@ pub(in crate::mapping) fn search(
     let least_f = if is_complete { f64::INFINITY } else { search.least_f() };
     let Search { cheapest, n_expanded, n_generated, .. } = search;
     Ok(Found {
-        paths: vec![
-            cheapest
-                .map_or_else(|| nodes.path(body, 0, problem.start), |state| nodes.path(body, problem.last(), state)),
-        ],
+        paths: vec![cheapest.map_or_else(
+            || nodes.path(ways_out, 0, problem.start),
+            |state| nodes.path(ways_out, problem.last(), state),
+        )],
         is_complete,
         stopped_by: end.stopped_by(),
         least_f,
@@ -201,9 +200,9 @@ pub(in crate::mapping) fn search(
 struct Search<'s> {
     /// The last observation.
     last: usize,
-    body: &'s Body,
-    parts: &'s Parts,
-    nodes: &'s mut Nodes,
+    ways_out: &'s WaysOut,
+    tables: &'s JoinedTables,
+    nodes: &'s mut LayeredNodes,
     /// Mappings of this cost or more are of no interest.
     limit: f64,
     /// What is less than this cheaper, as a part of the cost, is not looked for.
@@ -232,12 +231,12 @@ impl Search<'_> {
 
     /// What mappings must cost less than for no more than `width` of the open nodes of a layer to be expanded, equals aside.
     fn limit_of_beam(&self, observation: usize, width: usize) -> f64 {
-        let entries = self.parts.at(observation);
+        let entries = self.tables.at(observation);
         let costs = &self.nodes.costs[observation * self.nodes.n_states..];
         let mut least = [f64::INFINITY; WIDEST_BEAM];
         let least = &mut least[..width];
         for &state in &self.nodes.open[observation] {
-            let Estimate { distance, cost_to_go } = self.parts.estimate(entries, state);
+            let Estimate { distance, cost_to_go } = self.tables.estimate(entries, state);
             note(least, costs[state as usize] + distance + cost_to_go);
         }
         self.limit.min(least[width - 1].next_up())
@@ -246,8 +245,8 @@ impl Search<'_> {
     /// Expands the open nodes of a layer that may be on a mapping of less than `limit`, and those to which they lead by actions that do
     /// not advance, but not many more than `width`.
     fn expand(&mut self, observation: usize, limit: f64, width: usize) -> Result<End, Cancelled> {
-        let entries = self.parts.at(observation);
-        let Nodes { n_states, costs, links, are_open, open } = &mut *self.nodes;
+        let entries = self.tables.at(observation);
+        let LayeredNodes { n_states, costs, links, are_open, open } = &mut *self.nodes;
         let n_states = *n_states;
         let of_both = observation * n_states..(observation + 2) * n_states;
         let (costs, next_costs) = costs[of_both.clone()].split_at_mut(n_states);
@@ -261,7 +260,7 @@ impl Search<'_> {
         let mut at = 0;
         while let Some(&state) = open.get(at) {
             at += 1;
-            let estimate = self.parts.estimate(entries, state);
+            let estimate = self.tables.estimate(entries, state);
             let kind = links[state as usize].kind();
             let before = kind.arrive(costs[state as usize], estimate.distance);
             let f = before + estimate.cost_to_go;
@@ -273,7 +272,7 @@ impl Search<'_> {
                 n_kept += usize::from(is_kept);
                 continue;
             }
-            let (first_way, ways) = self.body.ways(state);
+            let (first_way, ways) = self.ways_out.ways(state);
             match self.meter.spend(1 + 2 * ways.len() as u64) {
                 Signal::Continue if self.n_expanded < self.budget.max_expansions => {}
                 Signal::Continue => return Ok(End::CutShort(StoppedBy::MaxExpansions)),
@@ -285,7 +284,7 @@ impl Search<'_> {
             let (may_skip, may_linger) = (MoveKind::Skip.may_follow(kind), MoveKind::Extra.may_follow(kind));
             self.n_expanded += 1;
             self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
-            let mut advance = |to: StateIdx, cost: f64, link: Link| {
+            let mut advance = |to: StateIdx, cost: f64, link: LastStep| {
                 let known = &mut next_costs[to as usize];
                 if cost < *known {
                     *known = cost;
@@ -296,14 +295,14 @@ impl Search<'_> {
                 }
             };
             if may_skip {
-                advance(state, before, Link::SKIP);
+                advance(state, before, LastStep::SKIP);
             }
-            for (number, &Way { cost, to, .. }) in (first_way..).zip(ways) {
+            for (number, &WayOut { cost, to, .. }) in (first_way..).zip(ways) {
                 let cost = before + cost;
-                advance(to, cost, Link::matched(number));
+                advance(to, cost, LastStep::matched(number));
                 if may_linger && cost < costs[to as usize] {
                     costs[to as usize] = cost;
-                    links[to as usize] = Link::extra(number);
+                    links[to as usize] = LastStep::extra(number);
                     if !std::mem::replace(&mut are_open[to as usize], true) {
                         open.push(to);
                     }
@@ -316,13 +315,13 @@ impl Search<'_> {
 
     /// What mappings cost at least, of those that were not found: they lead through open nodes.
     fn least_f(&self) -> f64 {
-        let Nodes { n_states, costs, are_open, open, .. } = &*self.nodes;
+        let LayeredNodes { n_states, costs, are_open, open, .. } = &*self.nodes;
         let fs = (0..=self.last).flat_map(|observation| {
-            let entries = self.parts.at(observation);
+            let entries = self.tables.at(observation);
             let open = open[observation].iter().map(move |state| (*state, observation * n_states + *state as usize));
             // A list that was not gone through to the end may name some that are not open any more.
             open.filter(|(_, at)| are_open[*at]).map(move |(state, at)| {
-                let Estimate { distance, cost_to_go } = self.parts.estimate(entries, state);
+                let Estimate { distance, cost_to_go } = self.tables.estimate(entries, state);
                 costs[at] + distance + cost_to_go
             })
         });
@@ -331,12 +330,12 @@ impl Search<'_> {
 
     /// Looks for a cheaper mapping among the nodes of the last layer that were reached.
     fn end(&mut self) {
-        let entries = self.parts.at(self.last);
-        let Nodes { n_states, costs, are_open, open, .. } = &mut *self.nodes;
+        let entries = self.tables.at(self.last);
+        let LayeredNodes { n_states, costs, are_open, open, .. } = &mut *self.nodes;
         for state in open[self.last].drain(..) {
             let at = self.last * *n_states + state as usize;
             are_open[at] = false;
-            let cost = MoveKind::Match.arrive(costs[at], self.parts.estimate(entries, state).distance);
+            let cost = MoveKind::Match.arrive(costs[at], self.tables.estimate(entries, state).distance);
             if cost < self.limit {
                 self.limit = cost * (1.0 - self.rounding);
                 self.cheapest = Some(state);
@@ -357,7 +356,7 @@ fn note(least: &mut [f64], f: f64) {
     }
 }
 
-impl Nodes {
+impl LayeredNodes {
     /// Forgets all nodes but the start.
     fn prepare(&mut self, problem: &Problem<'_>) {
         let n_observations = problem.demonstration.len();
@@ -367,23 +366,23 @@ impl Nodes {
         self.costs.resize(n_nodes, f64::INFINITY);
         self.are_open.clear();
         self.are_open.resize(n_nodes, false);
-        self.links.resize(n_nodes.max(self.links.len()), Link::START);
+        self.links.resize(n_nodes.max(self.links.len()), LastStep::START);
         self.open.iter_mut().for_each(Vec::clear);
         self.open.resize_with(n_observations.max(self.open.len()), Vec::new);
 
         self.costs[problem.start as usize] = 0.0;
-        self.links[problem.start as usize] = Link::START;
+        self.links[problem.start as usize] = LastStep::START;
         self.are_open[problem.start as usize] = true;
         self.open[0].push(problem.start);
     }
 
-    /// The way of `body` from the start to a node.
-    fn path(&self, body: &Body, mut observation: usize, mut state: StateIdx) -> Vec<Move> {
+    /// The way of `ways_out` from the start to a node.
+    fn path(&self, ways_out: &WaysOut, mut observation: usize, mut state: StateIdx) -> Vec<Move> {
         let mut moves = Vec::with_capacity(2 * observation + 1);
         loop {
             let link = self.links[observation * self.n_states + state as usize];
             let kind = link.kind();
-            let way = link.way().map(|way| body.ways[way]);
+            let way = link.way().map(|way| ways_out.ways[way]);
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
             moves.push(Move { kind, action: way.map(|way| way.action), observation: observation as u32, state });
             match kind {
@@ -398,7 +397,7 @@ impl Nodes {
     }
 }
 
-impl Body {
+impl WaysOut {
     /// Gathers the ways of `model`, the same every time.
     fn prepare(&mut self, model: &Model) {
         if !self.ends.is_empty() {
@@ -406,7 +405,7 @@ impl Body {
         }
         for state in 0..model.states().len() {
             let ways = model.graph().successors(state).iter();
-            self.ways.extend(ways.map(|way| Way {
+            self.ways.extend(ways.map(|way| WayOut {
                 cost: model.action(way.action).cost,
                 from: state,
                 to: way.to,
@@ -418,91 +417,8 @@ impl Body {
 
     /// The ways out of a state, and the number of the first.
     #[inline]
-    fn ways(&self, state: StateIdx) -> (usize, &[Way]) {
+    fn ways(&self, state: StateIdx) -> (usize, &[WayOut]) {
         let begin = (state as usize).checked_sub(1).map_or(0, |before| self.ends[before]);
         (begin, &self.ways[begin..self.ends[state as usize]])
-    }
-}
-
-/// The columns of the tables of estimates, joined to two *parts*, so that an estimate takes two looks, however many columns
-/// there are.
-#[derive(Debug, Default)]
-struct Parts {
-    columns: Vec<ChangingColumn>,
-    /// The distinct classes that states have in the columns of a part: those of the first part, then those of the second.
-    joined: Vec<Vec<u32>>,
-    n_first: usize,
-    /// By state, which of these it has.
-    classes: Vec<[u32; 2]>,
-    /// What they come to. Shape `[n_observations, n_joined]`.
-    entries: Vec<Estimate>,
-}
-
-impl Parts {
-    /// Sums up the entries of `projected`.
-    fn prepare(&mut self, problem: &Problem<'_>, projected: &Projected<'_>) {
-        if self.classes.is_empty() || self.columns != projected.changing_columns() {
-            self.join(problem.model, projected);
-        }
-        let (n_observations, n_joined) = (problem.demonstration.len(), self.joined.len());
-        self.entries.resize(n_observations.next_multiple_of(CHUNK_LEN) * n_joined, Estimate::default());
-        for first in (0..n_observations).step_by(CHUNK_LEN) {
-            let of_chunk = &mut self.entries[first * n_joined..];
-            for (number, classes) in self.joined.iter().enumerate() {
-                let sums = if number < self.n_first {
-                    projected.estimate_chunk(first, classes)
-                } else {
-                    projected.sum_chunk([Estimate::default(); CHUNK_LEN], first, classes)
-                };
-                of_chunk[number..].iter_mut().step_by(n_joined).zip(sums).for_each(|(entry, sum)| *entry = sum);
-            }
-        }
-    }
-
-    /// Divides the columns so that neither part has many classes.
-    fn join(&mut self, model: &Model, projected: &Projected<'_>) {
-        self.columns = projected.changing_columns().to_vec();
-        let n_values = |column: &ChangingColumn| model.states().domain(column.position()).len();
-        let n_joined = |columns: &[ChangingColumn]| columns.iter().map(n_values).fold(1, usize::saturating_mul);
-        let most = |at: &usize| n_joined(&self.columns[..*at]).max(n_joined(&self.columns[*at..]));
-        let n_columns = self.columns.len();
-        let divide_at = (0..=n_columns).min_by_key(most).unwrap_or_default();
-
-        self.joined.clear();
-        self.classes.clear();
-        self.classes.resize(model.graph().n_states(), [0; 2]);
-        for (part, range) in [0..divide_at, divide_at..n_columns].into_iter().enumerate() {
-            self.n_first = self.joined.len();
-            let columns: Vec<(usize, u128)> = self.columns[range.clone()]
-                .iter()
-                .map(|column| (column.position(), n_values(column) as u128))
-                .collect();
-            let mut numbers: FxHashMap<u128, u32> = FxHashMap::default();
-            for (state, of_state) in (0..).zip(&mut self.classes) {
-                let row = model.states().row(state);
-                let values = columns.iter().fold(0, |all, (position, n)| all * n + u128::from(row[*position]));
-                of_state[part] = *numbers.entry(values).or_insert_with(|| {
-                    self.joined.push(projected.classes(row).skip(range.start).take(range.len()).collect());
-                    #[expect(clippy::cast_possible_truncation, reason = "no more than two for each state")]
-                    let number = self.joined.len() as u32 - 1;
-                    number
-                });
-            }
-        }
-    }
-
-    /// The entries of an observation.
-    #[inline]
-    fn at(&self, observation: usize) -> &[Estimate] {
-        &self.entries[observation * self.joined.len()..][..self.joined.len()]
-    }
-
-    /// What the node of a state costs, given the entries of its observation.
-    #[inline]
-    fn estimate(&self, entries: &[Estimate], state: StateIdx) -> Estimate {
-        let [first, second] = self.classes[state as usize].map(|class| entries[class as usize]);
-        let mut sum = first;
-        sum += second;
-        sum
     }
 }

@@ -3,9 +3,9 @@
 //! | module | is | used with |
 //! |---|---|---|
 //! | [`layered`] | beams, and what they leave, layer by layer | the default heuristic, in small problems |
-//! | [`best_first`] | A* for consistent estimates, with an incumbent and buckets | the default heuristic, in larger ones |
+//! | [`best_first`] | A* for consistent estimates, with an incumbent and buckets | the default heuristic, in larger ones, and none |
 //! | [`sweep`] | what it costs to go on from every node, from the last layer back | what takes the others long |
-//! | [`astar`] | A* as in the textbook | the paper's heuristic, which is not consistent, and none |
+//! | [`astar`] | A* as in the textbook | the paper's heuristic, which is not consistent |
 //! | [`seen`], [`nodes`] with [`index`], [`buckets`] | the states, the closed and the open list of [`best_first`] | |
 
 pub(super) mod astar;

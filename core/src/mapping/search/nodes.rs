@@ -27,7 +27,7 @@ const IN_BLOCK: u32 = (1 << BLOCK_BITS) - 1;
 
 /// Where a node is, and how the way to it ends; all that an expansion asks for but the costs.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Step {
+pub(super) struct Position {
     pub(super) state: SeenIdx,
     pub(super) observation: u32,
     /// [`MoveKind::Match`] at the start, too.
@@ -176,7 +176,7 @@ impl Nodes {
 
     /// Where a node is, and how the way to it ends.
     #[inline]
-    pub(super) fn step(&self, id: NodeId) -> Step {
+    pub(super) fn step(&self, id: NodeId) -> Position {
         let (block, in_block) = split(id);
         let Key { state, number } = self.keys[block];
         let kind = match self.marks[block][in_block] & (SKIPPED_TO | LINGERED_TO) {
@@ -184,7 +184,7 @@ impl Nodes {
             LINGERED_TO => MoveKind::Extra,
             _ => MoveKind::Match,
         };
-        Step { state, observation: number << BLOCK_BITS | id & IN_BLOCK, kind }
+        Position { state, observation: number << BLOCK_BITS | id & IN_BLOCK, kind }
     }
 
     /// Whether a node was expanded since its way last became cheaper.
@@ -308,7 +308,7 @@ impl Nodes {
         while id != NO_NODE {
             let (block, in_block) = split(id);
             let Link { parent, action } = self.links[block][in_block];
-            let Step { state, observation, kind } = self.step(id);
+            let Position { state, observation, kind } = self.step(id);
             let kind = if parent == NO_NODE { MoveKind::Start } else { kind };
             let action = (action != NO_ACTION).then_some(action);
             // There is one for each observation up to here at least.

@@ -11,7 +11,7 @@ use super::{Found, Move, MoveKind};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::{Budget, Problem};
 use crate::model::{Graph, Model, Transition};
-use backward::{GoOn, Link, Links, NoLinks, Ways, Workspace};
+use backward::{GoOn, GoOnLink, NoLinks, NoteLinks, Ways, Workspace};
 
 /// What a sweep came to.
 #[derive(Debug)]
@@ -21,7 +21,7 @@ pub(in crate::mapping) enum Swept {
     /// The interrupt said to finish.
     CutShort {
         /// The earliest layer that was done.
-        known: Layer,
+        known: KnownLayer,
         n_expanded: u64,
         n_generated: u64,
     },
@@ -31,7 +31,7 @@ pub(in crate::mapping) enum Swept {
 
 /// What it costs to be at each state at an observation and to go on from there.
 #[derive(Debug)]
-pub(in crate::mapping) struct Layer {
+pub(in crate::mapping) struct KnownLayer {
     pub(in crate::mapping) observation: usize,
     /// By state.
     pub(in crate::mapping) costs: Vec<f64>,
@@ -63,7 +63,7 @@ fn in_sections(problem: &Problem<'_>, section_len: usize, mut meter: Meter<'_>) 
         Err(Signal::Cancel) => return Err(Cancelled),
         Err(_) => {
             // Nothing is less.
-            let known = Layer { observation: problem.last(), costs: vec![0.0; n_states] };
+            let known = KnownLayer { observation: problem.last(), costs: vec![0.0; n_states] };
             return Ok(Swept::CutShort { known, n_expanded: 0, n_generated: 0 });
         }
     };
@@ -100,7 +100,7 @@ fn in_sections(problem: &Problem<'_>, section_len: usize, mut meter: Meter<'_>) 
 /// How much memory a sweep takes at most, in bytes: if all layers are one section.
 pub(in crate::mapping) fn most_bytes(model: &Model, n_observations: usize) -> usize {
     let n_states = model.graph().n_states();
-    let links = n_observations.saturating_mul(n_states).saturating_mul(size_of::<Link>());
+    let links = n_observations.saturating_mul(n_states).saturating_mul(size_of::<GoOnLink>());
     links.saturating_add(basis_bytes(model.graph())).saturating_add(n_states * size_of::<f64>())
 }
 
@@ -117,7 +117,7 @@ fn section_len(problem: &Problem<'_>, budget: Budget) -> Option<usize> {
     let room = budget.max_bytes.checked_sub(basis_bytes(graph))? / n_states.max(1);
     // The more sections, the shorter they are, but the more layers are kept from which they begin.
     let mut divisions = (1..=n_observations.isqrt() + 1).map(|n| (n, n_observations.div_ceil(n)));
-    let fits = |(n_sections, len): &(usize, usize)| n_sections * size_of::<f64>() + len * size_of::<Link>() <= room;
+    let fits = |(n_sections, len): &(usize, usize)| n_sections * size_of::<f64>() + len * size_of::<GoOnLink>() <= room;
     divisions.find(fits).map(|(_, len)| len)
 }
 
@@ -141,11 +141,11 @@ struct Sweep<'s, 'i> {
 /// Why a sweep has no mapping.
 struct CutShort {
     signal: Signal,
-    known: Layer,
+    known: KnownLayer,
 }
 
 /// Tells the earliest layer that was done, if that was in an earlier section.
-fn with_earliest(earliest: &mut Option<Layer>) -> impl FnOnce(CutShort) -> CutShort {
+fn with_earliest(earliest: &mut Option<KnownLayer>) -> impl FnOnce(CutShort) -> CutShort {
     |cut_short| CutShort { known: earliest.take().unwrap_or(cut_short.known), ..cut_short }
 }
 
@@ -166,12 +166,12 @@ impl Sweep<'_, '_> {
         let mut first = 0;
         let mut earliest = None;
         // Of a section's layers, the last one's first. They are made one by one: together they take long to be written for the first time.
-        let mut links: Vec<Vec<Link>> = Vec::new();
+        let mut links: Vec<Vec<GoOnLink>> = Vec::new();
         loop {
             let end = self.observation;
             links.clear();
             while self.observation > first {
-                let mut of_layer = vec![Link::SKIP; n_states];
+                let mut of_layer = vec![GoOnLink::SKIP; n_states];
                 let stepped = self.step_back(of_layer.as_mut_slice());
                 stepped.map_err(with_earliest(&mut earliest))?;
                 links.push(of_layer);
@@ -186,7 +186,7 @@ impl Sweep<'_, '_> {
                     .iter()
                     .zip(&self.here)
                     .map(|(distance, here)| MoveKind::Start.go_on(*distance, *here));
-                earliest = Some(Layer { observation: 0, costs: costs.collect() });
+                earliest = Some(KnownLayer { observation: 0, costs: costs.collect() });
             }
             first = end;
             self.begin_at((first + section_len).min(last), kept.pop()).map_err(with_earliest(&mut earliest))?;
@@ -205,12 +205,12 @@ impl Sweep<'_, '_> {
         looked_up.map_err(|signal| {
             // Nothing is less.
             distances.fill(0.0);
-            CutShort { signal, known: Layer { observation, costs: std::mem::take(distances) } }
+            CutShort { signal, known: KnownLayer { observation, costs: std::mem::take(distances) } }
         })
     }
 
     /// Goes back by an observation.
-    fn step_back<L: Links + ?Sized>(&mut self, links: &mut L) -> Result<(), CutShort> {
+    fn step_back<L: NoteLinks + ?Sized>(&mut self, links: &mut L) -> Result<(), CutShort> {
         let Self { problem, ways, observation, distances, here, next, n_stepped, workspace, meter } = self;
         for ((next, distance), here) in next.iter_mut().zip(&*distances).zip(&*here) {
             *next = MoveKind::Match.go_on(*distance, *here);
@@ -219,7 +219,7 @@ impl Sweep<'_, '_> {
         let looked_up = problem.distances.of_states(*observation, problem.model.states(), distances, meter);
         let stepped = looked_up.and_then(|()| ways.step_back(next, distances, here, links, workspace, meter));
         stepped.map_err(|signal| {
-            let known = Layer { observation: *observation + 1, costs: std::mem::take(next) };
+            let known = KnownLayer { observation: *observation + 1, costs: std::mem::take(next) };
             CutShort { signal, known }
         })?;
         *n_stepped += 1;
@@ -231,7 +231,7 @@ impl Sweep<'_, '_> {
     }
 
     /// Goes on with `moves` to the observation `end`, as `links` say: those of the layer before it, then of the one before that.
-    fn follow(&self, links: &[Vec<Link>], end: usize, moves: &mut Vec<Move>) {
+    fn follow(&self, links: &[Vec<GoOnLink>], end: usize, moves: &mut Vec<Move>) {
         while let Some(&Move { kind, observation, state, .. }) = moves.last()
             && let Some(before_end) = (end - observation as usize).checked_sub(1)
         {

@@ -1,16 +1,21 @@
 //! Projections solved for one demonstration: tables of distances and exact costs-to-go.
 
+mod room;
 mod table;
 
 use std::collections::BinaryHeap;
 use std::ops::AddAssign;
 
+#[cfg(test)]
+pub(in crate::mapping) use room::MAX_ENTRIES;
+use room::used_projections;
+pub(in crate::mapping) use room::{TableRoom, most_bytes};
 pub(in crate::mapping) use table::CHUNK_LEN;
 use table::{Table, stride_for};
 
 use super::Heuristic;
 use super::projection::{Projection, Projections};
-use super::shares::{SharedWay, SharedWays};
+use super::shares::SharedWays;
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::{MoveKind, Problem};
@@ -83,17 +88,17 @@ impl ChangingColumn {
 
 /// What solving takes besides its result, kept to be used again.
 #[derive(Debug, Default)]
-pub(in crate::mapping) struct Buffers {
+pub(in crate::mapping) struct TableBuffers {
     /// By column, the ways into each value, if they are few.
     ways: Vec<SharedWays>,
     /// The projections that have tables with these ways: nothing else that they depend on differs from problem to problem of a model.
     used: Vec<bool>,
-    layer: Layer,
+    layer: ColumnLayer,
 }
 
 /// The entries of a column in the making.
 #[derive(Debug, Default)]
-struct Layer {
+struct ColumnLayer {
     /// By observation, the least term.
     least: Vec<f64>,
     /// By class, at an observation and at the next.
@@ -105,20 +110,16 @@ struct Layer {
 /// Most edges of all projections with tables whose ways are kept: 1.5 MB. To gather more takes little of the time that their tables take.
 const MAX_KEPT_EDGES: usize = 1 << 16;
 
-impl Buffers {
+impl TableBuffers {
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
-        let Layer { least, here, next, open } = &self.layer;
+        let ColumnLayer { least, here, next, open } = &self.layer;
         self.ways.iter().map(SharedWays::size_bytes).sum::<usize>()
             + least.capacity() * size_of::<f64>()
             + (here.capacity() + next.capacity()) * size_of::<Estimate>()
             + open.capacity() * size_of::<CheapestFirst>()
     }
 }
-
-/// Most entries of all tables together: 256 MB. Attributes that do not fit, the largest, are left out, which keeps the bound a
-/// bound.
-pub(in crate::mapping) const MAX_ENTRIES: usize = 1 << 24;
 
 impl<'p> Projected<'p> {
     /// Solves the projected problems, backwards over the demonstration. `None` if `interrupt` said to finish first. `buffers` are of
@@ -131,7 +132,7 @@ impl<'p> Projected<'p> {
         projections: &'p Projections,
         problem: &'p Problem<'p>,
         room: TableRoom,
-        buffers: &mut Buffers,
+        buffers: &mut TableBuffers,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
         /// How many classes are looked at between two looks at the interrupt: tens of microseconds.
@@ -351,12 +352,12 @@ impl<'p> Projected<'p> {
         &mut self,
         number: usize,
         predecessors: &SharedWays,
-        layer: &mut Layer,
+        layer: &mut ColumnLayer,
         meter: &mut Meter<'_>,
     ) -> Signal {
         let Column { projection, offset } = self.columns[number];
         let n_values = projection.n_values;
-        let Layer { here, next, open, .. } = layer;
+        let ColumnLayer { here, next, open, .. } = layer;
         next.clear();
         next.extend((0..n_values).map(|value| self.table.at(offset + value, self.problem.last())));
         here.clone_from(next);
@@ -434,81 +435,6 @@ impl Heuristic for Projected<'_> {
             sum + self.table.at(offset + row[projection.position] as usize, observation).cost_to_go
         })
     }
-}
-
-/// How much memory tables for `problem` take at most, in bytes, of two attempts to make them within `room`, and whether these have all
-/// distances.
-pub(in crate::mapping) fn most_bytes(
-    projections: &Projections,
-    problem: &Problem<'_>,
-    room: TableRoom,
-) -> (usize, bool) {
-    /// Two tables; beside each, the least terms take half as much at most.
-    const N_TIMES: usize = 3;
-    let (used, _) = used_projections(projections, problem, TableRoom { few: room.most, ..room });
-    let tabled = projections.attributes().iter().zip(&used).filter(|(_, is_used)| **is_used).map(|(own, _)| own);
-    let n_observations = problem.demonstration.len();
-    let n_classes: usize = tabled.clone().map(|own| own.n_values).sum();
-    let n_entries = Table::<Estimate>::n_entries_for(n_classes, n_observations);
-    let n_edges: usize = tabled.clone().map(|own| own.edges.n_items()).sum();
-    let n_bytes = N_TIMES * n_entries * size_of::<Estimate>()
-        + 2 * n_edges * size_of::<SharedWay>()
-        + 2 * stride_for(n_observations) * (size_of::<Estimate>() + size_of::<f64>());
-    let has = |position| tabled.clone().any(|own| own.position == position);
-    let mut active = (0..problem.model.schema().len()).filter(|position| problem.distances.is_active(*position));
-    (n_bytes, active.all(has))
-}
-
-/// How large tables may be.
-#[derive(Clone, Copy, Debug)]
-pub(in crate::mapping) struct TableRoom {
-    /// How many entries those may have that are made now,
-    pub(in crate::mapping) few: usize,
-    /// and those that may be made instead, if the search takes long.
-    pub(in crate::mapping) most: usize,
-    /// How many ways there may be between the values of an attribute.
-    max_ways: usize,
-    /// What the search may take in all.
-    pub(in crate::mapping) max_bytes: usize,
-}
-
-impl TableRoom {
-    /// Any that take a quarter of `max_bytes`, and no more while they are made. So two of them leave half.
-    pub(in crate::mapping) fn within(max_bytes: usize) -> Self {
-        const PART: usize = 4;
-        let most = MAX_ENTRIES.min(max_bytes / PART / size_of::<Estimate>());
-        Self { few: most, most, max_ways: max_bytes / PART / size_of::<SharedWay>(), max_bytes }
-    }
-
-    /// At first at most so many entries.
-    pub(in crate::mapping) fn at_first(self, few: usize) -> Self {
-        Self { few: few.min(self.most), ..self }
-    }
-}
-
-/// Which projections have tables, the smallest first as far as there is room for a few; and how many entries the others would have, as
-/// far as there is room for most.
-fn used_projections(projections: &Projections, problem: &Problem<'_>, room: TableRoom) -> (Vec<bool>, u64) {
-    let attributes = projections.attributes();
-    // An attribute that weighs nothing would take its share of the actions' costs to no purpose.
-    let is_wanted = |own: &Projection| {
-        own.is_kept && own.edges.n_items() <= room.max_ways && problem.distances.is_active(own.position)
-    };
-    let mut wanted: Vec<usize> = (0..attributes.len()).filter(|number| is_wanted(&attributes[*number])).collect();
-    wanted.sort_by_key(|number| attributes[*number].n_values);
-    let mut used = vec![false; attributes.len()];
-    let mut n_entries = 0_usize;
-    let mut n_left_out = 0;
-    for number in wanted {
-        let of_attribute = stride_for(problem.demonstration.len()).saturating_mul(attributes[number].n_values);
-        n_entries = n_entries.saturating_add(of_attribute);
-        match n_entries {
-            n if n <= room.few => used[number] = true,
-            n if n <= room.most => n_left_out += of_attribute as u64,
-            _ => break,
-        }
-    }
-    (used, n_left_out)
 }
 
 #[cfg(test)]

@@ -67,7 +67,7 @@ proptest! {
         let close = 1e-9 * (1.0 + optimum);
 
         let room = TableRoom::within(usize::MAX);
-        let solved = Projected::solve(&projections, &problem, room, &mut Buffers::default(), &mut Uninterrupted).unwrap();
+        let solved = Projected::solve(&projections, &problem, room, &mut TableBuffers::default(), &mut Uninterrupted).unwrap();
         let projected = solved.unwrap();
         // What no action changes is taken to be as it is at the start, so nothing is said of states that it does not lead to.
         let is_reached = |(i, state): &(usize, StateIdx)| from_start[*i][*state as usize].is_finite();
@@ -95,7 +95,7 @@ fn tables_have_no_more_entries_than_allowed_however_short_the_demonstration() {
     let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
     let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
-    let mut buffers = Buffers::default();
+    let mut buffers = TableBuffers::default();
     for n_observations in [1, 2, 8, 9] {
         let request = json!({"model": "m", "demonstration": vec![json!({"a": 50, "b": 3}); n_observations]});
         let mut faults = Faults::default();
@@ -128,7 +128,7 @@ fn buffers_of_other_problems_change_no_table() {
     let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
     let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
-    let mut buffers = Buffers::default();
+    let mut buffers = TableBuffers::default();
     for (a, b, n_observations) in [(1, 1, 5), (1, 0, 5), (0, 1, 9), (1, 1, 2), (2, 1, 2), (0, 0, 1), (1, 1, 5)] {
         let demonstration: Value = (0..n_observations).map(|i| json!({"a": i % 4, "b": 2})).collect();
         let request = json!({"model": "m", "demonstration": demonstration, "weights": {"a": a, "b": b}});
@@ -140,6 +140,6 @@ fn buffers_of_other_problems_change_no_table() {
                 Projected::solve(&projections, &problem, TableRoom::within(usize::MAX), buffers, &mut Uninterrupted);
             format!("{:?}", solved.unwrap().unwrap().table)
         };
-        assert_eq!(table(&mut buffers), table(&mut Buffers::default()), "weights {a} and {b}");
+        assert_eq!(table(&mut buffers), table(&mut TableBuffers::default()), "weights {a} and {b}");
     }
 }

@@ -46,9 +46,9 @@ pub(super) enum GoOn {
 
 /// A [`GoOn`], in two bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Link(u16);
+pub(super) struct GoOnLink(u16);
 
-impl Link {
+impl GoOnLink {
     pub(super) const SKIP: Self = Self(u16::MAX);
 
     #[inline]
@@ -71,20 +71,20 @@ impl Link {
     }
 }
 
-/// Most ways out of a state, so that their numbers have room in a [`Link`].
+/// Most ways out of a state, so that their numbers have room in a [`GoOnLink`].
 const MAX_WAYS_OUT: usize = (u16::MAX >> 1) as usize;
 
 /// Stands for "no way" among their numbers.
 const NO_WAY: u16 = u16::MAX;
 
 /// Takes note of the cheapest way to go on from each state, or does not.
-pub(super) trait Links {
-    fn set(&mut self, state: usize, link: Link);
+pub(super) trait NoteLinks {
+    fn set(&mut self, state: usize, link: GoOnLink);
 }
 
-impl Links for [Link] {
+impl NoteLinks for [GoOnLink] {
     #[inline]
-    fn set(&mut self, state: usize, link: Link) {
+    fn set(&mut self, state: usize, link: GoOnLink) {
         self[state] = link;
     }
 }
@@ -92,9 +92,9 @@ impl Links for [Link] {
 /// For whom costs are enough.
 pub(super) struct NoLinks;
 
-impl Links for NoLinks {
+impl NoteLinks for NoLinks {
     #[inline]
-    fn set(&mut self, _: usize, _: Link) {}
+    fn set(&mut self, _: usize, _: GoOnLink) {}
 }
 
 /// What a step back works with, kept for the next one.
@@ -142,7 +142,7 @@ impl Ways {
     /// # Errors
     ///
     /// What the interrupt of `meter` said, if that was not to continue.
-    pub(super) fn step_back<L: Links + ?Sized>(
+    pub(super) fn step_back<L: NoteLinks + ?Sized>(
         &self,
         next: &[f64],
         distances: &[f64],
@@ -153,15 +153,15 @@ impl Ways {
     ) -> Result<(), Signal> {
         for (state, ((here, skipped), ways)) in here.iter_mut().zip(next).zip(self.out.iter()).enumerate() {
             meter.go_on(1 + ways.len() as u64)?;
-            let (cost, link) = self.cheapest(*skipped, ways, next, Link::matched);
+            let (cost, link) = self.cheapest(*skipped, ways, next, GoOnLink::matched);
             *here = cost;
-            links.set(state, link.unwrap_or(Link::SKIP));
+            links.set(state, link.unwrap_or(GoOnLink::SKIP));
         }
         self.linger(distances, here, links, workspace, meter)
     }
 
     /// Makes cheaper what extra actions make cheaper.
-    fn linger<L: Links + ?Sized>(
+    fn linger<L: NoteLinks + ?Sized>(
         &self,
         distances: &[f64],
         here: &mut [f64],
@@ -180,7 +180,7 @@ impl Ways {
             changed.clear();
             for (state, (here, ways)) in (0..).zip(here.iter_mut().zip(self.out.iter())) {
                 meter.go_on(1 + ways.len() as u64)?;
-                if let (cost, Some(link)) = self.cheapest(*here, ways, arrivals, Link::extra) {
+                if let (cost, Some(link)) = self.cheapest(*here, ways, arrivals, GoOnLink::extra) {
                     *here = cost;
                     arrivals[state as usize] = MoveKind::Extra.go_on(distances[state as usize], cost);
                     links.set(state as usize, link);
@@ -205,7 +205,7 @@ impl Ways {
                 let known = &mut here[way.state as usize];
                 if cost < *known {
                     *known = cost;
-                    links.set(way.state as usize, Link::extra(way.number));
+                    links.set(way.state as usize, GoOnLink::extra(way.number));
                     open.push(CheapestFirst { cost, id: way.state });
                 }
             }
@@ -220,8 +220,8 @@ impl Ways {
         cost: f64,
         ways: &[Way],
         arrivals: &[f64],
-        link_by: impl Fn(u16) -> Link,
-    ) -> (f64, Option<Link>) {
+        link_by: impl Fn(u16) -> GoOnLink,
+    ) -> (f64, Option<GoOnLink>) {
         // Costs are not negative, so their bits are in the same order. Which way is cheaper cannot be foreseen, so there should be no
         // branch.
         let (mut least, mut number) = (cost.to_bits(), NO_WAY);

@@ -110,5 +110,5 @@ fn sections_are_as_long_as_there_is_room_for_and_a_sweep_without_room_is_not_beg
     assert!(matches!(sweep(&problem, too_small, &mut Uninterrupted), Ok(Swept::TooLarge)));
     assert!(matches!(sweep(&problem, Budget::DEFAULT, &mut || Signal::Cancel), Err(Cancelled)));
     let cut_short = sweep(&problem, Budget::DEFAULT, &mut || Signal::Finish);
-    assert!(matches!(cut_short, Ok(Swept::CutShort { known: Layer { observation: 899, .. }, n_expanded: 0, .. })));
+    assert!(matches!(cut_short, Ok(Swept::CutShort { known: KnownLayer { observation: 899, .. }, n_expanded: 0, .. })));
 }

@@ -5,7 +5,7 @@ use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::cost::SLACK;
 use crate::mapping::heuristic::Heuristic;
 use crate::mapping::heuristic::projected::{Projected, TableRoom};
-use crate::mapping::search::sweep::{Layer, Swept, sweep};
+use crate::mapping::search::sweep::{KnownLayer, Swept, sweep};
 use crate::mapping::search::{Found, best_first};
 use crate::mapping::{Problem, StoppedBy};
 use crate::model::{Space, StateIdx};
@@ -105,14 +105,14 @@ impl Mapper {
         most_f: f64,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Found, Cancelled> {
-        self.with_buffers(budget.max_bytes, |Buffers { searching, .. }| {
+        self.buffers.lend(budget.max_bytes, |Buffers { searching, .. }| {
             best_first::search(problem, space, projected, budget, most_f, searching, interrupt)
         })
     }
 }
 
 /// What mappings cost at least, given what it costs to go on from a layer: to come there, they cost no less than the estimate falls. 0 if there are so many states that it would take long.
-fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &Layer) -> f64 {
+fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &KnownLayer) -> f64 {
     /// That takes some ten milliseconds.
     const MAX_STATES: StateIdx = 1 << 17;
     let states = problem.model.states();
