@@ -28,17 +28,6 @@ pub(super) trait Heuristic {
     }
 }
 
-/// Estimates nothing.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Blind;
-
-impl Heuristic for Blind {
-    #[inline]
-    fn cost_to_go(&self, _: usize, _: &[u32]) -> f64 {
-        0.0
-    }
-}
-
 /// Which estimate guides a search.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]

@@ -28,9 +28,10 @@ use crate::model::{ActionIdx, Model, Operator, Rows};
 /// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
 #[derive(Debug)]
 pub(crate) struct Projections {
-    attributes: Vec<Projection>,
-    /// Distinct sets of projections that some transition changes.
-    change_sets: Vec<Vec<u16>>,
+    /// By attribute that varies.
+    pub(super) attributes: Vec<Projection>,
+    /// Distinct sets of these that some transition changes.
+    pub(super) change_sets: Vec<Vec<u16>>,
 }
 
 /// A model, projected on one of its attributes.
@@ -111,16 +112,6 @@ impl Projections {
             attributes.push(Projection { position, n_values, edges, is_kept });
         }
         Ok(Self { attributes, change_sets: change_sets.sets })
-    }
-
-    /// By attribute that varies.
-    pub(super) fn attributes(&self) -> &[Projection] {
-        &self.attributes
-    }
-
-    /// Distinct sets of attributes that some transition changes, as indices into [`Self::attributes`].
-    pub(super) fn change_sets(&self) -> &[Vec<u16>] {
-        &self.change_sets
     }
 
     /// Approximate size in memory, in bytes.

@@ -36,7 +36,7 @@ impl SharedWays {
         used: &[bool],
     ) -> Self {
         let n_sharing = |set: &Vec<u16>| set.iter().map(|number| u32::from(used[usize::from(*number)])).sum::<u32>();
-        let n_sharing: Vec<f64> = projections.change_sets().iter().map(|set| f64::from(n_sharing(set))).collect();
+        let n_sharing: Vec<f64> = projections.change_sets.iter().map(|set| f64::from(n_sharing(set))).collect();
         let mut ways = projection.edges.map(|edge| {
             let n_sharing = n_sharing[edge.change_set as usize];
             let share = problem.model.action(edge.action).cost / n_sharing;

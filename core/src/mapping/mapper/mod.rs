@@ -17,7 +17,7 @@ use super::cost::{Cost, ROUNDING, SLACK, cost_of};
 use super::heuristic::paper::Paper;
 use super::heuristic::projected::{Projected, TableRoom};
 use super::heuristic::projection::Projections;
-use super::heuristic::{Blind, Heuristic, HeuristicName};
+use super::heuristic::{Heuristic, HeuristicName};
 use super::search::{Found, Move, astar, layered};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
 use crate::model::{Model, Space, StateIdx, States};
@@ -41,9 +41,7 @@ pub struct Budget {
 impl Budget {
     /// Any number of expansions, within 1 GB.
     pub const DEFAULT: Self = Self { max_expansions: u64::MAX, max_bytes: 1 << 30 };
-}
 
-impl Budget {
     /// What is left of it if `n_bytes` are taken.
     pub(in crate::mapping) fn beside(self, n_bytes: usize) -> Self {
         Self { max_bytes: self.max_bytes.saturating_sub(n_bytes), ..self }
@@ -270,8 +268,9 @@ impl Mapper {
                 None => self.best_first(space, problem, settings, most_f, interrupt),
             },
             HeuristicName::None => {
-                let found = self.search(space, problem, &Projected::blind(problem), budget, most_f, interrupt)?;
-                conclude(problem, space, &Blind, within(most_f, found, problem), interrupt)
+                let blind = Projected::blind(problem);
+                let found = self.search(space, problem, &blind, budget, most_f, interrupt)?;
+                conclude(problem, space, &blind, within(most_f, found, problem), interrupt)
             }
             HeuristicName::Paper => {
                 let found = astar::search(problem, space, &Paper::new(problem), budget, interrupt)?;
@@ -284,7 +283,7 @@ impl Mapper {
                 } else {
                     let stopped_by = found.stopped_by.or(Some(StoppedBy::Deadline));
                     let found = Found { least_f: first, stopped_by, ..found };
-                    conclude(problem, space, &Blind, found, interrupt)
+                    conclude(problem, space, &Projected::blind(problem), found, interrupt)
                 }
             }
         }
@@ -350,7 +349,7 @@ impl Mapper {
             n_expanded: 0,
             n_generated: 0,
         };
-        let mapping = conclude(problem, &mut self.model.whole(), &Blind, found, interrupt)?;
+        let mapping = conclude(problem, &mut self.model.whole(), &Projected::blind(problem), found, interrupt)?;
         Ok(Mapping { status: Status::Local, lower_bound: None, stopped_by: Some(stopped_by), ..mapping })
     }
 }

@@ -1,6 +1,6 @@
 //! A* over nodes `(i, s)`, as in the textbook (Hart, Nilsson & Raphael 1968): what the paper searched with, for its own heuristic.
 
-use std::cmp::Ordering;
+use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 
 use rustc_hash::FxHashMap;
@@ -36,13 +36,13 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
     let row = space.row(problem.start);
     let g = MoveKind::Start.arrive(0.0, problem.distances.distance(0, row));
     let first = nodes.reach(CheapestWay { observation: 0, state: problem.start, g, action: NO_ACTION, parent: 0 });
-    open.extend(first.map(|id| Open { f: g + heuristic.cost_to_go(0, row), g, observation: 0, id }));
+    open.extend(first.map(|id| Open::new(g + heuristic.cost_to_go(0, row), g, 0, id)));
     // The farthest expanded node, and among those the most promising: where a search out of budget goes on greedily.
-    let mut farthest = Open { f: f64::INFINITY, g, observation: 0, id: 0 };
+    let mut farthest = Open::new(f64::INFINITY, g, 0, 0);
 
     while let Some(entry) = open.pop() {
         let node = *nodes.get(entry.id);
-        if entry.g > node.g {
+        if f64::from_bits(entry.g_bits) > node.g {
             continue;
         }
         let (i, state) = (node.observation as usize, node.state);
@@ -54,7 +54,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
         // Whatever is left of an expansion that is broken off costs at least the `f` of its node.
         let unfinished = |stopped_by, nodes: &FoundNodes, farthest: Open, n_expanded, n_generated| {
             let paths = [entry.id, farthest.id, 0].map(|id| nodes.path(id)).to_vec();
-            let (least_f, stopped_by) = (entry.f, Some(stopped_by));
+            let (least_f, stopped_by) = (entry.f(), Some(stopped_by));
             Ok(Found { paths, is_complete: false, stopped_by, least_f, n_expanded, n_generated })
         };
         let stopped_by = match meter.spend(1) {
@@ -70,7 +70,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             return unfinished(stopped_by, &nodes, farthest, n_expanded, n_generated);
         }
         n_expanded += 1;
-        if (entry.observation, farthest.f) > (farthest.observation, entry.f) {
+        if (entry.observation, farthest.f()) > (farthest.observation, entry.f()) {
             farthest = entry;
         }
 
@@ -95,7 +95,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
             let observation = i as u32;
             if let Some(id) = nodes.reach(CheapestWay { observation, state, g, action, parent: entry.id }) {
-                open.push(Open { f: g + heuristic.cost_to_go(i, row), g, observation, id });
+                open.push(Open::new(g + heuristic.cost_to_go(i, row), g, observation, id));
             }
         }
         most_open = most_open.max(open.len());
@@ -212,32 +212,22 @@ impl FoundNodes {
 
 /// An entry of the open list. The greatest is expanded next: least `f`, then the later observation, then the most
 /// recently found.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Open {
-    f: f64,
-    /// The node's `g` when this was pushed: stale if the node has become cheaper.
-    g: f64,
+    /// The bits of `f`, which are in its order, as it is not negative.
+    f_bits: Reverse<u64>,
     observation: u32,
     id: NodeId,
+    /// Those of the node's `g` when this was pushed: stale if the node has become cheaper.
+    g_bits: u64,
 }
 
-impl Ord for Open {
-    fn cmp(&self, other: &Self) -> Ordering {
-        let key = |open: &Self| (open.observation, open.id);
-        other.f.total_cmp(&self.f).then_with(|| key(self).cmp(&key(other)))
+impl Open {
+    fn new(f: f64, g: f64, observation: u32, id: NodeId) -> Self {
+        Self { f_bits: Reverse(f.to_bits()), observation, id, g_bits: g.to_bits() }
+    }
+
+    fn f(self) -> f64 {
+        f64::from_bits(self.f_bits.0)
     }
 }
-
-impl PartialOrd for Open {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl PartialEq for Open {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other).is_eq()
-    }
-}
-
-impl Eq for Open {}

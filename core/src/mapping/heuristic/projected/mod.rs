@@ -140,7 +140,7 @@ impl<'p> Projected<'p> {
         let (used, n_left_out) = used_projections(projections, problem, room);
         let mut projected = Self { n_left_out, ..Self::blind(problem) };
         let (mut width, n_observations) = (0, problem.demonstration.len());
-        for (projection, _) in projections.attributes().iter().zip(&used).filter(|(_, is_used)| **is_used) {
+        for (projection, _) in projections.attributes.iter().zip(&used).filter(|(_, is_used)| **is_used) {
             projected.columns.push(Column { projection, offset: width });
             width += projection.n_values;
             projected.untabled.retain(|at| *at != projection.position);

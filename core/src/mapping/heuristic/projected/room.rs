@@ -20,7 +20,7 @@ pub(in crate::mapping) fn most_bytes(
     /// Two tables; beside each, the least terms take half as much at most.
     const N_TIMES: usize = 3;
     let (used, _) = used_projections(projections, problem, TableRoom { few: room.most, ..room });
-    let tabled = projections.attributes().iter().zip(&used).filter(|(_, is_used)| **is_used).map(|(own, _)| own);
+    let tabled = projections.attributes.iter().zip(&used).filter(|(_, is_used)| **is_used).map(|(own, _)| own);
     let n_observations = problem.demonstration.len();
     let n_classes: usize = tabled.clone().map(|own| own.n_values).sum();
     let n_entries = Table::<Estimate>::n_entries_for(n_classes, n_observations);
@@ -63,7 +63,7 @@ impl TableRoom {
 /// Which projections have tables, the smallest first as far as there is room for a few; and how many entries the others would have, as
 /// far as there is room for most.
 pub(super) fn used_projections(projections: &Projections, problem: &Problem<'_>, room: TableRoom) -> (Vec<bool>, u64) {
-    let attributes = projections.attributes();
+    let attributes = &projections.attributes;
     // An attribute that weighs nothing would take its share of the actions' costs to no purpose.
     let is_wanted = |own: &Projection| {
         own.is_kept && own.edges.n_items() <= room.max_ways && problem.distances.is_active(own.position)
