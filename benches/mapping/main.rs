@@ -81,7 +81,7 @@ fn prepare(world: &World) -> Mapper {
 fn problem<'m>(mapper: &'m Mapper, world: &World) -> Problem<'m> {
     let request = json!({"model": "m", "demonstration": world.demonstration});
     let mut faults = Faults::default();
-    let object = Place::root(&request).object(&Request::FIELDS, &mut faults).expect("a request is an object");
+    let object = Place::root(&request).object(Request::FIELDS, &mut faults).expect("a request is an object");
     let request = Request::read(mapper.model(), &object, &mut faults);
     request.expect("worlds have their demonstrations").problem
 }

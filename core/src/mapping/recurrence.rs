@@ -27,6 +27,7 @@ use super::MoveKind;
 
 impl MoveKind {
     /// What a move of this kind pays of the distance at the node to which it leads: all of it.
+    #[expect(clippy::unused_self, reason = "this is where kinds will differ")]
     #[inline]
     pub(super) fn paid(self, distance: f64) -> f64 {
         distance

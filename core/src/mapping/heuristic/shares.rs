@@ -55,7 +55,7 @@ impl SharedWays {
     }
 
     #[inline]
-    pub(super) fn into_value(&self, value: usize) -> &[SharedWay] {
+    pub(super) fn leading_to(&self, value: usize) -> &[SharedWay] {
         self.0.of(value)
     }
 

@@ -37,7 +37,7 @@ const PROBE_SHARE: u64 = 16;
 /// How a search ends that the interrupt said to finish.
 const OUT_OF_TIME: End = End::CutShort(StoppedBy::Deadline);
 
-/// SearchBuffers of a search, kept to be used again.
+/// Buffers of a search, kept to be used again.
 #[derive(Debug, Default)]
 pub(in crate::mapping) struct SearchBuffers {
     seen: Seen,

@@ -27,7 +27,7 @@ const BEAM_WIDTHS: [usize; 2] = [1, 8];
 
 const WIDEST_BEAM: usize = BEAM_WIDTHS[BEAM_WIDTHS.len() - 1];
 
-/// LayeredBuffers of a search, kept to be used again by searches of the same model.
+/// Buffers of a search, kept to be used again by searches of the same model.
 #[derive(Debug, Default)]
 pub(in crate::mapping) struct LayeredBuffers {
     ways_out: WaysOut,

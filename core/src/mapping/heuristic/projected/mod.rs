@@ -374,7 +374,7 @@ impl<'p> Projected<'p> {
             }
             for (value, next) in next.iter().enumerate() {
                 let cost = MoveKind::Match.go_on(next.distance, next.cost_to_go);
-                for way in predecessors.into_value(value) {
+                for way in predecessors.leading_to(value) {
                     let matched = way.share + cost;
                     let known = &mut here[way.from as usize].cost_to_go;
                     if matched < *known {
@@ -418,7 +418,7 @@ fn relax(
     here: &mut [Estimate],
     open: &mut BinaryHeap<CheapestFirst>,
 ) {
-    for way in predecessors.into_value(value) {
+    for way in predecessors.leading_to(value) {
         let extra = way.of_extra(least_distance) + cost;
         let known = &mut here[way.from as usize].cost_to_go;
         if extra < *known {

@@ -60,7 +60,7 @@ proptest! {
         }).collect();
         let request = json!({"model": "m", "demonstration": seen});
         let mut faults = Faults::default();
-        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         let [from_start, to_end] = least_costs(&problem);
         let optimum = from_start[problem.last()].iter().copied().fold(f64::INFINITY, f64::min);
@@ -99,7 +99,7 @@ fn tables_have_no_more_entries_than_allowed_however_short_the_demonstration() {
     for n_observations in [1, 2, 8, 9] {
         let request = json!({"model": "m", "demonstration": vec![json!({"a": 50, "b": 3}); n_observations]});
         let mut faults = Faults::default();
-        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         for max_entries in [0, 7, 107, 856, 1_000, 1_712] {
             let solved = Projected::solve(
@@ -133,7 +133,7 @@ fn buffers_of_other_problems_change_no_table() {
         let demonstration: Value = (0..n_observations).map(|i| json!({"a": i % 4, "b": 2})).collect();
         let request = json!({"model": "m", "demonstration": demonstration, "weights": {"a": a, "b": b}});
         let mut faults = Faults::default();
-        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         let table = |buffers| {
             let solved =

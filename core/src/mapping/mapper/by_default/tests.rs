@@ -36,7 +36,7 @@ fn prepared(model: &Value) -> Mapper {
 
 fn read<'m>(mapper: &'m Mapper, request: &Value) -> Request<'m> {
     let mut faults = Faults::default();
-    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
     Request::read(mapper.model(), &object, &mut faults).unwrap()
 }
 

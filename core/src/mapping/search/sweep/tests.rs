@@ -67,7 +67,7 @@ proptest! {
         let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
         let mut faults = Faults::default();
-        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
         let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
         let [from_start, _] = least_costs(&problem);
         let least = from_start[problem.last()].iter().copied().fold(f64::INFINITY, f64::min);
@@ -95,7 +95,7 @@ fn sections_are_as_long_as_there_is_room_for_and_a_sweep_without_room_is_not_beg
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
     let request = json!({"model": "m", "demonstration": vec![json!({"x": 50}); 900]});
     let mut faults = Faults::default();
-    let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
     let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
     let within = |max_bytes| section_len(&problem, Budget { max_bytes, ..Budget::DEFAULT });
     let basis = Ways::bytes_for(100, 99) + 8 * 100 * 8;
