@@ -75,7 +75,7 @@ fn main() -> Result<(), Failure> {
     let directory = tempfile::tempdir()?;
     let storing = handler(n_bytes, async || {
         let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await?;
-        Ok(Between::SearchAndStore(Searched::read(&model, &request)?, store, stored.clone()))
+        Ok(Between::SearchAndStore(Searched::read(&model, &request)?, Box::new((store, stored.clone()))))
     })?;
 
     let mut table = Table::default();
@@ -152,7 +152,7 @@ enum Between {
     /// It searches for the policy.
     Search(Searched),
     /// It searches for the policy, and has as many bytes of it stored as the service has, durably.
-    SearchAndStore(Searched, Store, StoredPolicy),
+    SearchAndStore(Searched, Box<(Store, StoredPolicy)>),
 }
 
 /// A problem that is read already, and what searches it.
@@ -188,7 +188,8 @@ impl Between {
         match self {
             Self::Nothing => true,
             Self::Search(searched) => searched.search(),
-            Self::SearchAndStore(searched, store, StoredPolicy { summary, steps }) => {
+            Self::SearchAndStore(searched, stored) => {
+                let (store, StoredPolicy { summary, steps }) = &**stored;
                 let (id, created_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
                 let policy = NewPolicy { id, summary: summary.clone(), steps: steps.clone(), created_at };
                 searched.search() && store.add_policies(vec![policy], Vec::new()).await.is_ok()
