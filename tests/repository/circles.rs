@@ -10,7 +10,6 @@ use crate::sources::{Module, modules, references, uses};
 /// Circles of the core that are still to be opened.
 const CORE: &[&str] = &[
     "mapping/mapper, mapping/search",
-    "mapping/mapper, mapping/search/best_first",
     "mapping/mapper, mapping/search/layered",
     "mapping/search/nodes, mapping/search/seen",
 ];
