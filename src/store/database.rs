@@ -31,6 +31,12 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 /// Readers at the same time. Reads are short, and there are few cores. One of them copies the log now and then.
 pub(super) const N_READERS: u32 = 5;
 
+/// Copies what is in the log to the file of the database, as far as others let `connection`.
+pub(super) async fn checkpoint(connection: &mut SqliteConnection) -> Result<(), StoreError> {
+    sqlx::query("PRAGMA wal_checkpoint(PASSIVE)").execute(connection).await?;
+    Ok(())
+}
+
 /// Pages of the log, of 4 KiB, over which a commit copies it itself. That is rare: readers do it beside the writer before, but cannot
 /// come to its end as long as others write, and only then it begins anew.
 const MAX_LOG_PAGES: &str = "16384";
@@ -106,8 +112,7 @@ impl Readers {
     ///
     /// If the database failed.
     pub(super) async fn checkpoint(&self) -> Result<(), StoreError> {
-        sqlx::query("PRAGMA wal_checkpoint(PASSIVE)").execute(&mut *self.one().await?).await?;
-        Ok(())
+        checkpoint(&mut *self.one().await?).await
     }
 
     pub(super) async fn close(&self) {

@@ -33,7 +33,7 @@ use super::database::{Database, Readers};
 use super::policies::AddPolicies;
 use super::sessions::SessionRefusal;
 use super::trials::{NewReward, RewardAnswer};
-use super::{NewObservations, StoreError, Unavailable, models};
+use super::{NewObservations, StoreError, Unavailable, database, models};
 pub(super) use lines::MAX_LARGE_BYTES;
 use lines::{Lines, MAX_SMALL_BYTES};
 use verb::{Asked, Job};
@@ -47,6 +47,9 @@ const LINE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// What is written to the log between two checkpoints, roughly: as much as SQLite itself lets be written.
 const CHECKPOINT_BYTES: usize = 4 << 20;
+
+/// What the writer copies itself, roughly, of what was logged meanwhile; if there is more, it is copied with the rest the next time.
+const REST_BYTES: usize = 1 << 20;
 
 /// What a commit writes whatever it holds, roughly: four pages.
 const COMMIT_BYTES: usize = 16 << 10;
@@ -246,6 +249,7 @@ impl Open {
                     }
                 }
             }
+            self.finish_checkpoint().await;
         }
         self.close().await;
     }
@@ -282,9 +286,24 @@ impl Open {
         Ok(())
     }
 
+    /// Copies what little was logged while the rest was copied beside the writing, so that the log begins anew. One that only grows has
+    /// its size to make durable with every commit, which takes twice the time.
+    async fn finish_checkpoint(&mut self) {
+        if self.checkpoint.as_ref().is_none_or(|checkpoint| !checkpoint.is_finished()) {
+            return;
+        }
+        self.checkpoint = None;
+        if self.n_logged_bytes < REST_BYTES
+            && let Some(connection) = &mut self.connection
+            && let Err(error) = database::checkpoint(connection).await
+        {
+            tracing::debug!(error = &error as &dyn std::error::Error, "the log was not copied to its end");
+        }
+    }
+
     /// Has the log copied to the database's file, beside the writing.
     fn checkpoint(&mut self) {
-        if self.checkpoint.as_ref().is_none_or(JoinHandle::is_finished) {
+        if self.checkpoint.is_none() {
             self.n_logged_bytes = 0;
             let readers = Arc::clone(&self.readers);
             self.checkpoint = Some(self.tasks.spawn(async move {

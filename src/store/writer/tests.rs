@@ -191,6 +191,24 @@ async fn a_commit_leaves_it_to_others_to_copy_the_log() {
 }
 
 #[tokio::test]
+async fn the_log_begins_anew_once_it_was_copied() {
+    const N_ROUNDS: u64 = 16;
+    let directory = tempfile::tempdir().unwrap();
+    let store = open(directory.path()).await;
+    let n_bytes = |name: &str| fs::metadata(directory.path().join(name)).unwrap().len();
+    for round in 1..=N_ROUNDS {
+        store.writer.add_policies(policy(&format!("{round}"), CHECKPOINT_BYTES)).await.unwrap();
+        let mut n = 0;
+        while n_bytes("etude.db") < round * CHECKPOINT_BYTES as u64 || n < 20 {
+            store.writer.add_policies(policy(&format!("{round}, {n}"), 0)).await.unwrap();
+            n += 1;
+        }
+    }
+    let n_logged = n_bytes("etude.db-wal");
+    assert!(n_logged < N_ROUNDS * CHECKPOINT_BYTES as u64 / 2, "{n_logged}");
+}
+
+#[tokio::test]
 async fn copying_the_log_is_no_writing_by_others() {
     let directory = tempfile::tempdir().unwrap();
     let store = open(directory.path()).await;
