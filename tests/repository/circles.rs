@@ -8,11 +8,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use crate::sources::{Module, modules, references, uses};
 
 /// Circles of the core that are still to be opened.
-const CORE: &[&str] = &[
-    "mapping/mapper, mapping/search",
-    "mapping/mapper, mapping/search/layered",
-    "mapping/search/nodes, mapping/search/seen",
-];
+const CORE: &[&str] = &[];
 
 /// Circles of the service that are still to be opened.
 const SERVICE: &[&str] = &[

@@ -47,6 +47,7 @@
 //! replaced by a sweep over all nodes, from the last observation back, in which a node is left by a skip unless a match is cheaper, and by
 //! a match unless an extra action is; when it is depends on the problem and the budget alone.
 
+mod budget;
 #[cfg(test)]
 mod by_definition;
 mod completion;
@@ -64,11 +65,11 @@ mod request;
 mod search;
 mod written;
 
+pub use budget::{Budget, StoppedBy};
 pub use cost::Cost;
-pub use demonstration::Demonstration;
-pub use demonstration::WellFormed;
+pub use demonstration::{Demonstration, WellFormed};
 pub use heuristic::HeuristicName;
-pub use mapper::{Budget, Mapper, Mapping, Settings, Status, StoppedBy};
+pub use mapper::{Mapper, Mapping, Settings, Status};
 pub(crate) use online::longest_lookahead;
 pub use online::{CommittedStep, OnlineMapping, Stopped};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};

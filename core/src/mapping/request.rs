@@ -37,19 +37,12 @@ pub enum RequestKind {
     Session,
 }
 
-/// The names of a request's fields: its own ones, and those that every request has that maps.
-macro_rules! fields {
-    ($($own:literal),*) => {
-        &[$($own),*]
-    };
-}
-
 impl RequestKind {
     /// The names of the fields that a request may have, in the order in which they are listed where one is unknown.
     #[must_use]
     pub const fn fields(self) -> &'static [&'static str] {
         match self {
-            Self::Policy => fields![
+            Self::Policy => &[
                 "model",
                 "demonstration",
                 "weights",
@@ -58,9 +51,9 @@ impl RequestKind {
                 "start",
                 "heuristic",
                 "max_expansions",
-                "deadline_ms"
+                "deadline_ms",
             ],
-            Self::Batch => fields![
+            Self::Batch => &[
                 "model",
                 "items",
                 "weights",
@@ -69,11 +62,11 @@ impl RequestKind {
                 "start",
                 "heuristic",
                 "max_expansions",
-                "deadline_ms"
+                "deadline_ms",
             ],
-            Self::Item => fields!["demonstration", "weights", "lookahead", "start", "heuristic", "max_expansions"],
-            Self::Trial => fields!["model", "demonstration", "start", "lookahead"],
-            Self::Session => fields!["type", "model", "learner", "explore", "weights", "lookahead", "start"],
+            Self::Item => &["demonstration", "weights", "lookahead", "start", "heuristic", "max_expansions"],
+            Self::Trial => &["model", "demonstration", "start", "lookahead"],
+            Self::Session => &["type", "model", "learner", "explore", "weights", "lookahead", "start"],
         }
     }
 
@@ -143,21 +136,21 @@ impl Options {
 
     /// Reads the options that do not depend on the model.
     pub fn read_general(object: &Object<'_, '_>, base: &Self, faults: &mut Faults) -> Option<Self> {
-        let mut or_base = OrBase { object, faults };
-        let heuristic = or_base.read("heuristic", base.heuristic, read_heuristic);
-        let lookahead = or_base.read("lookahead", base.lookahead, read_lookahead);
-        let max_expansions =
-            or_base.read("max_expansions", base.max_expansions, |place, faults| place.integer(0, u64::MAX, faults));
-        let deadline_ms = or_base
-            .read("deadline_ms", base.deadline_ms, |place, faults| place.integer(0, Self::MAX_DEADLINE_MS, faults));
-        Some(Self {
-            weights: base.weights.clone(),
-            start: base.start.clone(),
-            lookahead: lookahead?,
-            heuristic: heuristic?,
-            max_expansions: max_expansions?,
-            deadline_ms: deadline_ms?,
-        })
+        let mut options = base.clone();
+        let n_before = faults.count();
+        if let Some(place) = object.optional("heuristic") {
+            options.heuristic = read_heuristic(&place, faults);
+        }
+        if let Some(place) = object.optional("lookahead") {
+            options.lookahead = read_lookahead(&place, faults);
+        }
+        if let Some(place) = object.optional("max_expansions") {
+            options.max_expansions = place.integer(0, u64::MAX, faults);
+        }
+        if let Some(place) = object.optional("deadline_ms") {
+            options.deadline_ms = place.integer(0, Self::MAX_DEADLINE_MS, faults);
+        }
+        (faults.count() == n_before).then_some(options)
     }
 
     /// The weights that are named, and those of `base` for the others.
@@ -216,27 +209,6 @@ impl Options {
                  make it shorter, or leave it out"
             );
             faults.note_at(&path, detail);
-        }
-    }
-}
-
-/// Reads options of an object.
-struct OrBase<'o, 'f> {
-    object: &'o Object<'o, 'o>,
-    faults: &'f mut Faults,
-}
-
-impl OrBase<'_, '_> {
-    /// Reads the option called `name`, which is that of the `base` if it is missing.
-    fn read<T>(
-        &mut self,
-        name: &str,
-        base: Option<T>,
-        read: impl FnOnce(&Place<'_, '_>, &mut Faults) -> Option<T>,
-    ) -> Option<Option<T>> {
-        match self.object.optional(name) {
-            Some(place) => read(&place, self.faults).map(Some),
-            None => Some(base),
         }
     }
 }

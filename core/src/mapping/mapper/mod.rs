@@ -11,7 +11,6 @@ use std::sync::Arc;
 use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
 
-use super::Problem;
 use super::completion::{Allowance, Extras, complete};
 use super::cost::{Cost, ROUNDING, SLACK, cost_of};
 use super::heuristic::paper::Paper;
@@ -19,46 +18,11 @@ use super::heuristic::projected::{Projected, TableRoom};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Heuristic, HeuristicName};
 use super::search::{Found, Move, astar, layered};
+use super::{Budget, Problem, StoppedBy};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
 use crate::model::{Model, Space, StateIdx, States};
 use buffers::{BufferPool, Buffers};
 use by_default::Patience;
-
-/// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Budget {
-    /// Most nodes expanded.
-    pub max_expansions: u64,
-    /// About the most memory that it takes, in bytes: for the nodes and states that it finds, for tables of estimates, which take
-    /// half of it at most, for ways and for the mapping. What does not fit is
-    /// left out, and when nothing is left, the search ends.
-    ///
-    /// Not counted are the problem itself, the model, what its mapper [keeps](Mapper::size_bytes) of searches before, and about a
-    /// hundred bytes for each observation and step of mappings with many actions for an observation.
-    pub max_bytes: usize,
-}
-
-impl Budget {
-    /// Any number of expansions, within 1 GB.
-    pub const DEFAULT: Self = Self { max_expansions: u64::MAX, max_bytes: 1 << 30 };
-
-    /// What is left of it if `n_bytes` are taken.
-    pub(in crate::mapping) fn beside(self, n_bytes: usize) -> Self {
-        Self { max_bytes: self.max_bytes.saturating_sub(n_bytes), ..self }
-    }
-
-    /// Whether there is no more memory: for `n_bytes`, and what was found in `space`.
-    #[inline]
-    pub(in crate::mapping) fn is_full(self, n_bytes: usize, space: &impl Space) -> bool {
-        n_bytes + space.found_bytes() >= self.max_bytes
-    }
-}
-
-impl Default for Budget {
-    fn default() -> Self {
-        Self::DEFAULT
-    }
-}
 
 /// How a mapping is searched for.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -93,32 +57,6 @@ impl Status {
             Self::Optimal => "optimal",
             Self::Bounded => "bounded",
             Self::Local => "local",
-        }
-    }
-}
-
-/// What a search ran out of.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[serde(rename_all = "snake_case")]
-pub enum StoppedBy {
-    /// The expansions that the request allows.
-    MaxExpansions,
-    /// Time.
-    #[serde(rename = "deadline_ms")]
-    Deadline,
-    /// The memory that a search may take.
-    Memory,
-}
-
-impl StoppedBy {
-    /// What it is called in JSON.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::MaxExpansions => "max_expansions",
-            Self::Deadline => "deadline_ms",
-            Self::Memory => "memory",
         }
     }
 }

@@ -1,5 +1,5 @@
 //! The mapping while the demonstration is still running: observations in, one by one, committed steps out. What is told here of
-//! windows, memory and ties holds for all files of this folder, which makes this one long.
+//! windows, memory and ties holds for all files of this folder.
 //!
 //! Of every state, the cheapest way from the last committed node, the *root*, to that state at the newest observation is known;
 //! these ways form a tree whose leaves are the *survivors*. A new observation adds a layer to the tree, from the layer before it
@@ -37,7 +37,7 @@
 //! **Memory.** Without a lookahead, older layers keep the observation and the nodes that survivors hang on, at most 8 bytes per
 //! state; but no costs, and no distances: of the few states that steps lead to, these are computed again. With a lookahead,
 //! layers are kept whole so that they can be repaired (16 bytes per state and observation after the root's, and tables of
-//! distances), unless that would be more than [`MAX_KEPT`] nodes or terms of distances; requests with a lookahead beyond
+//! distances), unless that would be more than [`memory::MAX_KEPT`] nodes or terms of distances; requests with a lookahead beyond
 //! [`longest_lookahead`] are refused.
 //!
 //! **Ties.** The way found first is kept: a skip, then matches, from the lower state first, then extras, from the cheaper state
@@ -46,6 +46,7 @@
 //! the same ones give the same steps.
 
 mod layer;
+mod memory;
 mod repair;
 mod window;
 
@@ -54,14 +55,15 @@ use std::sync::Arc;
 
 use super::cost::Cost;
 use super::distances::ObservedDistances;
-use super::open_list::CheapestFirst;
 use super::policy::{Step, StepWriter};
 use super::problem::choose_start;
 use super::{Mapper, Mapping, Move, MoveKind, Status};
 use crate::attribute::{Scalar, Value, Weights};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::model::{Model, StateIdx};
-use layer::{Layer, Node, Sweep};
+use layer::{Layer, Sweep};
+pub(crate) use memory::longest_lookahead;
+use memory::{keeps, n_terms};
 use repair::{Predecessors, Repair, Repaired};
 use window::{Place, Window};
 
@@ -127,17 +129,6 @@ pub struct OnlineMapping {
 /// Where more than one survivor in this many has lost its way, sweeping all layers takes less time than a repair.
 const SWEEPS_FROM: usize = 8;
 
-/// Most nodes of a window whose layers are kept whole, to be repaired, 16 bytes each; and most terms in its tables of distances,
-/// 8 bytes each. Together 48 MB.
-const MAX_KEPT: u64 = 1 << 21;
-
-/// The longest lookahead whose window takes about `max_bytes` with `model` if all of its nodes are alive, as when nothing tells the ways
-/// apart: that has one layer more, and 8 bytes a node. With 1 GB it has at most 134 million nodes. 0 if not even the shortest one fits.
-pub(crate) fn longest_lookahead(model: &Model, max_bytes: usize) -> u32 {
-    let n_layers = max_bytes / size_of::<Node>() / (model.states().len() as usize).max(1);
-    u32::try_from(n_layers.saturating_sub(1)).unwrap_or(u32::MAX)
-}
-
 impl OnlineMapping {
     /// A mapping of a demonstration of which nothing has come yet. `start` overrides the model's; `lookahead` is how many
     /// observations past the current one a decision may wait for, `None` for all.
@@ -181,31 +172,6 @@ impl OnlineMapping {
         Self { max_bytes, ..self }
     }
 
-    /// About how much memory a mapping of so many observations takes at most, in bytes, also while it takes one: if all ways to all states
-    /// are alive, as when nothing tells them apart.
-    #[must_use]
-    pub fn most_bytes(model: &Model, lookahead: Option<NonZeroU32>, n_observations: usize) -> usize {
-        /// How many entries of the open list there are for each state, about.
-        const OPEN: usize = 4;
-        let n_states = model.graph().n_states();
-        let n_terms = n_terms(model, |_| true);
-        let reach = lookahead.map_or(usize::MAX, |lookahead| lookahead.get() as usize);
-        let n_layers = n_observations.min(reach.saturating_add(1));
-        let keeps = keeps(n_states, n_terms, lookahead);
-        let each = if keeps {
-            n_states * (layer::NODE_BYTES + repair::NODE_BYTES) + n_terms * size_of::<f64>()
-        } else {
-            n_states * size_of::<Node>()
-        };
-        let each = each + size_of::<Layer>() + model.schema().len() * OBSERVED_BYTES;
-        let once = n_states
-            * (size_of::<f64>() + size_of::<StateIdx>() + OPEN * size_of::<CheapestFirst>() + 3 * layer::NODE_BYTES)
-            + n_terms * size_of::<f64>()
-            + Predecessors::bytes_for(model.graph());
-        let moves = n_observations.saturating_mul(MOVES_PER_OBSERVATION * size_of::<Move>());
-        n_layers.saturating_mul(each).saturating_add(once).saturating_add(moves + BASE_BYTES)
-    }
-
     /// How many observations have come.
     #[must_use]
     pub fn n_observed(&self) -> u32 {
@@ -222,29 +188,6 @@ impl OnlineMapping {
     #[must_use]
     pub fn n_nodes(&self) -> usize {
         self.window.n_alive()
-    }
-
-    /// Approximate size in memory, in bytes, without the model. Looks at no layer.
-    #[must_use]
-    pub fn size_bytes(&self) -> usize {
-        let predecessors = self.predecessors.as_ref().map_or(0, Predecessors::size_bytes);
-        let moves = self.moves.capacity() * size_of::<Move>();
-        size_of::<Self>() + self.window.size_bytes() + self.sweep.size_bytes() + predecessors + moves
-    }
-
-    /// Checks that there is memory for so many bytes more.
-    fn check_memory(&self, n_bytes: usize) -> Result<(), Stopped> {
-        if self.max_bytes == usize::MAX || self.size_bytes().saturating_add(n_bytes) <= self.max_bytes {
-            Ok(())
-        } else {
-            Err(Stopped::Memory)
-        }
-    }
-
-    /// How much memory the next layer takes, in bytes.
-    fn next_layer_bytes(&self) -> usize {
-        let observed = self.n_terms * size_of::<f64>() + self.weights.as_slice().len() * OBSERVED_BYTES;
-        self.window.layer_bytes(self.model.graph().n_states()) + observed
     }
 
     /// How many nodes were looked at: every state once for each layer that was swept.
@@ -443,27 +386,6 @@ impl OnlineMapping {
         Ok(self.sweep.follow(&self.model, &before.costs, &self.window.reached, observed, spare))
     }
 }
-
-/// How many terms of distances an observation has, for each value of the attributes at these positions.
-fn n_terms(model: &Model, weighs: impl Fn(usize) -> bool) -> usize {
-    let weighing = (0..model.schema().len()).filter(|position| weighs(*position));
-    weighing.map(|position| model.states().domain(position).len()).sum()
-}
-
-/// Whether the layers of a window are kept whole.
-fn keeps(n_states: usize, n_terms: usize, lookahead: Option<NonZeroU32>) -> bool {
-    let n_layers = lookahead.map_or(u64::MAX, |lookahead| 1 + u64::from(lookahead.get()));
-    n_layers.saturating_mul(n_states.max(n_terms) as u64) <= MAX_KEPT
-}
-
-/// What an observed attribute takes, besides its terms.
-const OBSERVED_BYTES: usize = 64;
-
-/// What there is however small the model.
-const BASE_BYTES: usize = 1 << 12;
-
-/// About how many steps an observation has at most, with the room for more: bodies that need more are rare.
-const MOVES_PER_OBSERVATION: usize = 8;
 
 #[cfg(test)]
 mod tests;

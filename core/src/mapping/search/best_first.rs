@@ -12,7 +12,7 @@
 //! divided into [`Buckets`]. The order within a bucket is not that of `f`, so a node may be expanded before the cheapest way to it is
 //! known; it is then expanded again.
 //!
-//! Probes and the search share the expansion, its budget and what is found, so they stand in one file, however long.
+//! This file is longer than 400 lines because probes and the search share the expansion, its budget and what is found.
 
 use std::collections::BinaryHeap;
 use std::ops::Range;

@@ -13,14 +13,16 @@
 //! optimum by more, and there are too many nodes for each to have a place.
 
 mod joined;
+mod ways_out;
 
 use super::{End, Found, Move, MoveKind, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{Estimate, Projected};
 use crate::mapping::{Budget, Problem, StoppedBy};
-use crate::model::{ActionIdx, Model, StateIdx};
+use crate::model::{Model, StateIdx};
 use joined::JoinedTables;
+use ways_out::{WayOut, WaysOut};
 
 /// How many nodes of each layer the beams expand, one beam after the other.
 const BEAM_WIDTHS: [usize; 2] = [1, 8];
@@ -33,23 +35,6 @@ pub(in crate::mapping) struct LayeredBuffers {
     ways_out: WaysOut,
     tables: JoinedTables,
     nodes: LayeredNodes,
-}
-
-/// The ways out of all states.
-#[derive(Debug, Default)]
-struct WaysOut {
-    ways: Vec<WayOut>,
-    /// By state, where its ways end.
-    ends: Vec<usize>,
-}
-
-/// A way out of a state.
-#[derive(Clone, Copy, Debug)]
-struct WayOut {
-    cost: f64,
-    from: StateIdx,
-    to: StateIdx,
-    action: ActionIdx,
 }
 
 /// All nodes, observation by observation. Shapes `[n_observations, n_states]`.
@@ -394,31 +379,5 @@ impl LayeredNodes {
         }
         moves.reverse();
         moves
-    }
-}
-
-impl WaysOut {
-    /// Gathers the ways of `model`, the same every time.
-    fn prepare(&mut self, model: &Model) {
-        if !self.ends.is_empty() {
-            return;
-        }
-        for state in 0..model.states().len() {
-            let ways = model.graph().successors(state).iter();
-            self.ways.extend(ways.map(|way| WayOut {
-                cost: model.action(way.action).cost,
-                from: state,
-                to: way.to,
-                action: way.action,
-            }));
-            self.ends.push(self.ways.len());
-        }
-    }
-
-    /// The ways out of a state, and the number of the first.
-    #[inline]
-    fn ways(&self, state: StateIdx) -> (usize, &[WayOut]) {
-        let begin = (state as usize).checked_sub(1).map_or(0, |before| self.ends[before]);
-        (begin, &self.ways[begin..self.ends[state as usize]])
     }
 }

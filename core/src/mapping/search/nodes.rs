@@ -21,7 +21,7 @@ pub(super) type BlockIdx = u32;
 pub(super) const NO_NODE: NodeId = NodeId::MAX;
 
 /// How many observations a block is for.
-pub(super) const BLOCK_LEN: usize = CHUNK_LEN;
+const BLOCK_LEN: usize = CHUNK_LEN;
 const BLOCK_BITS: u32 = BLOCK_LEN.ilog2();
 const IN_BLOCK: u32 = (1 << BLOCK_BITS) - 1;
 

@@ -4,8 +4,7 @@ use std::ops::Range;
 
 use rustc_hash::FxHashMap;
 
-use super::nodes::BLOCK_LEN;
-use crate::mapping::heuristic::projected::{ChangingColumn, Estimate, Projected};
+use crate::mapping::heuristic::projected::{CHUNK_LEN, ChangingColumn, Estimate, Projected};
 use crate::model::{Action, ActionIdx, Space, StateIdx, make_room};
 
 /// A state's number among those that a search has seen, in the order in which it did.
@@ -222,10 +221,10 @@ impl<S: Space> Estimates<'_, '_, S> {
         self.projected.estimate(observation as usize, self.seen.classes(state), values)
     }
 
-    /// At all nodes of a block, of which the first is of this observation; `None` if that is more than a little work. What they
-    /// are beyond the last observation is of no interest.
+    /// At the nodes of a state at [`CHUNK_LEN`] observations from `first` on; `None` if an estimate takes more than the tables. Past the
+    /// last observation the entries mean nothing.
     #[inline]
-    pub(super) fn of_all(&self, state: SeenIdx, first: u32) -> Option<[Estimate; BLOCK_LEN]> {
+    pub(super) fn of_all(&self, state: SeenIdx, first: u32) -> Option<[Estimate; CHUNK_LEN]> {
         let classes = self.seen.classes(state);
         self.projected.are_all_in_columns().then(|| self.projected.estimate_chunk(first as usize, classes))
     }

@@ -8,6 +8,7 @@ use crate::document::{Faults, Place};
 use crate::interrupt::Uninterrupted;
 use crate::mapping::Request;
 use crate::mapping::by_definition::{distance, least_costs, moves, nodes};
+use crate::mapping::heuristic::projection::Projections;
 use crate::model::{Definition, Limits, Model, StateIdx};
 
 /// A model of up to 12 states and three attributes, of which some weigh nothing, and a demonstration.

@@ -1,0 +1,46 @@
+//! The ways out of the states of a model, in one array.
+
+use crate::model::{ActionIdx, Model, StateIdx};
+
+/// The ways out of all states.
+#[derive(Debug, Default)]
+pub(super) struct WaysOut {
+    pub(super) ways: Vec<WayOut>,
+    /// By state, where its ways end.
+    pub(super) ends: Vec<usize>,
+}
+
+/// A way out of a state.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct WayOut {
+    pub(super) cost: f64,
+    pub(super) from: StateIdx,
+    pub(super) to: StateIdx,
+    pub(super) action: ActionIdx,
+}
+
+impl WaysOut {
+    /// Gathers the ways of `model`, the same every time.
+    pub(super) fn prepare(&mut self, model: &Model) {
+        if !self.ends.is_empty() {
+            return;
+        }
+        for state in 0..model.states().len() {
+            let ways = model.graph().successors(state).iter();
+            self.ways.extend(ways.map(|way| WayOut {
+                cost: model.action(way.action).cost,
+                from: state,
+                to: way.to,
+                action: way.action,
+            }));
+            self.ends.push(self.ways.len());
+        }
+    }
+
+    /// The ways out of a state, and the number of the first.
+    #[inline]
+    pub(super) fn ways(&self, state: StateIdx) -> (usize, &[WayOut]) {
+        let begin = (state as usize).checked_sub(1).map_or(0, |before| self.ends[before]);
+        (begin, &self.ways[begin..self.ends[state as usize]])
+    }
+}
