@@ -20,7 +20,7 @@ use crate::config::ServeConfig;
 use crate::http::{self, Access, ConnectionLimits, Context};
 use crate::memory::Memory;
 use crate::service::Etude;
-use crate::store::StoreError;
+use crate::service::StoreError;
 use crate::stream::Rooms;
 use crate::telemetry;
 

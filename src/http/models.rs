@@ -23,7 +23,7 @@ use super::paging::{List, Paging};
 use super::path::PathName;
 use super::problem::{BodyProblems, NoBodyProblems, Problem};
 use crate::service::{Caller, DefinitionReader, Etude, ModelDefinition, Registered, ServiceError};
-use crate::store::{ModelSummary, PIECE_BYTES};
+use crate::service::{ModelSummary, PIECE_BYTES};
 use etude_core::attribute::AttributeDocument;
 use etude_core::model::{ActionDocument, DefinitionDocument};
 

@@ -10,7 +10,7 @@ use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use super::SharedContext;
 use super::problem::{Problem, ProblemKind};
-use crate::store::StoreError;
+use crate::service::StoreError;
 
 /// Whether the process is alive.
 #[utoipa::path(

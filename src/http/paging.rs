@@ -6,7 +6,7 @@ use serde::Serialize;
 use utoipa::{IntoParams, ToSchema};
 
 use super::problem::Problem;
-use crate::store::Page;
+use crate::service::Page;
 use etude_core::document::{Faults, Path};
 
 /// Which part of a list is wanted.

@@ -13,7 +13,7 @@ use super::encoding::{BodyError, Encoding};
 use super::request_id::RequestId;
 use crate::memory::NoRoom;
 use crate::service::{self, PoolError, ServiceError};
-use crate::store::{StoreError, Unavailable};
+use crate::service::{StoreError, Unavailable};
 use etude_core::document::{Fault, Faults, ParseError};
 
 /// What kind of problem it is: its `type`, title and status.
@@ -313,6 +313,7 @@ impl From<ServiceError> for Problem {
             }
             ServiceError::Pool(PoolError::Panicked)
             | ServiceError::Store(_)
+            | ServiceError::Unreadable { .. }
             | ServiceError::Write(_)
             | ServiceError::WritePolicy(_) => {
                 // The client gets nothing but its request id, under which the log has the rest.

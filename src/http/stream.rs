@@ -31,7 +31,7 @@ use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{Problem, ProblemKind};
 use crate::service::Caller;
-use crate::store::SessionRow;
+use crate::service::SessionRecord;
 use crate::stream::{Gone, Incoming, PROTOCOL, Room, SMALL_FRAME_BYTES, Sender};
 use etude_core::attribute::ByAttribute;
 
@@ -185,8 +185,8 @@ struct SessionBody {
     active_at: Timestamp,
 }
 
-impl From<SessionRow> for SessionBody {
-    fn from(row: SessionRow) -> Self {
+impl From<SessionRecord> for SessionBody {
+    fn from(row: SessionRecord) -> Self {
         Self {
             id: row.id,
             model: row.model,

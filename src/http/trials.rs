@@ -17,8 +17,8 @@ use super::path::{PathId, PathName};
 use super::problem::{BodyProblems, Problem};
 use super::requests::TrialRequest;
 use super::{SharedContext, answer};
+use crate::service::TrialStatus;
 use crate::service::{Caller, TrialAnswer};
-use crate::store::{StoreError, TrialStatus};
 use etude_core::mapping::Policy;
 
 /// A trial: weights drawn from a learner, the policy that they gave, and the reward that it earned.
@@ -63,25 +63,23 @@ pub(super) struct TrialBody {
 }
 
 impl TrialBody {
-    fn of(answer: TrialAnswer) -> Result<Self, StoreError> {
-        let TrialAnswer { row, status, policy, held: _ } = answer;
-        let weights = RawValue::from_string(row.weights);
-        let weights = weights.map_err(|error| StoreError::corrupt("trials", "weights", &row.id, error))?;
-        Ok(Self {
-            id: row.id,
-            learner: row.learner,
-            number: row.number,
+    fn of(answer: TrialAnswer) -> Self {
+        let TrialAnswer { trial, weights, status, policy, held: _ } = answer;
+        Self {
+            id: trial.id,
+            learner: trial.learner,
+            number: trial.number,
             status: status.name(),
             weights,
-            weights_version: row.weights_version,
-            reward: row.reward.map(|accepted| accepted.reward),
-            reward_order: row.reward.map(|accepted| accepted.reward_order),
-            learned_version: row.learned_version,
-            reason: row.failed.and_then(|failure| failure.reason),
-            lease_expires_at: row.lease_expires_at,
-            policy_id: row.policy_id,
+            weights_version: trial.weights_version,
+            reward: trial.reward.map(|accepted| accepted.reward),
+            reward_order: trial.reward.map(|accepted| accepted.reward_order),
+            learned_version: trial.learned_version,
+            reason: trial.failed.and_then(|failure| failure.reason),
+            lease_expires_at: trial.lease_expires_at,
+            policy_id: trial.policy_id,
             policy,
-        })
+        }
     }
 }
 
@@ -126,7 +124,7 @@ pub(super) async fn make_trial(
     let body = read_json(request, &context).await?;
     let mut made = context.etude.make_trial(&name, body, caller).await?;
     let held = made.held.take();
-    let made = TrialBody::of(made)?;
+    let made = TrialBody::of(made);
     let location = HeaderValue::from_str(&format!("/v1/trials/{}", made.id));
     let mut response = answer::counted(json(StatusCode::CREATED, &made), held);
     if let Ok(location) = location {
@@ -182,8 +180,7 @@ pub(super) async fn list_trials(
 ) -> Result<Response, Problem> {
     let after = paging.after_number()?.unwrap_or(0);
     let page = context.etude.trials(&name, which.status, context.etude.clock().now(), after, paging.limit).await?;
-    let page = page.try_map(|answer| &answer.row.id, TrialBody::of)?;
-    Ok(json(StatusCode::OK, &List::of(page, |trial| trial)))
+    Ok(json(StatusCode::OK, &List::of(page, TrialBody::of)))
 }
 
 /// A trial, with its policy.
@@ -198,7 +195,7 @@ pub(super) async fn list_trials(
 pub(super) async fn get_trial(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
     let mut trial = context.etude.trial(&id, context.etude.clock().now()).await?;
     let held = trial.held.take();
-    Ok(answer::counted(json(StatusCode::OK, &TrialBody::of(trial)?), held))
+    Ok(answer::counted(json(StatusCode::OK, &TrialBody::of(trial)), held))
 }
 
 /// Give a trial its reward; durable before it is answered. Counts once, however often it is sent.
@@ -222,7 +219,7 @@ pub(super) async fn put_reward(
 ) -> Result<Response, Problem> {
     let body = read_small_json(request, &context).await?;
     let trial = context.etude.reward_trial(&id, &body, context.etude.clock().now()).await?;
-    Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
+    Ok(json(StatusCode::OK, &TrialBody::of(trial)))
 }
 
 /// End a trial without a reward.
@@ -246,5 +243,5 @@ pub(super) async fn fail_trial(
 ) -> Result<Response, Problem> {
     let body = read_small_json(request, &context).await?;
     let trial = context.etude.fail_trial(&id, &body, context.etude.clock().now()).await?;
-    Ok(json(StatusCode::OK, &TrialBody::of(trial)?))
+    Ok(json(StatusCode::OK, &TrialBody::of(trial)))
 }

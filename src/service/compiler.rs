@@ -187,7 +187,7 @@ impl Compiler {
             if let ModelText::Whole(text) = &text
                 && let Err(error) = check_hash(&model, &hex(Sha256::digest(text)), &expected)
             {
-                return Ok(Err(error.into()));
+                return Ok(Err(error));
             }
             let definition = text.read(Format::Json, Limits::NONE, interrupt);
             Ok(match definition {
@@ -235,7 +235,9 @@ fn shared(error: &ServiceError, name: &str, pointer: &'static str) -> ServiceErr
         ServiceError::Store(StoreError::Database(error)) => {
             StoreError::Database(sqlx::Error::Protocol(error.to_string())).into()
         }
-        ServiceError::Store(StoreError::Corrupt { source, .. }) => corrupt_definition(name, source.to_string().into()),
+        ServiceError::Store(StoreError::Corrupt { source, .. }) | ServiceError::Unreadable { source, .. } => {
+            corrupt_definition(name, source.to_string().into())
+        }
         // Nothing else comes of compiling.
         error => corrupt_definition(name, error.to_string().into()),
     }

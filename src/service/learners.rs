@@ -4,7 +4,7 @@ use jiff::Timestamp;
 
 use super::hash::hash_of;
 use super::{Etude, Name, Registered, ServiceError, as_stored};
-use crate::store::{Deletion, Fold, LearnerRow, NewLearner, Page, Registration, StoreError, WeightsRow};
+use crate::store::{Deletion, Fold, LearnerRecord, NewLearner, Page, Registration, WeightsRecord};
 use etude_core::document;
 use etude_core::learning::{Distribution, Learner, LearnerDocument};
 
@@ -77,7 +77,7 @@ pub(super) struct Ready {
     pub(super) sequence: i64,
     pub(super) name: String,
     pub(super) learner: Learner,
-    pub(super) weights: WeightsRow,
+    pub(super) weights: WeightsRecord,
 }
 
 impl Etude {
@@ -117,7 +117,7 @@ impl Etude {
     ///
     /// If there is none.
     pub async fn learner(&self, name: &Name) -> Result<LearnerAnswer, ServiceError> {
-        Ok(answer(self.learner_row(name).await?)?)
+        answer(self.learner_row(name).await?)
     }
 
     /// At most `limit` learners in the order of their names, from the first after `after`.
@@ -127,7 +127,7 @@ impl Etude {
     /// If the store failed.
     pub async fn learners(&self, after: Option<&str>, limit: u32) -> Result<Page<LearnerAnswer>, ServiceError> {
         let page = self.store.learners(after, limit).await?;
-        Ok(page.try_map(|row| &row.name, answer)?)
+        Ok(page.map_readable(|row| &row.name, answer))
     }
 
     /// Deletes the learner called `name`, with its weights and trials. Policies made with it stay.
@@ -198,7 +198,7 @@ impl Etude {
             return Ok(weights_answer(name, &learner, weights));
         }
         let folded =
-            WeightsRow { version: weights.version + 1, reward_order, distribution, updated_at: as_stored(now) };
+            WeightsRecord { version: weights.version + 1, reward_order, distribution, updated_at: as_stored(now) };
         if self.store.fold_rewards(sequence, folded.clone()).await? == Fold::Outdated {
             // Deleted meanwhile, or another process has learned; what that made is as good.
             let Ready { learner, weights, .. } = self.ready(name, None).await?;
@@ -229,7 +229,7 @@ impl Etude {
         loop {
             let page = self.store.weights_history(row.sequence, after, Self::REPLAY_PAGE).await?;
             if let Some(version) = page.unreadable.into_iter().next() {
-                return Err(StoreError::corrupt("weights", "value", version, "it cannot be read").into());
+                return Err(ServiceError::unreadable("weights", "value", version, "it cannot be read"));
             }
             versions.extend(page.items);
             match page.next {
@@ -239,7 +239,7 @@ impl Etude {
         }
         let mut versions = versions.into_iter().peekable();
         let mut replay = Replay { n_rewards: 0, n_versions: 0, first_difference: None };
-        let mut compare = |versions: &mut std::iter::Peekable<std::vec::IntoIter<WeightsRow>>,
+        let mut compare = |versions: &mut std::iter::Peekable<std::vec::IntoIter<WeightsRecord>>,
                            replayed: &Distribution,
                            reward_order: u64| {
             replay.n_rewards = reward_order;
@@ -287,7 +287,7 @@ impl Etude {
         Ok(Ready { sequence: row.sequence, name: row.name, learner, weights })
     }
 
-    pub(super) async fn learner_row(&self, name: &Name) -> Result<LearnerRow, ServiceError> {
+    pub(super) async fn learner_row(&self, name: &Name) -> Result<LearnerRecord, ServiceError> {
         self.store.learner(name.as_str()).await?.ok_or_else(|| unknown(name.as_str(), None))
     }
 }
@@ -297,27 +297,28 @@ pub(super) fn unknown(name: &str, pointer: Option<&'static str>) -> ServiceError
 }
 
 /// The text of a definition, if it is the one that was accepted.
-fn checked_definition(row: &LearnerRow) -> Result<&str, StoreError> {
+fn checked_definition(row: &LearnerRecord) -> Result<&str, ServiceError> {
     if hash_of(&row.definition) == row.hash {
         return Ok(&row.definition);
     }
-    Err(StoreError::corrupt("learners", "definition", &row.name, "it is not what its hash is of"))
+    Err(ServiceError::unreadable("learners", "definition", &row.name, "it is not what its hash is of"))
 }
 
 /// What was once accepted is read again without faults.
-fn read_definition(row: &LearnerRow) -> Result<Learner, StoreError> {
-    let corrupt = |error| StoreError::corrupt("learners", "definition", &row.name, error);
+fn read_definition(row: &LearnerRecord) -> Result<Learner, ServiceError> {
+    let corrupt = |error| ServiceError::unreadable("learners", "definition", &row.name, error);
     let document = document::parse(checked_definition(row)?.as_bytes()).map_err(|error| corrupt(error.to_string()))?;
     Learner::read(&document).map_err(|faults| corrupt(faults.to_string()))
 }
 
-fn answer(row: LearnerRow) -> Result<LearnerAnswer, StoreError> {
+fn answer(row: LearnerRecord) -> Result<LearnerAnswer, ServiceError> {
     let definition = serde_json::from_str(checked_definition(&row)?);
-    let definition = definition.map_err(|error| StoreError::corrupt("learners", "definition", &row.name, error))?;
+    let definition =
+        definition.map_err(|error| ServiceError::unreadable("learners", "definition", &row.name, error))?;
     Ok(LearnerAnswer { name: row.name, hash: row.hash, definition, created_at: row.created_at })
 }
 
-fn weights_answer(name: &str, learner: &Learner, row: WeightsRow) -> WeightsAnswer {
+fn weights_answer(name: &str, learner: &Learner, row: WeightsRecord) -> WeightsAnswer {
     let Distribution { mean, sd, expected_reward } = row.distribution;
     let known = learner.attributes().iter().zip(mean.into_iter().zip(sd));
     WeightsAnswer {

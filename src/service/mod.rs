@@ -57,7 +57,9 @@ pub use trials::TrialAnswer;
 
 use crate::clock::{Clock, Ids};
 use crate::memory::{Memory, NoRoom};
-use crate::store::{Store, StoreError};
+pub(crate) use crate::store::PIECE_BYTES;
+use crate::store::Store;
+pub use crate::store::{AcceptedReward, ModelSummary, Page, SessionRecord, StoreError, TrialStatus, Unavailable};
 use cache::ModelNames;
 use compiler::Compiler;
 use etude_core::document::{Faults, ParseError, Quoted};
@@ -203,12 +205,37 @@ pub enum ServiceError {
     /// The store failed.
     #[error(transparent)]
     Store(StoreError),
+    /// What the store holds cannot be read as what was stored.
+    #[error("table {table} holds an invalid {column} in the row of {row:?}")]
+    Unreadable {
+        /// Where.
+        table: &'static str,
+        /// In which column.
+        column: &'static str,
+        /// In which row, by its name or id.
+        row: String,
+        /// What is wrong with it.
+        #[source]
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
     /// What was made could not be written as JSON: a defect.
     #[error("an answer could not be written")]
     Write(#[source] serde_json::Error),
     /// A policy could not be written: a defect.
     #[error("a policy could not be written")]
     WritePolicy(#[from] WriteError),
+}
+
+impl ServiceError {
+    /// A row, known by its name or id, whose content cannot be read.
+    fn unreadable(
+        table: &'static str,
+        column: &'static str,
+        row: impl Into<String>,
+        source: impl Into<Box<dyn std::error::Error + Send + Sync>>,
+    ) -> Self {
+        Self::Unreadable { table, column, row: row.into(), source: source.into() }
+    }
 }
 
 impl From<StoreError> for ServiceError {

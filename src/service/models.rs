@@ -15,7 +15,7 @@ use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::store::{
     Deletion, ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, PIECE_BYTES, Page, Registration,
-    Store, StoreError, StoredDefinition,
+    Store, StoredDefinition,
 };
 use etude_core::attribute::AttributeDocument;
 use etude_core::interrupt::{Interrupt, Interrupted};
@@ -79,11 +79,11 @@ impl DefinitionReader {
 }
 
 /// Makes sure that what is stored of a definition is what was registered.
-pub(super) fn check_hash(model: &str, hash: &str, expected: &str) -> Result<(), StoreError> {
+pub(super) fn check_hash(model: &str, hash: &str, expected: &str) -> Result<(), ServiceError> {
     if hash == expected {
         return Ok(());
     }
-    Err(StoreError::corrupt("models", "definition", model, "it is not what its hash is of"))
+    Err(ServiceError::unreadable("models", "definition", model, "it is not what its hash is of"))
 }
 
 /// The text of a model on its way in.
@@ -372,7 +372,7 @@ pub(super) fn unknown(name: &str, pointer: Option<&'static str>) -> ServiceError
 }
 
 pub(super) fn corrupt_definition(model: &str, source: Box<dyn std::error::Error + Send + Sync>) -> ServiceError {
-    StoreError::corrupt("models", "definition", model, source).into()
+    ServiceError::unreadable("models", "definition", model, source)
 }
 
 impl From<ReadError> for ServiceError {

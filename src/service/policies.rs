@@ -9,7 +9,7 @@ use super::requests::{Named, SentRequest, base_weights, check_request};
 use super::search::{Extent, MAX_INLINE_BYTES, Searched, follow, is_quick, max_quick_observations};
 use super::{Caller, Etude, ServiceError};
 use crate::memory::{Held, Memory};
-use crate::store::{Page, PolicySummaryRow, StoreError};
+use crate::store::Page;
 use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Object, Path};
 use etude_core::interrupt::{Cancelled, Interrupt};
@@ -108,11 +108,7 @@ impl Etude {
     /// If the store failed.
     pub async fn policies(&self, after: i64, limit: u32) -> Result<Page<Box<RawValue>>, ServiceError> {
         let page = self.store.policies(after, limit).await?;
-        let read = |row: PolicySummaryRow| {
-            RawValue::from_string(row.summary)
-                .map_err(|error| StoreError::corrupt("policies", "summary", row.id, error))
-        };
-        Ok(page.try_map(|row| &row.id, read)?)
+        Ok(page.map(|policy| policy.summary))
     }
 }
 

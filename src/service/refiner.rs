@@ -205,17 +205,17 @@ impl Etude {
         let (memory, limit) = (self.memory.clone(), self.time_limits.max_deadline);
         let job = move |interrupt: &mut dyn Interrupt| {
             let _held = held;
-            let corrupt = |error| StoreError::corrupt("refinements", "request", policy_id, error);
+            let corrupt = |error| ServiceError::unreadable("refinements", "request", policy_id, error);
             let schema = mapper.model().schema();
             let weights = schema.attributes().iter().map(|attribute| weights.get(&attribute.name).copied());
             let demonstration = Demonstration::read_again(schema, &texts, 0);
             let problem = match (demonstration, weights.collect::<Option<Vec<f64>>>()) {
-                (Err(error), _) => return Ok(Err(corrupt(error.to_string()).into())),
+                (Err(error), _) => return Ok(Err(corrupt(error.to_string()))),
                 (Ok(Some(demonstration)), Some(weights)) if has_state(mapper.model(), start) => {
                     let start = Some(Origin::State(start));
                     Problem::new(mapper.model(), demonstration, Weights::of(weights), start)
                 }
-                _ => return Ok(Err(corrupt("it does not fit its model".to_owned()).into())),
+                _ => return Ok(Err(corrupt("it does not fit its model".to_owned()))),
             };
             drop(texts);
             let began = Instant::now();

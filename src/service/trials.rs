@@ -13,7 +13,7 @@ use super::requests::check_request;
 use super::search::{Searched, write};
 use super::{Caller, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::memory::Held;
-use crate::store::{FailureAnswer, NewReward, NewTrial, Opened, Page, RewardAnswer, StoreError, TrialRow, TrialStatus};
+use crate::store::{FailureAnswer, NewReward, NewTrial, Opened, Page, RewardAnswer, TrialRecord, TrialStatus};
 use etude_core::attribute::{Schema, Weights};
 use etude_core::document::{Faults, Object, Path, Place, Range};
 use etude_core::learning::Learner;
@@ -26,14 +26,25 @@ const MAX_REASON_CHARS: usize = 1000;
 /// A trial, and what has become of it.
 #[derive(Debug)]
 pub struct TrialAnswer {
-    /// The trial.
-    pub row: TrialRow,
+    /// The trial, but for its weights.
+    pub trial: TrialRecord,
+    /// Its weights by attribute of the learner: JSON.
+    pub weights: Box<RawValue>,
     /// What has become of it.
     pub status: TrialStatus,
     /// Its policy: JSON. Not in lists.
     pub policy: Option<Box<RawValue>>,
     /// For the policy, and as much again while it is written into an answer, if it is much.
     pub held: Option<Held>,
+}
+
+impl TrialAnswer {
+    /// The answer without the policy.
+    fn of(mut trial: TrialRecord, now: Timestamp) -> Result<Self, ServiceError> {
+        let weights = RawValue::from_string(std::mem::take(&mut trial.weights));
+        let weights = weights.map_err(|error| ServiceError::unreadable("trials", "weights", &trial.id, error))?;
+        Ok(Self { status: trial.status(now), trial, weights, policy: None, held: None })
+    }
 }
 
 impl Etude {
@@ -115,7 +126,7 @@ impl Etude {
             self.refiner.wake();
         }
         metrics::counter!("etude_trials_total").increment(1);
-        let row = TrialRow {
+        let trial = TrialRecord {
             sequence: 0,
             id,
             learner: name,
@@ -128,8 +139,8 @@ impl Etude {
             reward: None,
             learned_version: None,
         };
-        let policy = Some(read_policy(policy, &row.policy_id)?);
-        Ok(TrialAnswer { row, status: TrialStatus::Active, policy, held })
+        let policy = Some(read_policy(policy, &trial.policy_id)?);
+        Ok(TrialAnswer { status: TrialStatus::Active, policy, held, ..TrialAnswer::of(trial, now)? })
     }
 
     /// Draws a trial for a policy that is still in the making. The caller stores it.
@@ -163,13 +174,13 @@ impl Etude {
     ///
     /// If there is none.
     pub async fn trial(&self, id: &str, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
-        let row = self.store.trial(id).await?.ok_or_else(|| unknown_trial(id))?;
-        let (policy, held) = self.store.policy_within(&row.policy_id, &self.memory).await?.unzip();
-        let policy = policy.map(|policy| read_policy(policy, &row.policy_id)).transpose()?;
+        let trial = self.store.trial(id).await?.ok_or_else(|| unknown_trial(id))?;
+        let (policy, held) = self.store.policy_within(&trial.policy_id, &self.memory).await?.unzip();
+        let policy = policy.map(|policy| read_policy(policy, &trial.policy_id)).transpose()?;
         // Once more in the answer.
         let mut held = held.flatten();
         self.memory.hold(&mut held, 2 * policy.as_ref().map_or(0, |policy| policy.get().len()))?;
-        Ok(TrialAnswer { status: row.status(now), row, policy, held })
+        Ok(TrialAnswer { policy, held, ..TrialAnswer::of(trial, now)? })
     }
 
     /// At most `limit` trials of a learner in the order of their numbers, from the first after the number `after`; only those
@@ -188,7 +199,7 @@ impl Etude {
     ) -> Result<Page<TrialAnswer>, ServiceError> {
         let learner = self.learner_row(name).await?.sequence;
         let page = self.store.trials(learner, status, now, after, limit).await?;
-        Ok(page.map(|row| TrialAnswer { status: row.status(now), row, policy: None, held: None }))
+        Ok(page.map_readable(|trial| &trial.id, |trial| TrialAnswer::of(trial, now)))
     }
 
     /// Accepts the reward in `body` (JSON) for a trial; durable when this returns. The same reward again changes nothing.
@@ -212,19 +223,19 @@ impl Etude {
     /// If there is no such trial, or it has another reward or has failed.
     pub async fn accept_reward(&self, id: &str, reward: f64, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
         let new = NewReward { trial: id.to_owned(), reward, accepted_at: now };
-        let row = match self.store.accept_reward(new).await? {
-            RewardAnswer::Accepted(row) => {
+        let trial = match self.store.accept_reward(new).await? {
+            RewardAnswer::Accepted(trial) => {
                 metrics::counter!("etude_rewards_total").increment(1);
-                row
+                trial
             }
-            RewardAnswer::Unchanged(row) => row,
+            RewardAnswer::Unchanged(trial) => trial,
             RewardAnswer::Conflict { existing } => {
                 return Err(ServiceError::AlreadyRewarded { trial: id.to_owned(), existing });
             }
             RewardAnswer::Failed => return Err(ServiceError::TrialFailed { trial: id.to_owned() }),
             RewardAnswer::Unknown => return Err(unknown_trial(id)),
         };
-        Ok(TrialAnswer { status: row.status(now), row, policy: None, held: None })
+        TrialAnswer::of(trial, now)
     }
 
     /// Ends a trial without a reward, for the reason in `body` (JSON).
@@ -248,7 +259,7 @@ impl Etude {
         });
         let reason = faults.check(reason)?;
         match self.store.fail_trial(id, reason).await? {
-            FailureAnswer::Failed(row) => Ok(TrialAnswer { status: row.status(now), row, policy: None, held: None }),
+            FailureAnswer::Failed(trial) => TrialAnswer::of(trial, now),
             FailureAnswer::Conflict { .. } => Err(ServiceError::TrialFailed { trial: id.to_owned() }),
             FailureAnswer::Rewarded { existing } => {
                 Err(ServiceError::AlreadyRewarded { trial: id.to_owned(), existing })
@@ -277,5 +288,5 @@ fn unknown_trial(id: &str) -> ServiceError {
 
 fn read_policy(policy: String, id: &str) -> Result<Box<RawValue>, ServiceError> {
     let read = RawValue::from_string(policy);
-    Ok(read.map_err(|error| StoreError::corrupt("policies", "policy", id, error))?)
+    read.map_err(|error| ServiceError::unreadable("policies", "policy", id, error))
 }

@@ -139,17 +139,7 @@ pub enum Unavailable {
 }
 
 impl StoreError {
-    /// A row that holds what this program never writes, known by its name or id.
-    pub(crate) fn corrupt(
-        table: &'static str,
-        column: &'static str,
-        row: impl Into<String>,
-        source: impl Into<Box<dyn std::error::Error + Send + Sync>>,
-    ) -> Self {
-        Self::Corrupt { table, column, row: Some(row.into()), source: source.into() }
-    }
-
-    /// The same, which is about a row of `table`, where nothing else is known.
+    /// The same error, about the row of `table` with this name or id if it tells no row yet.
     pub(super) fn of_row(self, table: &'static str, name: &str) -> Self {
         match self {
             Self::Corrupt { table, column, row: None, source } => {
@@ -164,8 +154,7 @@ impl StoreError {
     }
 
     /// Whether it is one row's fault.
-    #[must_use]
-    pub fn is_of_a_row(&self) -> bool {
+    pub(super) fn is_of_a_row(&self) -> bool {
         matches!(self, Self::Corrupt { .. })
     }
 }

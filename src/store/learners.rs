@@ -28,7 +28,7 @@ pub struct NewLearner {
 
 /// A learner as it is stored.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct LearnerRow {
+pub struct LearnerRecord {
     /// Unlike its name, never used again.
     pub sequence: i64,
     /// The name it is registered under.
@@ -43,7 +43,7 @@ pub struct LearnerRow {
 
 /// A version of a learner's distribution.
 #[derive(Clone, Debug, PartialEq)]
-pub struct WeightsRow {
+pub struct WeightsRecord {
     /// Counted from 0: what the learner started from.
     pub version: u64,
     /// The order of the last reward that is folded in; 0 if there is none.
@@ -56,7 +56,7 @@ pub struct WeightsRow {
 
 /// What a learner learns from: an accepted reward, and the weights that earned it.
 #[derive(Clone, Debug, PartialEq)]
-pub struct RewardRow {
+pub struct RewardRecord {
     /// Counted from 1 per learner, in the order of acceptance.
     pub reward_order: u64,
     /// As drawn.
@@ -82,7 +82,7 @@ struct DeleteLearner(String);
 #[derive(Debug)]
 struct FoldRewards {
     learner: i64,
-    weights: WeightsRow,
+    weights: WeightsRecord,
 }
 
 impl Store {
@@ -91,7 +91,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn register_learner(&self, learner: NewLearner) -> Result<Registration<LearnerRow>, StoreError> {
+    pub async fn register_learner(&self, learner: NewLearner) -> Result<Registration<LearnerRecord>, StoreError> {
         self.writer.write(learner).await
     }
 
@@ -113,7 +113,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn fold_rewards(&self, learner: i64, weights: WeightsRow) -> Result<Fold, StoreError> {
+    pub async fn fold_rewards(&self, learner: i64, weights: WeightsRecord) -> Result<Fold, StoreError> {
         self.writer.write(FoldRewards { learner, weights }).await
     }
 
@@ -122,7 +122,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn learner(&self, name: &str) -> Result<Option<LearnerRow>, StoreError> {
+    pub async fn learner(&self, name: &str) -> Result<Option<LearnerRecord>, StoreError> {
         let query = sqlx::query("SELECT * FROM learners WHERE name = $1").bind(name);
         query.fetch_optional(&mut *self.reader().await?).await?.map(|row| read_learner(&row)).transpose()
     }
@@ -132,7 +132,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn learner_and_weights(&self, name: &str) -> Result<Option<(LearnerRow, WeightsRow)>, StoreError> {
+    pub async fn learner_and_weights(&self, name: &str) -> Result<Option<(LearnerRecord, WeightsRecord)>, StoreError> {
         let query = sqlx::query(
             "SELECT l.*, w.version, w.reward_order, w.expected_reward, w.mean, w.sd, w.updated_at_ms
              FROM learners l JOIN weights w ON w.learner = l.sequence
@@ -147,7 +147,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn learners(&self, after: Option<&str>, limit: u32) -> Result<Page<LearnerRow>, StoreError> {
+    pub async fn learners(&self, after: Option<&str>, limit: u32) -> Result<Page<LearnerRecord>, StoreError> {
         // Definitions may be so long that even a few of them are not read ahead.
         let sizes = "SELECT octet_length(definition) FROM learners WHERE name > $1 ORDER BY name LIMIT $2";
         let sizes = sqlx::query_scalar(sizes).bind(after.unwrap_or_default()).bind(i64::from(limit) + 1);
@@ -175,7 +175,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn weights(&self, learner: i64, version: u64) -> Result<Option<WeightsRow>, StoreError> {
+    pub async fn weights(&self, learner: i64, version: u64) -> Result<Option<WeightsRecord>, StoreError> {
         let query = sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version = $2");
         let query = query.bind(learner).bind(as_integer(version));
         query.fetch_optional(&mut *self.reader().await?).await?.map(|row| read_weights(&row)).transpose()
@@ -191,7 +191,7 @@ impl Store {
         learner: i64,
         after: Option<u64>,
         limit: u32,
-    ) -> Result<Page<WeightsRow>, StoreError> {
+    ) -> Result<Page<WeightsRecord>, StoreError> {
         let query = sqlx::query("SELECT * FROM weights WHERE learner = $1 AND version > $2 ORDER BY version LIMIT $3");
         let query = query.bind(learner).bind(after.map_or(-1, as_integer)).bind(i64::from(limit) + 1);
         let mut reader = self.reader().await?;
@@ -210,7 +210,7 @@ impl Store {
         &self,
         learner: i64,
         after: u64,
-        mut each: impl FnMut(RewardRow),
+        mut each: impl FnMut(RewardRecord),
     ) -> Result<(), StoreError> {
         let query = sqlx::query(
             "SELECT r.reward_order, r.reward, t.weights FROM rewards r JOIN trials t ON t.sequence = r.trial
@@ -219,7 +219,7 @@ impl Store {
         let mut reader = self.reader().await?;
         let mut rows = query.bind(learner).bind(as_integer(after)).fetch(&mut *reader);
         while let Some(row) = rows.try_next().await? {
-            each(RewardRow {
+            each(RewardRecord {
                 reward_order: count(&row, "rewards", "reward_order")?,
                 weights: serde_json::from_str(row.try_get("weights")?).map_err(corrupt("trials", "weights"))?,
                 reward: row.try_get("reward")?,
@@ -232,8 +232,8 @@ impl Store {
 /// Looked for every second, however many learners there are: only those that have something to fold are in the index.
 const BEHIND: &str = "SELECT name FROM learners WHERE has_pending = 1 ORDER BY sequence";
 
-fn read_learner(row: &SqliteRow) -> Result<LearnerRow, StoreError> {
-    Ok(LearnerRow {
+fn read_learner(row: &SqliteRow) -> Result<LearnerRecord, StoreError> {
+    Ok(LearnerRecord {
         sequence: row.try_get("sequence")?,
         name: row.try_get("name")?,
         hash: row.try_get("hash")?,
@@ -242,12 +242,12 @@ fn read_learner(row: &SqliteRow) -> Result<LearnerRow, StoreError> {
     })
 }
 
-fn read_weights(row: &SqliteRow) -> Result<WeightsRow, StoreError> {
+fn read_weights(row: &SqliteRow) -> Result<WeightsRecord, StoreError> {
     const TABLE: &str = "weights";
     let numbers = |column: &'static str| -> Result<Vec<f64>, StoreError> {
         serde_json::from_str(row.try_get(column)?).map_err(corrupt(TABLE, column))
     };
-    Ok(WeightsRow {
+    Ok(WeightsRecord {
         version: count(row, TABLE, "version")?,
         reward_order: count(row, TABLE, "reward_order")?,
         distribution: Distribution {
@@ -260,13 +260,13 @@ fn read_weights(row: &SqliteRow) -> Result<WeightsRow, StoreError> {
 }
 
 impl Verb for NewLearner {
-    type Answer = Registration<LearnerRow>;
+    type Answer = Registration<LearnerRecord>;
 
     fn n_bytes(&self) -> usize {
         self.definition.len()
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Registration<LearnerRow>, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Registration<LearnerRecord>, StoreError> {
         let connection = &mut *writing.connection;
         let inserted = sqlx::query(
             "INSERT INTO learners (name, hash, definition, created_at_ms) VALUES ($1, $2, $3, $4)
@@ -282,7 +282,7 @@ impl Verb for NewLearner {
         let row = read_learner(&query.fetch_one(&mut *connection).await?)?;
         if inserted.rows_affected() == 1 {
             let distribution = self.initial.clone();
-            let first = WeightsRow { version: 0, reward_order: 0, distribution, updated_at: self.created_at };
+            let first = WeightsRecord { version: 0, reward_order: 0, distribution, updated_at: self.created_at };
             insert_weights(connection, row.sequence, &first).await?;
             return Ok(Registration::Created(row));
         }
@@ -339,7 +339,7 @@ pub(super) async fn mark_pending(connection: &mut SqliteConnection, learners: &s
 async fn insert_weights(
     connection: &mut SqliteConnection,
     learner: i64,
-    weights: &WeightsRow,
+    weights: &WeightsRecord,
 ) -> Result<(), StoreError> {
     let json = |numbers: &[f64], column| serde_json::to_string(numbers).map_err(corrupt("weights", column));
     let Distribution { mean, sd, expected_reward } = &weights.distribution;

@@ -38,13 +38,13 @@ use definitions::Sweeper;
 pub use definitions::{NewPieces, PIECE_BYTES};
 pub use error::{StoreError, Unavailable};
 use jiff::Timestamp;
-pub use learners::{Fold, LearnerRow, NewLearner, RewardRow, WeightsRow};
-pub use models::{ModelKey, ModelRow, ModelSize, ModelSummary, NewDefinition, NewModel, StoredDefinition};
+pub use learners::{Fold, LearnerRecord, NewLearner, RewardRecord, WeightsRecord};
+pub use models::{ModelKey, ModelRecord, ModelSize, ModelSummary, NewDefinition, NewModel, StoredDefinition};
 pub use page::Page;
-pub use policies::{NewPolicy, PolicySummaryRow, pack_steps};
+pub use policies::{NewPolicy, PolicyRecord, pack_steps};
 pub use refinements::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd};
 pub use sessions::{
-    ExpiredSession, MAX_EXPIRED_AT_ONCE, NewObservations, NewSession, Owner, SessionEnd, SessionRefusal, SessionRow,
+    ExpiredSession, MAX_EXPIRED_AT_ONCE, NewObservations, NewSession, Owner, SessionEnd, SessionRecord, SessionRefusal,
     SessionStatus, Taken,
 };
 
@@ -53,7 +53,7 @@ use sqlx::pool::PoolConnection;
 use tokio_util::task::TaskTracker;
 use trials::TrialNumbers;
 pub use trials::{
-    AcceptedReward, Failure, FailureAnswer, NewReward, NewTrial, NextNumber, Opened, RewardAnswer, TrialRow,
+    AcceptedReward, Failure, FailureAnswer, NewReward, NewTrial, NextNumber, Opened, RewardAnswer, TrialRecord,
     TrialStatus,
 };
 use writer::Writer;

@@ -69,7 +69,7 @@ pub enum NewDefinition {
 
 /// A model as it is stored.
 #[derive(Clone, Debug)]
-pub struct ModelRow {
+pub struct ModelRecord {
     /// What is kept besides the definition.
     pub summary: ModelSummary,
     /// Its canonical text.
@@ -126,7 +126,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn model(&self, name: &str) -> Result<Option<ModelRow>, StoreError> {
+    pub async fn model(&self, name: &str) -> Result<Option<ModelRecord>, StoreError> {
         let query = sqlx::query("SELECT * FROM models WHERE name = $1").bind(name);
         let row = query.fetch_optional(&mut *self.reader().await?).await?;
         let read = |row: SqliteRow| {
@@ -134,7 +134,7 @@ impl Store {
                 Some(id) => StoredDefinition::Pieces(id),
                 None => StoredDefinition::Text(row.try_get("definition")?),
             };
-            Ok(ModelRow { summary: read_summary(&row)?, definition })
+            Ok(ModelRecord { summary: read_summary(&row)?, definition })
         };
         row.map(read).transpose()
     }

@@ -60,7 +60,12 @@ impl<T> Rows<T> {
                 Ok(item) => page.items.push(item),
                 Err(error) => {
                     let name = shown(&row, self.name).unwrap_or_default();
-                    page.unreadable.push(leave_out(error.of_row(self.table, &name), name)?);
+                    let error = error.of_row(self.table, &name);
+                    if !error.is_of_a_row() {
+                        return Err(error);
+                    }
+                    log_left_out(&error);
+                    page.unreadable.push(name);
                 }
             }
         }
@@ -101,37 +106,31 @@ impl<T> Page<T> {
         Page { items: items.into_iter().map(item).collect(), unreadable, next }
     }
 
-    /// The page of what `item` makes of each item; those of which nothing can be made, as their rows hold what this program never
-    /// writes, are named by `name`.
-    ///
-    /// # Errors
-    ///
-    /// Whatever else goes wrong.
-    pub fn try_map<U>(
+    /// The page of what `read` makes of each item. An item that cannot be read is left out, and its name is added to
+    /// [`Self::unreadable`].
+    pub fn map_readable<U, E: std::error::Error + 'static>(
         self,
         name: impl Fn(&T) -> &str,
-        item: impl Fn(T) -> Result<U, StoreError>,
-    ) -> Result<Page<U>, StoreError> {
+        read: impl Fn(T) -> Result<U, E>,
+    ) -> Page<U> {
         let Self { items, mut unreadable, next } = self;
-        let mut made = Vec::with_capacity(items.len());
-        for from in items {
-            let name = name(&from).to_owned();
-            match item(from) {
-                Ok(to) => made.push(to),
-                Err(error) => unreadable.push(leave_out(error, name)?),
+        let mut readable = Vec::with_capacity(items.len());
+        for item in items {
+            let name = name(&item).to_owned();
+            match read(item) {
+                Ok(item) => readable.push(item),
+                Err(error) => {
+                    log_left_out(&error);
+                    unreadable.push(name);
+                }
             }
         }
-        Ok(Page { items: made, unreadable, next })
+        Page { items: readable, unreadable, next }
     }
 }
 
-/// Logs what is wrong with a row, and gives its name.
-fn leave_out(error: StoreError, name: String) -> Result<String, StoreError> {
-    if !error.is_of_a_row() {
-        return Err(error);
-    }
-    tracing::error!(error = &error as &dyn std::error::Error, "a list leaves out a row");
-    Ok(name)
+fn log_left_out(error: &(dyn std::error::Error + 'static)) {
+    tracing::error!(error, "a list leaves out a row");
 }
 
 fn text<'r>(row: &'r SqliteRow, column: &str) -> Option<&'r [u8]> {

@@ -6,6 +6,7 @@
 use std::sync::OnceLock;
 
 use jiff::Timestamp;
+use serde_json::value::RawValue;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{AssertSqlSafe, Row, SqlSafeStr, SqlStr, SqliteConnection};
 
@@ -51,14 +52,14 @@ impl AddPolicies {
 }
 
 /// A policy without its steps, as it is stored.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct PolicySummaryRow {
+#[derive(Clone, Debug)]
+pub struct PolicyRecord {
     /// The order in which it became durable.
     pub sequence: i64,
     /// Its id.
     pub id: String,
-    /// JSON.
-    pub summary: String,
+    /// JSON: the policy without its steps.
+    pub summary: Box<RawValue>,
 }
 
 impl Store {
@@ -153,7 +154,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn policies(&self, after: i64, limit: u32) -> Result<Page<PolicySummaryRow>, StoreError> {
+    pub async fn policies(&self, after: i64, limit: u32) -> Result<Page<PolicyRecord>, StoreError> {
         let query = sqlx::query(
             "SELECT sequence, id, summary, checksum, refined_by FROM policies WHERE sequence > $1 ORDER BY sequence LIMIT $2",
         );
@@ -181,12 +182,13 @@ fn half_checksum(summary: &str) -> i64 {
     i64::from(crc32fast::hash(summary.as_bytes())) << 32
 }
 
-fn read_summary(row: &SqliteRow) -> Result<PolicySummaryRow, StoreError> {
+fn read_summary(row: &SqliteRow) -> Result<PolicyRecord, StoreError> {
     let summary: String = row.try_get("summary")?;
     if (row.try_get::<i64, _>("checksum")? >> 32) << 32 != half_checksum(&summary) {
         return Err(corrupt("checksum")("it is not that of the summary"));
     }
-    Ok(PolicySummaryRow { sequence: row.try_get("sequence")?, id: row.try_get("id")?, summary: linked(summary, row)? })
+    let summary = RawValue::from_string(linked(summary, row)?).map_err(corrupt("summary"))?;
+    Ok(PolicyRecord { sequence: row.try_get("sequence")?, id: row.try_get("id")?, summary })
 }
 
 /// Steps as they are stored: postcard.

@@ -11,10 +11,10 @@ use tokio_util::sync::CancellationToken;
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem, WriteError};
 use super::queue::{Gone, Receiver, Sender, Weighed};
 use super::room::{Crowded, SMALL_FRAME_BYTES, Taken};
+use crate::service::{AcceptedReward, StoreError, Unavailable};
 use crate::service::{
     Caller, Client, Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
-use crate::store::{AcceptedReward, StoreError, Unavailable};
 use etude_core::document::{self, ParseError, Place};
 use etude_core::mapping::{CommittedStep, Demonstration};
 
@@ -300,9 +300,10 @@ impl Connection<'_> {
             (ClientFrame::Reward { reward }, Some(session)) if let Some(trial) = session.trial_id() => {
                 let has_ended = session.has_ended();
                 match self.etude.accept_reward(trial, reward, now).await {
-                    Ok(trial) => {
-                        let order = trial.row.reward.as_ref().map(|reward| reward.reward_order);
-                        self.send(&ServerFrame::Rewarded { trial: &trial.row.id, reward, reward_order: order }).await?;
+                    Ok(rewarded) => {
+                        let trial = rewarded.trial;
+                        let order = trial.reward.as_ref().map(|reward| reward.reward_order);
+                        self.send(&ServerFrame::Rewarded { trial: &trial.id, reward, reward_order: order }).await?;
                         self.is_reward_told = true;
                         Ok(has_ended.then_some(Closed::Done))
                     }

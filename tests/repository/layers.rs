@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::sources::{modules, references};
+use crate::sources::{Module, modules, references};
 
 /// Modules of the core. Those of a layer may use those before it.
 const CORE: [&[&str]; 6] =
@@ -29,6 +29,22 @@ fn modules_of_the_core_use_only_those_before_them() {
 #[test]
 fn modules_of_the_service_use_only_those_before_them() {
     assert_eq!(out_of_order("src", &SERVICE), Vec::<String>::new());
+}
+
+#[test]
+fn transports_know_the_store_by_what_the_service_hands_out_alone() {
+    let modules = modules("src");
+    let mut users = Vec::new();
+    for (module, code) in &modules {
+        if !matches!(module.first().map(String::as_str), Some("http" | "stream")) {
+            continue;
+        }
+        let uses_store = |(used, name): &(Module, String)| used.first().unwrap_or(name) == "store";
+        if references(module, code, &modules).iter().any(uses_store) {
+            users.push(module.join("/"));
+        }
+    }
+    assert_eq!(users, Vec::<String>::new());
 }
 
 /// References that lead to a later layer, or to one that is not listed.

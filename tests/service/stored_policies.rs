@@ -109,7 +109,7 @@ async fn a_refined_policy_is_read_and_listed_with_its_link() {
     assert_eq!(store.policy("p").await.unwrap().unwrap(), serde_json::to_string(&policy).unwrap());
     assert_eq!(store.policy("q").await.unwrap().unwrap(), answer);
     let listed = store.policies(0, 100).await.unwrap().items;
-    let listed: Vec<Value> = listed.iter().map(|row| serde_json::from_str(&row.summary).unwrap()).collect();
+    let listed: Vec<Value> = listed.iter().map(|row| serde_json::from_str(row.summary.get()).unwrap()).collect();
     assert_eq!(listed.iter().map(|summary| &summary["id"]).collect::<Vec<_>>(), ["p", "q"]);
     assert_eq!(listed[0]["refined_by"], "q");
 }

@@ -24,7 +24,8 @@ use super::search::MAX_INLINE_BYTES;
 use super::{Caller, Etude, PoolError, ServiceError};
 use crate::memory::Held;
 use crate::store::{
-    MAX_EXPIRED_AT_ONCE, NewSession, Opened, Owner, Page, SessionRefusal, SessionRow, SessionStatus, StoreError, Taken,
+    MAX_EXPIRED_AT_ONCE, NewSession, Opened, Owner, Page, SessionRecord, SessionRefusal, SessionStatus, StoreError,
+    Taken,
 };
 use etude_core::attribute::{ByAttribute, Schema, Weights};
 use etude_core::document::{Faults, Place};
@@ -302,7 +303,7 @@ impl Etude {
                 } else {
                     self.pool.read_patiently(caller.client, n_policy_bytes, read).await?
                 };
-                Some(read.map_err(|error| StoreError::corrupt("policies", "policy", policy_id, error))?)
+                Some(read.map_err(|error| ServiceError::unreadable("policies", "policy", policy_id, error))?)
             }
         };
         Ok(Resumed { session, steps, policy })
@@ -333,7 +334,7 @@ impl Etude {
     /// # Errors
     ///
     /// If there is none.
-    pub async fn session(&self, id: &str) -> Result<SessionRow, ServiceError> {
+    pub async fn session(&self, id: &str) -> Result<SessionRecord, ServiceError> {
         self.store.session(id).await?.ok_or_else(|| unknown(id))
     }
 
@@ -342,7 +343,7 @@ impl Etude {
     /// # Errors
     ///
     /// If the store failed.
-    pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRow>, ServiceError> {
+    pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRecord>, ServiceError> {
         Ok(self.store.sessions(after, limit).await?)
     }
 
@@ -407,7 +408,7 @@ fn unknown(id: &str) -> ServiceError {
 /// The weights of the session `id`, as they are stored, in the order of the model's attributes.
 fn weights_in_order(weights: &ByAttribute<f64>, schema: &Schema, id: &str) -> Result<Weights, SessionError> {
     let missing =
-        |name: &str| StoreError::corrupt("sessions", "weights", id, format!("the weight of {name:?} is missing"));
+        |name: &str| ServiceError::unreadable("sessions", "weights", id, format!("the weight of {name:?} is missing"));
     let names = schema.attributes().iter().map(|attribute| &attribute.name);
     let weights = names.map(|name| weights.get(name).copied().ok_or_else(|| missing(name)));
     Ok(Weights::of(weights.collect::<Result<Vec<_>, _>>()?))
@@ -426,7 +427,7 @@ fn read_stored(
     (id, n_observations): (&str, u32),
 ) -> Result<Demonstration, SessionError> {
     let read = Demonstration::read_again(mapper.model().schema(), texts, n_observations as usize);
-    let read = read.map_err(|error| StoreError::corrupt("observations", "states", id, error))?;
+    let read = read.map_err(|error| ServiceError::unreadable("observations", "states", id, error))?;
     read.ok_or(SessionError::Empty)
 }
 

@@ -14,7 +14,7 @@ use crate::service::owners::Ownership;
 use crate::service::refined::RefinedRequest;
 use crate::service::search::{PolicyText, as_micros, report, take_beyond_small, write_policy};
 use crate::service::{Client, Etude, PoolError, ServiceError};
-use crate::store::{AcceptedReward, NewObservations, NewRefinement, Owner, SessionEnd, TrialRow};
+use crate::store::{AcceptedReward, NewObservations, NewRefinement, Owner, SessionEnd, TrialRecord};
 use etude_core::attribute::{ByAttribute, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, Uninterrupted};
@@ -190,8 +190,8 @@ impl Session {
     pub async fn reward(&self, etude: &Etude) -> Result<RewardState, SessionError> {
         let Some(trial) = &self.source.trial_id else { return Ok(RewardState::Never) };
         Ok(match etude.store.trial(trial).await? {
-            Some(TrialRow { reward: Some(reward), id, .. }) => RewardState::Accepted { trial: id, reward },
-            Some(TrialRow { failed: None, .. }) => RewardState::Awaited,
+            Some(TrialRecord { reward: Some(reward), id, .. }) => RewardState::Accepted { trial: id, reward },
+            Some(TrialRecord { failed: None, .. }) => RewardState::Awaited,
             Some(_) | None => RewardState::Never,
         })
     }

@@ -45,7 +45,7 @@ async fn reward(store: &Store, learner: i64, number: u64) {
 
 async fn fold(store: &Store, learner: i64, version: u64, reward_order: u64) {
     let distribution = Distribution { mean: vec![1.0], sd: vec![1.0], expected_reward: None };
-    let weights = WeightsRow { version, reward_order, distribution, updated_at: Timestamp::UNIX_EPOCH };
+    let weights = WeightsRecord { version, reward_order, distribution, updated_at: Timestamp::UNIX_EPOCH };
     assert_eq!(store.fold_rewards(learner, weights).await.unwrap(), Fold::Added);
 }
 

@@ -74,16 +74,16 @@ pub enum SessionRefusal {
 #[derive(Clone, Debug, PartialEq)]
 pub enum Taken {
     /// The session is open, and its row names the new owner.
-    Open(SessionRow),
+    Open(SessionRecord),
     /// It is done or has expired, and has no owner any more.
-    Ended(SessionRow),
+    Ended(SessionRecord),
     /// There is none.
     Unknown,
 }
 
 /// A session, without its observations.
 #[derive(Clone, Debug, PartialEq)]
-pub struct SessionRow {
+pub struct SessionRecord {
     /// The order in which it was opened.
     pub sequence: i64,
     /// Its id.
@@ -281,7 +281,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn session(&self, id: &str) -> Result<Option<SessionRow>, StoreError> {
+    pub async fn session(&self, id: &str) -> Result<Option<SessionRecord>, StoreError> {
         let arrived = self.settle().await?;
         let query = sqlx::query("SELECT * FROM sessions WHERE id = $1").bind(id);
         let row = query.fetch_optional(&mut *self.reader().await?).await?;
@@ -294,7 +294,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRow>, StoreError> {
+    pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRecord>, StoreError> {
         let arrived = self.settle().await?;
         let query = sqlx::query("SELECT * FROM sessions WHERE sequence > $1 ORDER BY sequence LIMIT $2");
         let mut reader = self.reader().await?;
@@ -336,7 +336,7 @@ impl Store {
     }
 }
 
-impl SessionRow {
+impl SessionRecord {
     /// With what has arrived for it, and is not settled yet.
     fn with(mut self, arrived: &BTreeMap<String, Arrived>) -> Self {
         // What was settled since it was read is in the row already.
@@ -348,14 +348,14 @@ impl SessionRow {
     }
 }
 
-fn read_session(row: &SqliteRow) -> Result<SessionRow, StoreError> {
+fn read_session(row: &SqliteRow) -> Result<SessionRecord, StoreError> {
     const TABLE: &str = "sessions";
     let count = |column: &'static str| -> Result<Option<u32>, StoreError> {
         let count: Option<i64> = row.try_get(column)?;
         count.map(u32::try_from).transpose().map_err(corrupt(TABLE, column))
     };
     let status: &str = row.try_get("status")?;
-    Ok(SessionRow {
+    Ok(SessionRecord {
         sequence: row.try_get("sequence")?,
         id: row.try_get("id")?,
         model: row.try_get("model")?,

@@ -52,7 +52,7 @@ pub struct NewReward {
 
 /// A trial as it is stored.
 #[derive(Clone, Debug, PartialEq)]
-pub struct TrialRow {
+pub struct TrialRecord {
     /// The order in which it became durable.
     pub sequence: i64,
     /// Its id.
@@ -124,7 +124,7 @@ impl TrialStatus {
         }
     }
 
-    /// The same as [`TrialRow::status`], in SQL; `$4` is now.
+    /// The same as [`TrialRecord::status`], in SQL; `$4` is now.
     fn condition(self) -> &'static str {
         match self {
             Self::Active => "t.is_failed = 0 AND r.reward_order IS NULL AND t.lease_expires_at_ms > $4",
@@ -140,7 +140,7 @@ impl TrialStatus {
     }
 }
 
-impl TrialRow {
+impl TrialRecord {
     /// What has become of it by `now`.
     #[must_use]
     pub fn status(&self, now: Timestamp) -> TrialStatus {
@@ -169,9 +169,9 @@ pub enum Opened {
 #[derive(Clone, Debug, PartialEq)]
 pub enum RewardAnswer {
     /// It is the trial's now.
-    Accepted(TrialRow),
+    Accepted(TrialRecord),
     /// It was the trial's already.
-    Unchanged(TrialRow),
+    Unchanged(TrialRecord),
     /// The trial has another one, which was left alone.
     Conflict {
         /// The one it has.
@@ -187,7 +187,7 @@ pub enum RewardAnswer {
 #[derive(Clone, Debug, PartialEq)]
 pub enum FailureAnswer {
     /// It has failed, now or before for the same reason.
-    Failed(TrialRow),
+    Failed(TrialRecord),
     /// It had failed for another reason, which was left alone.
     Conflict {
         /// The one it has.
@@ -254,7 +254,7 @@ impl Store {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn trial(&self, id: &str) -> Result<Option<TrialRow>, StoreError> {
+    pub async fn trial(&self, id: &str) -> Result<Option<TrialRecord>, StoreError> {
         let query = sqlx::query(AssertSqlSafe(format!("{SELECT} {FROM} WHERE t.id = $1"))).bind(id);
         query.fetch_optional(&mut *self.reader().await?).await?.map(|row| read_trial(&row)).transpose()
     }
@@ -272,7 +272,7 @@ impl Store {
         now: Timestamp,
         after: u64,
         limit: u32,
-    ) -> Result<Page<TrialRow>, StoreError> {
+    ) -> Result<Page<TrialRecord>, StoreError> {
         let condition = status.map_or("TRUE", TrialStatus::condition);
         let query = sqlx::query(AssertSqlSafe(format!(
             "{SELECT} {FROM} WHERE t.learner = $1 AND t.number > $2 AND {condition} ORDER BY t.number LIMIT $3"
@@ -295,7 +295,7 @@ const SELECT: &str = "
 const FROM: &str = "
     FROM trials t JOIN learners l ON l.sequence = t.learner LEFT JOIN rewards r ON r.trial = t.sequence";
 
-fn read_trial(row: &SqliteRow) -> Result<TrialRow, StoreError> {
+fn read_trial(row: &SqliteRow) -> Result<TrialRecord, StoreError> {
     const TABLE: &str = "trials";
     let reward: Option<f64> = row.try_get("reward")?;
     let reward = match reward {
@@ -305,12 +305,12 @@ fn read_trial(row: &SqliteRow) -> Result<TrialRow, StoreError> {
     let learned: Option<i64> = row.try_get("learned_version")?;
     let is_failed: i64 = row.try_get("is_failed")?;
     let failed = if is_failed == 0 { None } else { Some(Failure { reason: row.try_get("fail_reason")? }) };
-    Ok(TrialRow {
+    Ok(TrialRecord {
+        weights: row.try_get("weights")?,
         sequence: row.try_get("sequence")?,
         id: row.try_get("id")?,
         learner: row.try_get("learner_name")?,
         number: count(row, TABLE, "number")?,
-        weights: row.try_get("weights")?,
         weights_version: count(row, TABLE, "weights_version")?,
         policy_id: row.try_get("policy_id")?,
         lease_expires_at: timestamp(TABLE, "lease_expires_at_ms", row.try_get("lease_expires_at_ms")?)?,

@@ -6,7 +6,7 @@ use rustc_hash::{FxHashMap, FxHashSet};
 use sqlx::{AssertSqlSafe, QueryBuilder, Row, SqliteConnection};
 
 use super::{
-    AcceptedReward, FROM, Failure, FailureAnswer, NewReward, NewTrial, Opened, RewardAnswer, SELECT, TrialRow,
+    AcceptedReward, FROM, Failure, FailureAnswer, NewReward, NewTrial, Opened, RewardAnswer, SELECT, TrialRecord,
     read_trial,
 };
 use crate::store::policies::NewPolicy;
@@ -151,7 +151,7 @@ struct Rewarded {
 
 struct Found {
     learner: i64,
-    row: TrialRow,
+    row: TrialRecord,
 }
 
 async fn read_rewarded(connection: &mut SqliteConnection, rewards: &[&NewReward]) -> Result<Rewarded, StoreError> {
