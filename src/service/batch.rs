@@ -8,6 +8,8 @@
 //!
 //! A batch takes one place in the pool, whatever its size, and gives its threads back after every slice: a request that
 //! comes meanwhile waits for a slice, not for the batch.
+//!
+//! This file is longer than 400 lines because its tests use what is private to batches.
 
 use std::fmt;
 use std::iter::Enumerate;

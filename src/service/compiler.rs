@@ -19,8 +19,8 @@ use tokio_util::task::TaskTracker;
 use tracing::Instrument;
 
 use super::cache::MapperCache;
+use super::definitions::{DefinitionReader, ModelText, check_hash, corrupt_definition, unknown};
 use super::hash::hex;
-use super::models::{DefinitionReader, ModelText, check_hash, corrupt_definition, unknown};
 use super::pool::Admission;
 use super::{Client, Etude, PipeWriter, PoolError, SearchPool, ServiceError, Settings, pipe};
 use crate::clock::Clock;

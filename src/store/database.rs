@@ -10,42 +10,29 @@
 //! version's schema. Where nothing can be written, the database is read all the same if that can be: until a writer gets its way.
 //! The file of the database is never opened here but by SQLite, which would lose its locks if another descriptor were closed.
 
-use std::fs::{self, File, OpenOptions, Permissions};
-use std::io::{self, ErrorKind};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
+mod files;
+mod readers;
+
+use std::fs::{self, File, OpenOptions};
+use std::io::ErrorKind;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
 
-use rustix::process::geteuid;
-use sqlx::pool::PoolConnection;
-use sqlx::sqlite::{SqliteConnectOptions, SqlitePool, SqlitePoolOptions, SqliteSynchronous};
-use sqlx::{ConnectOptions, Connection, Sqlite, SqliteConnection};
+use sqlx::sqlite::{SqlitePool, SqliteSynchronous};
+use sqlx::{ConnectOptions, Connection, SqliteConnection};
 use tokio::sync::RwLock;
 
 use super::{Depth, StoreError, Unavailable, schema};
-
-/// How long a connection waits for another process's lock.
-const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// Readers at the same time. Reads are short, and there are few cores. One of them copies the log now and then.
-pub(super) const N_READERS: u32 = 5;
-
-/// Copies what is in the log to the file of the database, as far as others let `connection`.
-pub(super) async fn checkpoint(connection: &mut SqliteConnection) -> Result<(), StoreError> {
-    sqlx::query("PRAGMA wal_checkpoint(PASSIVE)").execute(connection).await?;
-    Ok(())
-}
+use files::{Identity, MODE, is_read_only, probe_aside, resolve, unavailable};
+#[cfg(test)]
+pub(super) use readers::N_READERS;
+pub(super) use readers::{Readers, checkpoint};
+use readers::{look_at, options, readers};
 
 /// Pages of the log, of 4 KiB, over which a commit copies it itself. That is rare: readers do it beside the writer before, but cannot
 /// come to its end as long as others write, and only then it begins anew.
 const MAX_LOG_PAGES: &str = "16384";
-
-/// Statements that a connection keeps prepared: all that there are, those with a number of rows as often as there are numbers.
-const N_STATEMENTS: usize = 256;
-
-/// Nobody but the service's user is to read what others have sent.
-const MODE: u32 = 0o600;
 
 /// Whether others are kept from the database.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -73,51 +60,6 @@ pub(super) struct Database {
     has_log: bool,
     /// `None` until there is a way to read.
     readers: Option<Arc<Readers>>,
-}
-
-/// Tells a file from another one that has its path later.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct Identity {
-    device: u64,
-    inode: u64,
-}
-
-impl Identity {
-    fn of(path: &Path) -> io::Result<Self> {
-        let metadata = fs::metadata(path)?;
-        Ok(Self { device: metadata.dev(), inode: metadata.ino() })
-    }
-}
-
-/// The ways to read.
-#[derive(Debug)]
-pub(super) struct Readers {
-    /// Locked while one takes the place of another.
-    pool: RwLock<SqlitePool>,
-}
-
-impl Readers {
-    /// One of them, until it is dropped. While others take their place, these are waited for.
-    ///
-    /// # Errors
-    ///
-    /// If none comes free in time, or there are no more.
-    pub(super) async fn one(&self) -> Result<PoolConnection<Sqlite>, StoreError> {
-        Ok(self.pool.read().await.acquire().await?)
-    }
-
-    /// Copies what is in the log to the file of the database, as far as others let it: nobody waits for that.
-    ///
-    /// # Errors
-    ///
-    /// If the database failed.
-    pub(super) async fn checkpoint(&self) -> Result<(), StoreError> {
-        checkpoint(&mut *self.one().await?).await
-    }
-
-    pub(super) async fn close(&self) {
-        self.pool.read().await.close().await;
-    }
 }
 
 impl Database {
@@ -326,7 +268,7 @@ impl Database {
         }
         for path in [self.path.clone(), self.beside("-wal"), self.beside("-shm"), self.beside("-lock")] {
             let file = path.display();
-            match keep_from_others(&path) {
+            match files::keep_from_others(&path) {
                 Ok(true) => {
                     tracing::info!(%file, "others could read or write this file of the database; now only its owner can");
                 }
@@ -372,96 +314,6 @@ impl Database {
         name.push(end);
         name.into()
     }
-}
-
-/// The path without links, as SQLite names the files beside it; of a file that is not there yet, that of its directory.
-fn resolve(path: &Path) -> io::Result<PathBuf> {
-    match fs::canonicalize(path) {
-        Err(error) if error.kind() == ErrorKind::NotFound => {}
-        resolved => return resolved,
-    }
-    let directory = path.parent().filter(|parent| !parent.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let name = path.file_name().ok_or(ErrorKind::InvalidFilename)?;
-    Ok(fs::canonicalize(directory)?.join(name))
-}
-
-/// Makes a file its owner's alone, if that is this process's user. Says whether it was not.
-fn keep_from_others(path: &Path) -> io::Result<bool> {
-    let file = match fs::symlink_metadata(path) {
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(false),
-        file => file?,
-    };
-    let is_to_be_kept = file.is_file() && file.uid() == geteuid().as_raw() && file.mode() & 0o077 != 0;
-    if is_to_be_kept {
-        fs::set_permissions(path, Permissions::from_mode(file.mode() & MODE))?;
-    }
-    Ok(is_to_be_kept)
-}
-
-/// Writes a little beside the database, and removes it, on a thread of its own, as a disk may take its time.
-async fn probe_aside(path: &Path) -> Result<(), Unavailable> {
-    let path = path.to_owned();
-    tokio::task::spawn_blocking(move || probe(&path)).await.unwrap_or(Ok(()))
-}
-
-fn probe(path: &Path) -> Result<(), Unavailable> {
-    /// More than what is left over in a page of a full disk.
-    const N_BYTES: usize = 64 * 1024;
-    let directory = path.parent().unwrap_or(Path::new("."));
-    let written = tempfile::tempfile_in(directory).and_then(|mut file| {
-        io::Write::write_all(&mut file, &vec![0; N_BYTES])?;
-        file.sync_all()
-    });
-    match written {
-        Ok(()) => Ok(()),
-        Err(error) => unavailable(&error).map_or(Ok(()), Err),
-    }
-}
-
-/// What an error of a file says of its disk.
-fn unavailable(error: &io::Error) -> Option<Unavailable> {
-    match error.kind() {
-        ErrorKind::StorageFull | ErrorKind::QuotaExceeded => Some(Unavailable::Full),
-        _ if is_read_only(error) => Some(Unavailable::ReadOnly),
-        _ => None,
-    }
-}
-
-fn is_read_only(error: &io::Error) -> bool {
-    matches!(error.kind(), ErrorKind::ReadOnlyFilesystem | ErrorKind::PermissionDenied)
-}
-
-/// What every connection has.
-fn options(path: &Path) -> SqliteConnectOptions {
-    SqliteConnectOptions::new()
-        .filename(path)
-        .create_if_missing(false)
-        .busy_timeout(BUSY_TIMEOUT)
-        .statement_cache_capacity(N_STATEMENTS)
-        .disable_statement_logging()
-}
-
-/// Ways to read, all of them now, which stay: opened later, one could need room that there is none of, or find another file.
-async fn readers(options: SqliteConnectOptions) -> Result<SqlitePool, StoreError> {
-    let pool = SqlitePoolOptions::new().min_connections(N_READERS).max_connections(N_READERS);
-    // Until a connection has read, SQLite holds nothing open for it, and whoever closes another one may remove the log.
-    let pool = pool.idle_timeout(None).max_lifetime(None).after_connect(|connection, _| {
-        Box::pin(async move { sqlx::query("SELECT 1 FROM sqlite_schema").execute(connection).await.map(drop) })
-    });
-    Ok(pool.connect_with(options).await?)
-}
-
-/// Ways to read a database that is whole, and has this version's schema.
-async fn look_at(options: SqliteConnectOptions, depth: Depth) -> Result<SqlitePool, StoreError> {
-    let mut connection = options.connect().await?;
-    schema::check_version(&mut connection).await?;
-    schema::check_whose(&mut connection).await?;
-    schema::check_current(&mut connection).await?;
-    if depth == Depth::Whole {
-        schema::quick_check(&mut connection).await?;
-    }
-    connection.close().await?;
-    readers(options).await
 }
 
 #[cfg(test)]

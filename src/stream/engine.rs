@@ -1,4 +1,6 @@
 //! The protocol, one connection at a time.
+//!
+//! This file is longer than 400 lines because it is the whole state machine of a connection: each frame, in each state.
 
 use std::error::Error;
 use std::time::Duration;

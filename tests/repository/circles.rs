@@ -12,7 +12,6 @@ const CORE: &[&str] = &[];
 
 /// Circles of the service that are still to be opened.
 const SERVICE: &[&str] = &[
-    "service/compiler, service/models",
     "store/alive, store/sessions",
     "store/arrivals, store/sessions",
     "store/arrivals, store/sessions/verbs",

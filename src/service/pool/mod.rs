@@ -7,7 +7,7 @@
 //! ```
 //!
 //! A job is admitted while there is a place for its client, waits for its turn, and runs on a thread. What has run for longer than a
-//! [`MOMENT`] may hold all threads but some, and makes way for the long jobs of other clients: it keeps what it has done and waits for its
+//! [`MOMENT`](place::MOMENT) may hold all threads but some, and makes way for the long jobs of other clients: it keeps what it has done and waits for its
 //! next turn, so that small requests are answered while any number of large ones run. Whoever waits for a job may go away at
 //! any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`].
 //!
@@ -16,36 +16,27 @@
 //! nobody waits for runs where there is a thread to spare, and is stopped as soon as somebody needs that. And a job that is over
 //! before a change of threads would have paid for itself runs where it is ([`SearchPool::run_here`]).
 
+mod place;
+mod threads;
 mod turns;
+mod watch;
 
-use std::cell::Cell;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::sync::atomic::{AtomicBool, AtomicU64};
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use rustc_hash::FxHashMap;
 use tokio::runtime::Handle;
-use tokio::sync::oneshot;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
 use super::Client;
 use crate::clock::Clock;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
+use place::Place;
+use threads::{Threads, Turn};
 pub(crate) use turns::Places;
-use turns::{Class, LENT_AFTER, Level, Ticket, Turns};
-
-/// How long a job, or all jobs of a request together, may run before it is long. Most are over by then.
-const MOMENT: Duration = Duration::from_millis(10);
-
-/// How long a long job keeps its thread while those of other clients wait. Long beside the change of threads that it costs.
-const SHARE: Duration = Duration::from_millis(100);
-
-/// How often a long job looks whether it should make way.
-const LOOK_EVERY: Duration = Duration::from_millis(1);
-
-/// Most jobs that have made way, each of which keeps a thread of the operating system; more are refused.
-const MAX_PARKED: usize = 256;
+use turns::{Class, Level};
+use watch::{Job, Watch, give_way};
 
 /// How long a job that nobody waits for may go on when it has taken the last thread: longer than most jobs keep theirs.
 const LAST_THREAD_KEPT: Duration = Duration::from_millis(100);
@@ -90,117 +81,6 @@ struct Shared {
     tasks: TaskTracker,
     abort: CancellationToken,
     clock: Clock,
-}
-
-/// Threads that jobs take turns on.
-#[derive(Debug)]
-struct Threads(Mutex<Lines>);
-
-#[derive(Debug)]
-struct Lines {
-    clock: Clock,
-    turns: Turns,
-    /// How to tell those who wait.
-    waiting: FxHashMap<Ticket, oneshot::Sender<()>>,
-    /// Jobs that have made way and wait with all that they have done.
-    n_parked: usize,
-}
-
-impl Lines {
-    /// Tells those whose turn it is.
-    fn pass_on(&mut self) {
-        while let Some(ticket) = self.turns.next(self.clock.instant()) {
-            if let Some(waiting) = self.waiting.remove(&ticket) {
-                // Whoever has gone gives the thread back.
-                let _ = waiting.send(());
-            }
-        }
-    }
-}
-
-impl Threads {
-    fn new(settings: PoolSettings, clock: Clock) -> Self {
-        let n_short = settings.n_threads.max(1) + settings.max_waiting;
-        let turns = Turns::new(settings.n_threads, n_short, settings.max_long);
-        Self(Mutex::new(Lines { clock, turns, waiting: FxHashMap::default(), n_parked: 0 }))
-    }
-
-    /// What a panic has left behind is whole.
-    fn lines(&self) -> MutexGuard<'_, Lines> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
-    /// Takes a thread, or lines up for one.
-    fn start_or_wait(self: &Arc<Self>, client: Client, class: Class, level: Level) -> Result<Turn, Waiting> {
-        let mut lines = self.lines();
-        let now = lines.clock.instant();
-        if lines.turns.try_start(class, now) {
-            return Ok(Turn { threads: Arc::clone(self), class });
-        }
-        Err(self.line_up(&mut lines, client, class, level))
-    }
-
-    fn line_up(self: &Arc<Self>, lines: &mut Lines, client: Client, class: Class, level: Level) -> Waiting {
-        let (sender, granted) = oneshot::channel();
-        let ticket = lines.turns.wait(client, class, level);
-        lines.waiting.insert(ticket, sender);
-        Waiting { threads: Arc::clone(self), client, class, ticket: Some(ticket), granted }
-    }
-}
-
-/// The right to use a thread, until it is dropped.
-#[derive(Debug)]
-struct Turn {
-    threads: Arc<Threads>,
-    class: Class,
-}
-
-impl Drop for Turn {
-    fn drop(&mut self) {
-        let mut lines = self.threads.lines();
-        lines.turns.stop(self.class);
-        lines.pass_on();
-    }
-}
-
-/// A job that waits for its turn, until it is dropped.
-#[derive(Debug)]
-struct Waiting {
-    threads: Arc<Threads>,
-    client: Client,
-    class: Class,
-    /// `None` once it has its turn.
-    ticket: Option<Ticket>,
-    granted: oneshot::Receiver<()>,
-}
-
-impl Waiting {
-    async fn turn(mut self) -> Turn {
-        loop {
-            tokio::select! {
-                biased;
-                _ = &mut self.granted => {
-                    self.ticket = None;
-                    return Turn { threads: Arc::clone(&self.threads), class: self.class };
-                }
-                // Then a thread may be lent that was not before.
-                () = tokio::time::sleep(LENT_AFTER), if self.class == Class::Long => self.threads.lines().pass_on(),
-            }
-        }
-    }
-}
-
-impl Drop for Waiting {
-    fn drop(&mut self) {
-        let Some(ticket) = self.ticket else { return };
-        let mut lines = self.threads.lines();
-        lines.waiting.remove(&ticket);
-        if !lines.turns.give_up(self.client, self.class, ticket) {
-            // It was granted, and nobody has noticed.
-            lines.turns.stop(self.class);
-        }
-        lines.pass_on();
-    }
 }
 
 impl SearchPool {
@@ -400,52 +280,6 @@ impl SearchPool {
     }
 }
 
-/// The level of a job that has run for so long.
-fn level(ran: Duration) -> Level {
-    let n_moments = ran.as_micros() / MOMENT.as_micros();
-    n_moments.checked_ilog2().map_or(0, |power| power + 1)
-}
-
-/// A place in the pool, counted among the short or the long ones.
-#[derive(Debug)]
-struct Place {
-    threads: Arc<Threads>,
-    client: Client,
-    is_long: AtomicBool,
-    /// How long the jobs of this request have run.
-    spent_us: AtomicU64,
-}
-
-impl Place {
-    /// How long its jobs have run.
-    fn level(&self) -> Level {
-        level(Duration::from_micros(self.spent_us.load(Ordering::Relaxed)))
-    }
-
-    fn class(&self) -> Class {
-        if self.is_long.load(Ordering::Relaxed) { Class::Long } else { Class::Short }
-    }
-
-    /// Moves to the long ones. Says whether there is a place among them.
-    fn become_long(&self, turns: &mut Turns) -> bool {
-        if self.is_long.load(Ordering::Relaxed) {
-            return true;
-        }
-        let is_admitted = turns.admit(self.client, Class::Long);
-        if is_admitted {
-            turns.leave(self.client, Class::Short);
-            self.is_long.store(true, Ordering::Relaxed);
-        }
-        is_admitted
-    }
-}
-
-impl Drop for Place {
-    fn drop(&mut self) {
-        self.threads.lines().turns.leave(self.client, self.class());
-    }
-}
-
 /// A place in the pool. Given back when this and its clones are dropped and the last job that ran by it has ended.
 #[derive(Clone, Debug)]
 pub struct Admission {
@@ -526,145 +360,6 @@ impl Admission {
             Some(patience) => tokio::time::timeout_at(patience.into(), waiting).await.ok().transpose()?,
         };
         self.pool.run_holding((), Job { client, turn, place: Some(place), deadline }, job).await
-    }
-}
-
-/// Lets the threads that talk to clients and to the disk come before this one, from now on: they need little, and soon.
-fn give_way() {
-    /// Where all processors are wanted, a thirtieth of what others have: a search that runs is then interrupted at once by a thread that has
-    /// an answer to send.
-    const NICENESS: i32 = 15;
-    thread_local! {
-        static HAS_GIVEN_WAY: Cell<bool> = const { Cell::new(false) };
-    }
-    #[cfg(target_os = "linux")]
-    if !HAS_GIVEN_WAY.replace(true) {
-        // Threads have priorities of their own here. Where this one keeps its, things are as they were.
-        let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
-    }
-}
-
-/// What is known of a job that is about to run.
-struct Job {
-    client: Client,
-    /// `None` beside the pool.
-    turn: Option<Turn>,
-    /// `None` if its caller is bounded in number.
-    place: Option<Arc<Place>>,
-    deadline: Option<Instant>,
-}
-
-/// Looks at the token, the clock, and whose turn it is, when asked.
-struct Watch {
-    job: Job,
-    cancel: CancellationToken,
-    runtime: Handle,
-    clock: Clock,
-    /// When its turn began.
-    began: Instant,
-    /// How long it had run before.
-    before: Duration,
-    next_look: Instant,
-    /// Whether it was stopped as there was no place for it among the long ones.
-    is_refused: bool,
-}
-
-impl Watch {
-    fn new(job: Job, cancel: CancellationToken, runtime: Handle, clock: Clock) -> Self {
-        let began = clock.instant();
-        let before = job.place.as_ref().map_or(0, |place| place.spent_us.load(Ordering::Relaxed));
-        let before = Duration::from_micros(before);
-        let next_look = began + MOMENT.saturating_sub(before);
-        Self { job, cancel, runtime, clock, began, before, next_look, is_refused: false }
-    }
-
-    /// Becomes long, or makes way if it should.
-    fn look(&mut self, now: Instant) -> Signal {
-        self.next_look = now + LOOK_EVERY;
-        let Some(turn) = &mut self.job.turn else { return Signal::Continue };
-        let ran = now - self.began;
-        let level = level(self.before + ran);
-        let threads = Arc::clone(&turn.threads);
-        let mut lines = threads.lines();
-        let makes_way = if turn.class == Class::Short {
-            if self.job.place.as_ref().is_some_and(|place| !place.become_long(&mut lines.turns)) {
-                self.is_refused = true;
-                return Signal::Cancel;
-            }
-            turn.class = Class::Long;
-            !lines.turns.become_long(now)
-        } else {
-            lines.turns.makes_way(self.job.client, level, ran >= SHARE, now)
-        };
-        if !makes_way {
-            return Signal::Continue;
-        }
-        if lines.n_parked >= MAX_PARKED {
-            self.is_refused = true;
-            return Signal::Cancel;
-        }
-        lines.n_parked += 1;
-        let waiting = threads.line_up(&mut lines, self.job.client, Class::Long, level);
-        drop(lines);
-        self.count();
-        self.before += ran;
-        self.job.turn = None;
-        self.wait(&threads, waiting)
-    }
-
-    /// Waits for the next turn.
-    fn wait(&mut self, threads: &Threads, waiting: Waiting) -> Signal {
-        let (cancel, deadline) = (self.cancel.clone(), self.job.deadline);
-        let until_deadline = async {
-            match deadline {
-                Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
-                None => std::future::pending().await,
-            }
-        };
-        let waited = self.runtime.block_on(async {
-            tokio::select! {
-                biased;
-                () = cancel.cancelled() => Err(Signal::Cancel),
-                () = until_deadline => Err(Signal::Finish),
-                turn = waiting.turn() => Ok(turn),
-            }
-        });
-        self.began = self.clock.instant();
-        threads.lines().n_parked -= 1;
-        match waited {
-            Ok(turn) => {
-                self.job.turn = Some(turn);
-                Signal::Continue
-            }
-            Err(signal) => signal,
-        }
-    }
-
-    /// Adds to the place what this turn has taken.
-    fn count(&self) {
-        if let Some(place) = &self.job.place {
-            let ran_us = u64::try_from(self.clock.elapsed(self.began).as_micros()).unwrap_or(u64::MAX);
-            place.spent_us.fetch_add(ran_us, Ordering::Relaxed);
-        }
-    }
-}
-
-impl Drop for Watch {
-    fn drop(&mut self) {
-        self.count();
-    }
-}
-
-impl Interrupt for Watch {
-    fn poll(&mut self) -> Signal {
-        if self.cancel.is_cancelled() {
-            return Signal::Cancel;
-        }
-        let now = self.clock.instant();
-        if self.job.deadline.is_some_and(|deadline| now >= deadline) {
-            return Signal::Finish;
-        }
-        if now >= self.next_look { self.look(now) } else { Signal::Continue }
     }
 }
 

@@ -1,9 +1,11 @@
 //! Who runs when, and who makes way for whom, on real threads.
 
 use std::net::{IpAddr, Ipv4Addr};
+use std::sync::atomic::Ordering;
 
 use tokio::task::JoinHandle;
 
+use super::place::MOMENT;
 use super::*;
 
 fn client(n: u8) -> Client {

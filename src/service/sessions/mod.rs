@@ -2,6 +2,8 @@
 //!
 //! Of a session only what it was opened with and its observations are stored. Whoever resumes it gets the same steps
 //! again, because they follow from those. A session belongs to one connection at a time; resuming takes it over.
+//!
+//! This file is longer than 400 lines because opening, resuming and expiring follow the same rules, and its tests stand with it.
 
 #[expect(clippy::disallowed_methods, reason = "to be handed the clock")]
 mod session;

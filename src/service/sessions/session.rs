@@ -1,4 +1,6 @@
 //! An open session: observations in, committed steps out.
+//!
+//! This file is longer than 400 lines because all that changes a session stands here, beside its tests.
 
 use std::num::NonZeroU32;
 use std::ops::Deref;

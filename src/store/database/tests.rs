@@ -1,8 +1,12 @@
 //! Which databases are opened, and which are left as they are.
 
+use std::fs::Permissions;
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
+
 use sqlx::Row;
 use tokio_util::task::TaskTracker;
 
+use super::files::keep_from_others;
 use super::*;
 use crate::store::Store;
 

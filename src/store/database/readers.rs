@@ -1,0 +1,90 @@
+//! The ways to read, and what every way to the database has.
+
+use std::path::Path;
+use std::time::Duration;
+
+use sqlx::pool::PoolConnection;
+use sqlx::sqlite::{SqliteConnectOptions, SqlitePool, SqlitePoolOptions};
+use sqlx::{ConnectOptions, Connection, Sqlite, SqliteConnection};
+use tokio::sync::RwLock;
+
+use crate::store::{Depth, StoreError, schema};
+
+/// How long a connection waits for another process's lock.
+const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
+
+/// Readers at the same time. Reads are short, and there are few cores. One of them copies the log now and then.
+pub(in crate::store) const N_READERS: u32 = 5;
+
+/// Statements that a connection keeps prepared: all that there are, those with a number of rows as often as there are numbers.
+const N_STATEMENTS: usize = 256;
+
+/// Copies what is in the log to the file of the database, as far as others let `connection`.
+pub(in crate::store) async fn checkpoint(connection: &mut SqliteConnection) -> Result<(), StoreError> {
+    sqlx::query("PRAGMA wal_checkpoint(PASSIVE)").execute(connection).await?;
+    Ok(())
+}
+
+/// The ways to read.
+#[derive(Debug)]
+pub(in crate::store) struct Readers {
+    /// Locked while one takes the place of another.
+    pub(super) pool: RwLock<SqlitePool>,
+}
+
+impl Readers {
+    /// One of them, until it is dropped. While others take their place, these are waited for.
+    ///
+    /// # Errors
+    ///
+    /// If none comes free in time, or there are no more.
+    pub(in crate::store) async fn one(&self) -> Result<PoolConnection<Sqlite>, StoreError> {
+        Ok(self.pool.read().await.acquire().await?)
+    }
+
+    /// Copies what is in the log to the file of the database, as far as others let it: nobody waits for that.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub(in crate::store) async fn checkpoint(&self) -> Result<(), StoreError> {
+        checkpoint(&mut *self.one().await?).await
+    }
+
+    pub(in crate::store) async fn close(&self) {
+        self.pool.read().await.close().await;
+    }
+}
+
+/// What every connection has.
+pub(super) fn options(path: &Path) -> SqliteConnectOptions {
+    SqliteConnectOptions::new()
+        .filename(path)
+        .create_if_missing(false)
+        .busy_timeout(BUSY_TIMEOUT)
+        .statement_cache_capacity(N_STATEMENTS)
+        .disable_statement_logging()
+}
+
+/// Ways to read, all of them now, which stay: opened later, one could need room that there is none of, or find another file.
+pub(super) async fn readers(options: SqliteConnectOptions) -> Result<SqlitePool, StoreError> {
+    let pool = SqlitePoolOptions::new().min_connections(N_READERS).max_connections(N_READERS);
+    // Until a connection has read, SQLite holds nothing open for it, and whoever closes another one may remove the log.
+    let pool = pool.idle_timeout(None).max_lifetime(None).after_connect(|connection, _| {
+        Box::pin(async move { sqlx::query("SELECT 1 FROM sqlite_schema").execute(connection).await.map(drop) })
+    });
+    Ok(pool.connect_with(options).await?)
+}
+
+/// Ways to read a database that is whole, and has this version's schema.
+pub(super) async fn look_at(options: SqliteConnectOptions, depth: Depth) -> Result<SqlitePool, StoreError> {
+    let mut connection = options.connect().await?;
+    schema::check_version(&mut connection).await?;
+    schema::check_whose(&mut connection).await?;
+    schema::check_current(&mut connection).await?;
+    if depth == Depth::Whole {
+        schema::quick_check(&mut connection).await?;
+    }
+    connection.close().await?;
+    readers(options).await
+}
