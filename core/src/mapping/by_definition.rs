@@ -1,7 +1,35 @@
-//! What mappings cost by definition, written to be read, for tests to hold searches and estimates against.
+//! What tests share: how they make problems, and what mappings cost by definition, written to be read, for searches and estimates to be
+//! held against.
 
-use super::Problem;
-use crate::model::StateIdx;
+use serde_json::Value;
+
+use super::{Problem, Request};
+use crate::document::{Faults, Place};
+use crate::interrupt::Uninterrupted;
+use crate::model::{Definition, Limits, Model, StateIdx};
+
+/// The model that a document defines.
+pub(super) fn compiled(document: &Value) -> Model {
+    let definition = Definition::read(document, Limits::NONE, &mut Uninterrupted).unwrap();
+    Model::compile(&definition, Limits::NONE, &mut Uninterrupted).unwrap()
+}
+
+/// The problem of a request.
+pub(super) fn problem<'m>(model: &'m Model, request: &Value) -> Problem<'m> {
+    let mut faults = Faults::default();
+    let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
+    Request::read(model, &object, &mut faults).unwrap().problem
+}
+
+/// Transitions by state, action and next state, made to fit into `n_states` states and to be one for each state and action.
+pub(super) fn fitted(mut transitions: Vec<(usize, usize, usize)>, n_states: usize) -> Vec<(usize, usize, usize)> {
+    for (from, _, to) in &mut transitions {
+        (*from, *to) = (*from % n_states, *to % n_states);
+    }
+    transitions.sort_unstable();
+    transitions.dedup_by_key(|(from, action, _)| (*from, *action));
+    transitions
+}
 
 /// `D(o_i, s)`.
 pub(super) fn distance(problem: &Problem<'_>, i: usize, state: StateIdx) -> f64 {

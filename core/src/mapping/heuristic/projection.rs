@@ -235,6 +235,7 @@ mod tests {
 
     use super::*;
     use crate::interrupt::Uninterrupted;
+    use crate::mapping::by_definition::compiled;
     use crate::model::{Definition, Limits};
 
     #[test]
@@ -246,8 +247,7 @@ mod tests {
             "actions": [{"name": "on"}],
             "dynamics": {"kind": "table", "states": states, "transitions": transitions},
         });
-        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+        let model = compiled(&model);
         let kept = |max_edges| {
             let projections = Projections::bounded(&model, max_edges, &mut Uninterrupted).unwrap();
             projections.attributes.iter().map(|own| (own.is_kept, own.edges.n_items())).collect::<Vec<_>>()

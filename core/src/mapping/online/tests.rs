@@ -3,19 +3,15 @@ use serde_json::json;
 
 use super::*;
 use crate::interrupt::Uninterrupted;
+use crate::mapping::by_definition::{compiled, fitted};
 use crate::mapping::{Demonstration, HeuristicName, Problem, Settings};
-use crate::model::{Definition, Limits, Model, Origin};
+use crate::model::Origin;
 
 /// States on a line, in any order, with any transitions.
 fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Mapper {
     let states: Vec<_> = places.iter().map(|x| json!([x])).collect();
     let actions = [("a", 0.0), ("b", 0.5), ("c", 2.0)];
-    let mut transitions: Vec<_> = transitions
-        .iter()
-        .map(|(from, action, to)| (from % places.len(), actions[*action].0, to % places.len()))
-        .collect();
-    transitions.sort_unstable();
-    transitions.dedup_by_key(|(from, action, _)| (*from, *action));
+    let transitions = fitted(transitions.to_vec(), places.len());
     let document = json!({
         "attributes": [{"name": "x", "kind": "number"}],
         "actions": actions.map(|(name, cost)| json!({"name": name, "cost": cost})),
@@ -24,10 +20,8 @@ fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Mapper {
     prepared(&document)
 }
 
-fn prepared(model: &serde_json::Value) -> Mapper {
-    let definition = Definition::read(model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-    Mapper::new(model, &mut Uninterrupted).unwrap()
+fn prepared(document: &serde_json::Value) -> Mapper {
+    Mapper::new(compiled(document), &mut Uninterrupted).unwrap()
 }
 
 /// Two loops of as many states each. From state 0 either can be entered, and none is left. All attributes tell all states

@@ -5,7 +5,7 @@ use std::collections::BinaryHeap;
 use super::room::{TableRoom, used_projections};
 use super::table::Table;
 use super::{ChangingColumn, Column, Estimate, Projected};
-use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
+use crate::interrupt::{Cancelled, Interrupt, Interrupted, Meter};
 use crate::mapping::heuristic::projection::Projections;
 use crate::mapping::heuristic::shares::SharedWays;
 use crate::mapping::open_list::CheapestFirst;
@@ -73,50 +73,54 @@ impl<'p> Projected<'p> {
         projected.table = Table::filled_with(Estimate::default(), width, n_observations);
         projected.least_terms = vec![0.0; n_observations * projected.columns.len()];
         projected.least_distances = vec![0.0; n_observations];
-        let mut meter = Meter::new(interrupt, POLL_EVERY);
-        for number in 0..projected.columns.len() {
-            match projected.write_terms(number, &mut buffers.layer.least, &mut meter) {
-                Signal::Continue => {}
-                Signal::Finish => return Ok(None),
-                Signal::Cancel => return Err(Cancelled),
-            }
+        match projected.fill(projections, &used, buffers, &mut Meter::new(interrupt, POLL_EVERY)) {
+            Ok(()) => Ok(Some(projected)),
+            Err(Interrupted::OutOfTime) => Ok(None),
+            Err(Interrupted::Cancelled(cancelled)) => Err(cancelled),
         }
-        projected.add_constants();
-        let ways_of = |column: &Column<'_>| SharedWays::new(projections, column.projection, problem, &used);
-        let n_edges: usize = projected.columns.iter().map(|column| column.projection.edges.n_items()).sum();
+    }
+
+    /// Fills the tables, of the projections that are `used`.
+    fn fill(
+        &mut self,
+        projections: &Projections,
+        used: &[bool],
+        buffers: &mut TableBuffers,
+        meter: &mut Meter<'_>,
+    ) -> Result<(), Interrupted> {
+        for number in 0..self.columns.len() {
+            self.write_terms(number, &mut buffers.layer.least, meter)?;
+        }
+        self.add_constants();
+        let problem = self.problem;
+        let ways_of = |column: &Column<'_>| SharedWays::new(projections, column.projection, problem, used);
+        let n_edges: usize = self.columns.iter().map(|column| column.projection.edges.n_items()).sum();
         let are_kept = n_edges <= MAX_KEPT_EDGES;
         if are_kept && buffers.used != used {
-            buffers.ways = projected.columns.iter().map(ways_of).collect();
-            buffers.used.clone_from(&used);
+            buffers.ways = self.columns.iter().map(ways_of).collect();
+            used.clone_into(&mut buffers.used);
         }
-        for number in 0..projected.columns.len() {
-            let made = (!are_kept).then(|| ways_of(&projected.columns[number]));
+        for number in 0..self.columns.len() {
+            let made = (!are_kept).then(|| ways_of(&self.columns[number]));
             let ways = made.as_ref().unwrap_or_else(|| &buffers.ways[number]);
-            match projected.solve_column(number, ways, &mut buffers.layer, &mut meter) {
-                Signal::Continue => {}
-                Signal::Finish => return Ok(None),
-                Signal::Cancel => return Err(Cancelled),
-            }
+            self.solve_column(number, ways, &mut buffers.layer, meter)?;
         }
-        projected.tell_unchanged();
-        Ok(Some(projected))
+        self.tell_unchanged();
+        Ok(())
     }
 
     /// Writes the terms of a column, and the least of them at each observation. What no action changes stays as it was at the start.
-    fn write_terms(&mut self, number: usize, least: &mut Vec<f64>, meter: &mut Meter<'_>) -> Signal {
+    fn write_terms(&mut self, number: usize, least: &mut Vec<f64>, meter: &mut Meter<'_>) -> Result<(), Interrupted> {
         let (n_observations, n_columns) = (self.problem.demonstration.len(), self.columns.len());
         let Column { projection, offset } = self.columns[number];
         let position = projection.position;
         let start = self.problem.start_row[position];
         let is_unchanged = projection.is_constant();
-        let Some(terms) = self.problem.distances.of(position) else { return Signal::Continue };
+        let Some(terms) = self.problem.distances.of(position) else { return Ok(()) };
         least.clear();
         least.resize(n_observations, f64::INFINITY);
         for value in (0..).take(projection.n_values) {
-            match meter.spend(n_observations as u64) {
-                Signal::Continue => {}
-                signal => return signal,
-            }
+            meter.spend_or_stop(n_observations as u64)?;
             let entries = self.table.of_mut(offset + value as usize);
             for ((i, least), entry) in least.iter_mut().enumerate().zip(entries) {
                 entry.distance = terms.term(i, value);
@@ -129,7 +133,7 @@ impl<'p> Projected<'p> {
             self.least_terms[i * n_columns + number] = *least;
             self.least_distances[i] += least;
         }
-        Signal::Continue
+        Ok(())
     }
 
     /// Adds what attributes of a single value add to the least distances.
@@ -176,7 +180,7 @@ impl<'p> Projected<'p> {
         predecessors: &SharedWays,
         layer: &mut ColumnLayer,
         meter: &mut Meter<'_>,
-    ) -> Signal {
+    ) -> Result<(), Interrupted> {
         let Column { projection, offset } = self.columns[number];
         let n_values = projection.n_values;
         let ColumnLayer { here, next, open, .. } = layer;
@@ -186,10 +190,7 @@ impl<'p> Projected<'p> {
         open.clear();
         let (mut here, mut next) = (here.as_mut_slice(), next.as_mut_slice());
         for i in (0..self.problem.last()).rev() {
-            match meter.spend(n_values as u64) {
-                Signal::Continue => {}
-                signal => return signal,
-            }
+            meter.spend_or_stop(n_values as u64)?;
             for (value, (here, next)) in here.iter_mut().zip(&*next).enumerate() {
                 here.distance = self.table.at(offset + value, i).distance;
                 here.cost_to_go = MoveKind::Skip.go_on(next.distance, next.cost_to_go);
@@ -211,10 +212,7 @@ impl<'p> Projected<'p> {
                 relax(predecessors, value, cost, least_distance, here, open);
             }
             while let Some(CheapestFirst { cost, id: value }) = open.pop() {
-                match meter.spend(1) {
-                    Signal::Continue => {}
-                    signal => return signal,
-                }
+                meter.spend_or_stop(1)?;
                 let entry = here[value as usize];
                 if cost <= entry.cost_to_go {
                     let cost = MoveKind::Extra.go_on(entry.distance - least, cost);
@@ -226,7 +224,7 @@ impl<'p> Projected<'p> {
             }
             std::mem::swap(&mut here, &mut next);
         }
-        Signal::Continue
+        Ok(())
     }
 }
 

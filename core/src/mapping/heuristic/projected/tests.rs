@@ -4,12 +4,10 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::document::{Faults, Place};
 use crate::interrupt::Uninterrupted;
-use crate::mapping::Request;
-use crate::mapping::by_definition::{distance, least_costs, moves, nodes};
+use crate::mapping::by_definition::{compiled, distance, fitted, least_costs, moves, nodes, problem};
 use crate::mapping::heuristic::projection::Projections;
-use crate::model::{Definition, Limits, Model, StateIdx};
+use crate::model::StateIdx;
 
 /// A model of up to 12 states and three attributes, of which some weigh nothing, and a demonstration.
 fn model_and_demonstration() -> impl Strategy<Value = (Value, Value)> {
@@ -21,9 +19,8 @@ fn model_and_demonstration() -> impl Strategy<Value = (Value, Value)> {
         let ways = prop::collection::vec((0..n_states, 0usize..3, 0..n_states), 0..3 * n_states);
         let rows = prop::collection::vec(row(), n_states);
         (weights.clone(), costs.clone(), rows, ways, prop::collection::vec(seen.clone(), 1..6)).prop_map(
-            |(weights, costs, rows, mut ways, seen)| {
-                ways.sort_unstable();
-                ways.dedup_by_key(|(from, action, _)| (*from, *action));
+            |(weights, costs, rows, ways, seen)| {
+                let ways = fitted(ways, rows.len());
                 let attributes = ["a", "b", "c"].into_iter().zip(weights);
                 let attributes =
                     attributes.map(|(name, weight)| json!({"name": name, "kind": "number", "weight": weight}));
@@ -32,7 +29,7 @@ fn model_and_demonstration() -> impl Strategy<Value = (Value, Value)> {
                     "attributes": attributes.collect::<Value>(), "actions": actions.collect::<Value>(),
                     "dynamics": {"kind": "table", "states": rows, "transitions": ways, "start": 0},
                 });
-                (model, json!(seen))
+                (model, json!({"model": "m", "demonstration": seen}))
             },
         )
     })
@@ -52,17 +49,10 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn estimates_are_admissible_and_consistent((definition, demonstration) in model_and_demonstration()) {
-        let definition = Definition::read(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    fn estimates_are_admissible_and_consistent((model, request) in model_and_demonstration()) {
+        let model = compiled(&model);
         let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
-        let seen: Vec<Value> = demonstration.as_array().unwrap().iter().map(|seen| {
-            json!({"a": seen[0], "b": seen[1], "c": seen[2]})
-        }).collect();
-        let request = json!({"model": "m", "demonstration": seen});
-        let mut faults = Faults::default();
-        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
-        let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
+        let problem = problem(&model, &request);
         let [from_start, to_end] = least_costs(&problem);
         let optimum = from_start[problem.last()].iter().copied().fold(f64::INFINITY, f64::min);
         let close = 1e-9 * (1.0 + optimum);
@@ -93,15 +83,12 @@ fn tables_have_no_more_entries_than_allowed_however_short_the_demonstration() {
         "actions": [{"name": "go", "cost": 1}],
         "dynamics": {"kind": "table", "states": states, "transitions": [[0, "go", 1]], "start": 0},
     });
-    let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    let model = compiled(&model);
     let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
     let mut buffers = TableBuffers::default();
     for n_observations in [1, 2, 8, 9] {
         let request = json!({"model": "m", "demonstration": vec![json!({"a": 50, "b": 3}); n_observations]});
-        let mut faults = Faults::default();
-        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
-        let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
+        let problem = problem(&model, &request);
         for max_entries in [0, 7, 107, 856, 1_000, 1_712] {
             let solved = Projected::solve(
                 &projections,
@@ -126,16 +113,13 @@ fn buffers_of_other_problems_change_no_table() {
         "actions": [{"name": "on", "cost": 1}, {"name": "far", "cost": 3}],
         "dynamics": {"kind": "table", "states": states, "transitions": ways, "start": 0},
     });
-    let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    let model = compiled(&model);
     let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
     let mut buffers = TableBuffers::default();
     for (a, b, n_observations) in [(1, 1, 5), (1, 0, 5), (0, 1, 9), (1, 1, 2), (2, 1, 2), (0, 0, 1), (1, 1, 5)] {
         let demonstration: Value = (0..n_observations).map(|i| json!({"a": i % 4, "b": 2})).collect();
         let request = json!({"model": "m", "demonstration": demonstration, "weights": {"a": a, "b": b}});
-        let mut faults = Faults::default();
-        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
-        let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
+        let problem = problem(&model, &request);
         let table = |buffers| {
             let solved =
                 Projected::solve(&projections, &problem, TableRoom::within(usize::MAX), buffers, &mut Uninterrupted);

@@ -2,13 +2,11 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::document::{Faults, Place};
 use crate::interrupt::{Signal, Uninterrupted};
-use crate::mapping::Request;
+use crate::mapping::by_definition::{compiled, fitted, problem};
 use crate::mapping::heuristic::HeuristicName;
 use crate::mapping::heuristic::projected::MAX_ENTRIES;
 use crate::mapping::mapper::Status;
-use crate::model::{Definition, Limits, Model};
 
 /// A belt of places with a dial of ten at each, and a demonstration that turns it in a way that the body cannot.
 fn belt(n_places: usize, n_observations: usize) -> (Mapper, Value) {
@@ -28,16 +26,8 @@ fn belt(n_places: usize, n_observations: usize) -> (Mapper, Value) {
     (prepared(&model), json!({"model": "belt", "demonstration": seen.collect::<Value>()}))
 }
 
-fn prepared(model: &Value) -> Mapper {
-    let definition = Definition::read(model, Limits::NONE, &mut Uninterrupted).unwrap();
-    let model = Model::compile(&definition, Limits::NONE, &mut Uninterrupted).unwrap();
-    Mapper::new(model, &mut Uninterrupted).unwrap()
-}
-
-fn read<'m>(mapper: &'m Mapper, request: &Value) -> Request<'m> {
-    let mut faults = Faults::default();
-    let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
-    Request::read(mapper.model(), &object, &mut faults).unwrap()
+fn prepared(document: &Value) -> Mapper {
+    Mapper::new(compiled(document), &mut Uninterrupted).unwrap()
 }
 
 /// A body in a world of small numbers, and a demonstration. States look alike now and then, and actions may cost nothing.
@@ -46,25 +36,19 @@ fn wander() -> impl Strategy<Value = (Value, Value)> {
     let transitions = prop::collection::vec((0..60_usize, 0..3_usize, 0..60_usize), 10..200);
     let seen = (0..8_u32, prop::option::weighted(0.7, 0..4_u32), prop::option::weighted(0.7, 0..3_u32));
     let costs = prop_oneof![Just([0.0, 0.5, 2.0]), Just([0.3, 0.7, 1.1])];
-    (states, transitions, prop::collection::vec(seen, 3..16), costs).prop_map(
-        |(states, mut transitions, seen, costs)| {
-            for (from, _, to) in &mut transitions {
-                (*from, *to) = (*from % states.len(), *to % states.len());
-            }
-            transitions.sort_unstable();
-            transitions.dedup_by_key(|(from, action, _)| (*from, *action));
-            let model = json!({
-                "attributes": [
-                    {"name": "x", "kind": "number"},
-                    {"name": "y", "kind": "number", "weight": 2.5},
-                    {"name": "c", "kind": "category", "weight": 1.3},
-                ],
-                "actions": (0..3).map(|n| json!({"name": format!("a{n}"), "cost": costs[n]})).collect::<Value>(),
-                "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
-            });
-            (model, json!({"model": "wander", "demonstration": seen}))
-        },
-    )
+    (states, transitions, prop::collection::vec(seen, 3..16), costs).prop_map(|(states, transitions, seen, costs)| {
+        let transitions = fitted(transitions, states.len());
+        let model = json!({
+            "attributes": [
+                {"name": "x", "kind": "number"},
+                {"name": "y", "kind": "number", "weight": 2.5},
+                {"name": "c", "kind": "category", "weight": 1.3},
+            ],
+            "actions": (0..3).map(|n| json!({"name": format!("a{n}"), "cost": costs[n]})).collect::<Value>(),
+            "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
+        });
+        (model, json!({"model": "wander", "demonstration": seen}))
+    })
 }
 
 /// Says to finish when it is asked for the `n`-th time.
@@ -102,13 +86,13 @@ proptest! {
         looseness in prop_oneof![Just(None), Just(Some(1.0)), Just(Some(1.3))],
     ) {
         let mapper = Mapper { patience: helps, ..prepared(&model) };
-        let request = read(&mapper, &request);
+        let request = problem(mapper.model(), &request);
         let without = Settings { heuristic: HeuristicName::None, ..Settings::default() };
-        let optimum = mapper.map(&request.problem, without, &mut Uninterrupted).unwrap().cost.total;
+        let optimum = mapper.map(&request, without, &mut Uninterrupted).unwrap().cost.total;
         let close = |cost: f64| (cost - optimum).abs() <= 1e-9 * optimum;
         let settings = Settings { upper_bound: looseness.map(|factor| optimum * factor), ..Settings::default() };
         let map = |budget, interrupt: &mut dyn Interrupt| {
-            mapper.map(&request.problem, Settings { budget, ..settings }, interrupt).unwrap()
+            mapper.map(&request, Settings { budget, ..settings }, interrupt).unwrap()
         };
         let is_true = |mapping: &Mapping| {
             let lower_bound = mapping.lower_bound.unwrap();
@@ -119,7 +103,7 @@ proptest! {
 
         let mapping = map(Budget::DEFAULT, &mut Uninterrupted);
         prop_assert!(mapping.status == Status::Optimal && close(mapping.cost.total), "{mapping:?}, not {optimum}");
-        let max_bytes = mapper.search_bytes(&request.problem, settings);
+        let max_bytes = mapper.search_bytes(&request, settings);
         prop_assert!(max_bytes < Budget::DEFAULT.max_bytes);
         let within = map(Budget { max_bytes, ..Budget::DEFAULT }, &mut Uninterrupted);
         prop_assert!(within.status == Status::Optimal && close(within.cost.total), "{within:?}, not {optimum}");
@@ -161,7 +145,7 @@ proptest! {
             });
             let settings = Settings { budget: Budget { max_bytes: *max_bytes, ..Budget::DEFAULT }, ..Settings::default() };
             let map = |mapper: &Mapper, settings| {
-                mapper.map(&read(mapper, &request).problem, settings, &mut Uninterrupted).unwrap()
+                mapper.map(&problem(mapper.model(), &request), settings, &mut Uninterrupted).unwrap()
             };
             let mapping = map(&reused, settings);
             prop_assert_eq!(&mapping, &map(&fresh(), settings));
@@ -187,7 +171,7 @@ fn a_state_with_thousands_of_ways_out_does_not_overrun_the_memory() {
         },
     });
     let mapper = prepared(&model);
-    let request = read(&mapper, &json!({"model": "star", "demonstration": vec![json!({"x": 0}); 30]})).problem;
+    let request = problem(mapper.model(), &json!({"model": "star", "demonstration": vec![json!({"x": 0}); 30]}));
     // Less than the nodes take that the first expansion finds.
     let settings = Settings { budget: Budget { max_bytes: 100 * N_WAYS, ..Budget::DEFAULT }, ..Settings::default() };
     assert_eq!(mapper.map(&request, settings, &mut Uninterrupted).unwrap().n_expanded, 1);
@@ -197,14 +181,14 @@ fn a_state_with_thousands_of_ways_out_does_not_overrun_the_memory() {
 fn tables_left_out_at_first_come_to_the_same_cost_as_a_search_without_heuristic() {
     // The places' table is too large for a first attempt, which is not enough.
     let (mapper, request) = belt(3_000, 30);
-    let request = read(&mapper, &request);
+    let request = problem(mapper.model(), &request);
     let few_entries = Patience::DEFAULT.few_entries;
     let few = TableRoom::within(usize::MAX).at_first(few_entries);
-    let few = mapper.solve(&request.problem, few, &mut Uninterrupted);
+    let few = mapper.solve(&request, few, &mut Uninterrupted);
     assert!(few.unwrap().unwrap().n_left_out() >= 90_000);
     let map = |heuristic| {
         let settings = Settings { heuristic, ..Settings::default() };
-        mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap()
+        mapper.map(&request, settings, &mut Uninterrupted).unwrap()
     };
     let (by_default, without) = (map(HeuristicName::Default), map(HeuristicName::None));
     assert_eq!((by_default.cost.total, by_default.status), (without.cost.total, Status::Optimal));
@@ -212,13 +196,13 @@ fn tables_left_out_at_first_come_to_the_same_cost_as_a_search_without_heuristic(
     // Cut short between the two attempts, it keeps what the first one found.
     let optimum = without.cost.total;
     for n_polls in 1..60 {
-        let mapping = mapper.map(&request.problem, Settings::default(), &mut finish_at(n_polls)).unwrap();
+        let mapping = mapper.map(&request, Settings::default(), &mut finish_at(n_polls)).unwrap();
         let lower_bound = mapping.lower_bound.unwrap();
         assert!(lower_bound <= optimum + 1e-9 && optimum <= mapping.cost.total + 1e-9, "after {n_polls} polls");
     }
     for max_expansions in [0, 10, 1_000, 6_000, 10_000] {
         let settings = Settings { budget: Budget { max_expansions, ..Budget::DEFAULT }, ..Settings::default() };
-        let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+        let mapping = mapper.map(&request, settings, &mut Uninterrupted).unwrap();
         assert!(mapping.n_expanded <= max_expansions && mapping.lower_bound.unwrap() <= optimum + 1e-9);
     }
 }
@@ -233,9 +217,9 @@ fn a_sweep_that_is_cut_short_raises_the_bound_and_counts() {
         ..Patience::DEFAULT
     };
     let mapper = Mapper { patience, ..mapper };
-    let request = read(&mapper, &request);
-    let map_until = |n| mapper.map(&request.problem, Settings::default(), &mut finish_at(n)).unwrap();
-    let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap();
+    let request = problem(mapper.model(), &request);
+    let map_until = |n| mapper.map(&request, Settings::default(), &mut finish_at(n)).unwrap();
+    let optimum = mapper.map(&request, Settings::default(), &mut Uninterrupted).unwrap();
     assert_eq!(optimum.n_expanded, 10 + 600 * 100);
     let cut_short = |n| Some(map_until(n)).filter(|mapping| mapping.status == Status::Bounded);
     let swept: Vec<Mapping> = (1..1000).map_while(cut_short).filter(|mapping| mapping.n_expanded > 10).collect();
@@ -249,12 +233,12 @@ fn a_sweep_that_is_cut_short_raises_the_bound_and_counts() {
 #[test]
 fn an_upper_bound_below_the_optimum_proves_that_there_is_no_such_mapping() {
     let (mapper, request) = belt(6, 40);
-    let request = read(&mapper, &request);
-    let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap().cost.total;
+    let request = problem(mapper.model(), &request);
+    let optimum = mapper.map(&request, Settings::default(), &mut Uninterrupted).unwrap().cost.total;
     for factor in [0.0, 0.5, 0.99, 0.999_999] {
         let upper_bound = Some(optimum * factor);
         let settings = Settings { upper_bound, ..Settings::default() };
-        let mapping = mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap();
+        let mapping = mapper.map(&request, settings, &mut Uninterrupted).unwrap();
         assert_eq!(mapping.status, Status::Bounded, "{factor}");
         assert!(mapping.lower_bound.unwrap() <= optimum && optimum <= mapping.cost.total, "{factor}: {mapping:?}");
         assert!(mapping.lower_bound.unwrap() >= optimum * factor);
@@ -264,9 +248,9 @@ fn an_upper_bound_below_the_optimum_proves_that_there_is_no_such_mapping() {
 #[test]
 fn a_small_search_that_is_cut_short_tells_what_its_open_nodes_cost_at_least() {
     let (mapper, request) = belt(60, 100);
-    let request = read(&mapper, &request);
-    let optimum = mapper.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap().cost.total;
-    let map_until = |n| mapper.map(&request.problem, Settings::default(), &mut finish_at(n)).unwrap();
+    let request = problem(mapper.model(), &request);
+    let optimum = mapper.map(&request, Settings::default(), &mut Uninterrupted).unwrap().cost.total;
+    let map_until = |n| mapper.map(&request, Settings::default(), &mut finish_at(n)).unwrap();
     let mappings: Vec<Mapping> = (2..1000).map(map_until).take_while(|found| found.status == Status::Bounded).collect();
     assert!(mappings.len() > 3, "{}", mappings.len());
     for mapping in &mappings {
@@ -289,10 +273,10 @@ fn a_search_goes_on_where_there_is_no_room_for_a_sweep_and_none_is_begun_that_wo
         ..Patience::DEFAULT
     };
     let mapper = Mapper { patience, ..mapper };
-    let request = read(&mapper, &request);
+    let request = problem(mapper.model(), &request);
     let map = |budget| {
         let settings = Settings { budget, ..Settings::default() };
-        mapper.map(&request.problem, settings, &mut Uninterrupted).unwrap()
+        mapper.map(&request, settings, &mut Uninterrupted).unwrap()
     };
     let swept = map(Budget::DEFAULT);
     assert_eq!((swept.status, swept.n_expanded), (Status::Optimal, 100 + 30_000 * 30));

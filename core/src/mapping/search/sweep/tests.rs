@@ -4,12 +4,9 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::document::{Faults, Place};
 use crate::interrupt::Uninterrupted;
-use crate::mapping::Request;
-use crate::mapping::by_definition::least_costs;
+use crate::mapping::by_definition::{compiled, fitted, least_costs, problem};
 use crate::mapping::cost::cost_of;
-use crate::model::{Definition, Limits, Model};
 
 /// A model of up to 14 states, and a demonstration. Actions may cost nothing, states look alike, and not all is observed, so that many
 /// extra actions may follow each other.
@@ -18,12 +15,8 @@ fn model_and_demonstration() -> impl Strategy<Value = (Value, Value)> {
     let rows = prop::collection::vec((0..5u8, 0..3u8), 1..14);
     let ways = prop::collection::vec((0..14usize, 0..3usize, 0..14usize), 0..40);
     let seen = prop::collection::vec((prop::option::weighted(0.4, 0..6u8), prop::option::weighted(0.3, 0..3u8)), 1..14);
-    (costs, rows, ways, seen).prop_map(|(costs, rows, mut ways, seen)| {
-        for (from, _, to) in &mut ways {
-            (*from, *to) = (*from % rows.len(), *to % rows.len());
-        }
-        ways.sort_unstable();
-        ways.dedup_by_key(|(from, action, _)| (*from, *action));
+    (costs, rows, ways, seen).prop_map(|(costs, rows, ways, seen)| {
+        let ways = fitted(ways, rows.len());
         let actions = costs.iter().enumerate().map(|(n, cost)| json!({"name": format!("a{n}"), "cost": cost}));
         let model = json!({
             "attributes": [{"name": "x", "kind": "number", "weight": 4}, {"name": "c", "kind": "category", "weight": 1.7}],
@@ -64,11 +57,8 @@ proptest! {
 
     #[test]
     fn a_sweep_in_sections_of_any_length_finds_the_cheapest_mapping((model, request) in model_and_demonstration()) {
-        let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-        let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-        let mut faults = Faults::default();
-        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
-        let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
+        let model = compiled(&model);
+        let problem = problem(&model, &request);
         let [from_start, _] = least_costs(&problem);
         let least = from_start[problem.last()].iter().copied().fold(f64::INFINITY, f64::min);
         let n_observations = problem.demonstration.len();
@@ -91,12 +81,9 @@ fn sections_are_as_long_as_there_is_room_for_and_a_sweep_without_room_is_not_beg
         "actions": [{"name": "on"}],
         "dynamics": {"kind": "table", "states": states, "transitions": ways, "start": 0},
     });
-    let definition = Definition::read(&model, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
+    let model = compiled(&model);
     let request = json!({"model": "m", "demonstration": vec![json!({"x": 50}); 900]});
-    let mut faults = Faults::default();
-    let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
-    let problem = Request::read(&model, &object, &mut faults).unwrap().problem;
+    let problem = problem(&model, &request);
     let within = |max_bytes| section_len(&problem, Budget { max_bytes, ..Budget::DEFAULT });
     let basis = Ways::bytes_for(100, 99) + 8 * 100 * 8;
     assert_eq!(within(usize::MAX), Some(900));
