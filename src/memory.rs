@@ -10,8 +10,8 @@
 //! waits ([`Memory::take`]) or is refused ([`Memory::try_take`]). An eighth of the room is left to what takes up to [`SMALL_BYTES`], so that
 //! large requests cannot keep small ones from being answered.
 //!
-//! The budget counts what it is told. What it is not told shows in what is resident, which [`Memory::watch`] measures: while most of
-//! `--max-memory` is, nothing large is begun, whatever was counted.
+//! The budget counts only what is taken from it. Other memory shows in what is resident, which [`Memory::watch`] measures: while most of
+//! `--max-memory` is resident, nothing large is begun, whatever was counted.
 
 use std::fs;
 use std::pin::pin;
@@ -40,7 +40,7 @@ pub struct NoRoom {
     pub room: u64,
 }
 
-/// How long whoever waits for memory leaves it at that, once what was given back was not enough: any number may wait.
+/// How long a waiting caller pauses when what was given back was not enough. Any number of callers may wait, so none may spin.
 const WAITING_PAUSE: Duration = Duration::from_millis(20);
 
 /// The budget. Clones share it.
@@ -61,11 +61,11 @@ struct Budget {
 struct Resident {
     /// As much as may be, in bytes.
     most: u64,
-    /// When that was last measured, in bytes.
+    /// What was measured last, in bytes.
     measured: AtomicU64,
 }
 
-/// How often what is resident is measured: more often than much can be allocated and written to.
+/// How often resident memory is measured: so often that little can be added in between.
 const MEASURE_EVERY: Duration = Duration::from_millis(20);
 
 impl Memory {
@@ -175,8 +175,8 @@ impl Memory {
         Ok(Held { memory: self.clone(), permit })
     }
 
-    /// Takes `n_bytes` as large once they are free. Whoever waits holds nothing back: others may take meanwhile what would not be enough
-    /// for it, so that it may wait for as long as it likes to.
+    /// Takes `n_bytes` as large once they are free. A waiting caller reserves nothing: others may take meanwhile what is free, so that
+    /// waiting for long keeps nobody from anything.
     ///
     /// # Errors
     ///

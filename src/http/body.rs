@@ -37,7 +37,7 @@ const DISCARD_TIMEOUT: Duration = Duration::from_secs(10);
 /// How much of it is read, as a multiple of the limit.
 const MAX_DISCARDED_LIMITS: usize = 64;
 
-/// Of the body of a model, how much is waited for before reading begins: one that is not larger is at hand then.
+/// Bodies of models up to this size, in bytes, are buffered whole before they are read.
 const AT_HAND_BYTES: usize = 1 << 20;
 
 /// Largest body of a reward or of a reason.

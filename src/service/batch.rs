@@ -23,7 +23,7 @@ use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
 use uuid::Uuid;
 
-use super::learners::Ready;
+use super::learners::LearnerState;
 use super::requests::{Named, Names, SentRequest, base_weights, most_demonstration_bytes, n_observations};
 use super::search::{Extent, Searched, follow, take_for_demonstration};
 use super::{Caller, Etude, MadePolicy, ServiceError};
@@ -76,7 +76,7 @@ impl Etude {
         let names = names.filter(|names| faults.is_empty() && names.over_limits.is_empty());
         let Some(names) = names else { return Ok(None) };
         let deadline = self.deadline(&names, caller.arrived);
-        let place = place.with_patience(deadline);
+        let place = place.waiting_until(deadline);
         let named = self.find(&names, faults, &place, deadline).await?;
         let memory = self.memory.clone();
         let read = move |_: &mut dyn Interrupt| Ok(Batch::read(sent, &names, named, memory));
@@ -370,7 +370,7 @@ impl Answer {
 }
 
 /// Notes what is wrong with a batch, but for its items.
-fn check_batch(object: &Object<'_, '_>, model: &Model, learner: Option<&Ready>, faults: &mut Faults) {
+fn check_batch(object: &Object<'_, '_>, model: &Model, learner: Option<&LearnerState>, faults: &mut Faults) {
     if let Some(place) = object.required("items", faults)
         && let Some(items) = place.array(faults)
     {
@@ -399,7 +399,7 @@ fn check_items(model: &Model, items: &[Value], place: &Place<'_, '_>, faults: &m
 fn read_shared(
     object: &Object<'_, '_>,
     model: &Model,
-    learner: Option<&Ready>,
+    learner: Option<&LearnerState>,
     faults: &mut Faults,
 ) -> Option<(Weights, Options)> {
     let options = Options::read(object, model, &Options::default(), faults);

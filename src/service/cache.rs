@@ -59,14 +59,14 @@ impl MapperCache {
         Self { cache, oversized: Mutex::default() }
     }
 
-    /// Lets as many large models go that nobody searches now as give back `n_bytes`, or none if all of them would not. Gives them, to be freed
-    /// where nobody waits for it. Small ones stay: whoever asks for much memory does not keep others waiting for theirs.
+    /// Evicts large models that nobody searches now until `n_bytes` are given back; none if all of them together have less. Returns them, so
+    /// that the caller frees them where nobody waits. Small models stay, as many requests would have to compile them again.
     #[must_use]
     pub(super) fn make_room(&self, n_bytes: u64) -> Vec<Arc<Mapper>> {
         let mut oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner);
         let idle_oversized = oversized.as_ref().filter(|(_, mapper)| Arc::strong_count(mapper) == 1);
         let oversized_bytes = idle_oversized.map_or(0, |(_, mapper)| mapper.size_bytes() as u64);
-        // One is the cache's, one that of whoever looks.
+        // One reference is the cache's, one is the iterator's.
         let idle =
             self.cache.iter().filter(|(_, kept)| kept.size_bytes > SMALL_BYTES && Arc::strong_count(&kept.mapper) == 2);
         let idle: Vec<(ModelKey, u64)> = idle.map(|(key, kept)| (key, kept.size_bytes)).collect();
@@ -108,7 +108,7 @@ impl MapperCache {
         // The cache keeps nothing that exceeds its hot part, most of it.
         if self.cache.peek(key).is_none() && mapper.size_bytes() as u64 > self.cache.capacity() / 2 {
             let kept = (key.clone(), Arc::clone(mapper));
-            // What it replaces may take long to free, which nobody should wait for with the lock in hand.
+            // What it replaces may take long to free: not while the lock is held.
             let replaced = self.oversized.lock().unwrap_or_else(PoisonError::into_inner).replace(kept);
             drop(replaced);
         }
@@ -167,7 +167,7 @@ mod tests {
         cache.insert(&key("growing"), &growing);
         let object = json!({"model": "m", "demonstration": [{"x": 0}, {"x": 8}]});
         let mut faults = Faults::default();
-        let object = Place::root(&object).object(&Request::FIELDS, &mut faults).unwrap();
+        let object = Place::root(&object).object(Request::FIELDS, &mut faults).unwrap();
         let request = Request::read(growing.model(), &object, &mut faults).unwrap();
         growing.map(&request.problem, Settings::default(), &mut Uninterrupted).unwrap();
         assert!(growing.size_bytes() > size_bytes, "what it searched with is kept");
@@ -228,12 +228,12 @@ impl Etude {
         place: &Admission,
         deadline: Option<Instant>,
     ) -> Result<(String, Arc<Mapper>), ServiceError> {
-        // Before anything is read: what changes meanwhile makes what was read outdated.
+        // Read before anything else, so that a change meanwhile makes the entry outdated.
         let generation = self.store.models_generation();
         if let Some(known) = self.mapper_at_hand(name) {
             return Ok(known);
         }
-        // On the heap, as every request would carry along what only the first one for a model needs.
+        // Boxed, as only the first request for a model needs it, and the future of every request would have its size.
         let (hash, mapper) = Box::pin(self.mapper(name, pointer, Some(place), deadline)).await?;
         if let Some(generation) = generation {
             let key = ModelKey { hash: hash.clone(), is_lazy: mapper.model().is_lazy() };

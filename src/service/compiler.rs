@@ -6,7 +6,8 @@
 //! whoever asks meanwhile, without a place -------+ waits for it, until its deadline
 //! ```
 //!
-//! What was begun is finished, also if nobody waits for it any more: whoever asks again finds it. Whoever leaves leaves nothing behind.
+//! A compilation that was begun is finished even if nobody waits for it any more, so that the next request finds the model. A requester that
+//! goes away leaves no state behind.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -45,7 +46,7 @@ pub(super) struct Compiler {
     coming: Arc<Mutex<FxHashMap<ModelKey, Coming>>>,
 }
 
-/// Gives a model, or why there is none, once that is known.
+/// Completes with the model, or with why there is none.
 type Coming = watch::Receiver<Option<Result<Arc<Mapper>, Arc<ServiceError>>>>;
 
 /// A model is being made ready until this is dropped.
@@ -78,15 +79,15 @@ impl Compiler {
         self.coming.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Takes the memory for compiling what needs about `n_bytes`, in place of large models that nobody searches now if need be. It takes
-    /// time to free these.
+    /// Takes the memory for a compilation that needs about `n_bytes`. If there is too little, large models that nobody searches now are
+    /// evicted, which takes time.
     ///
     /// # Errors
     ///
     /// [`NoRoom`] if there is not so much.
     pub(super) fn take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
-        /// Where values differ from state to state, it takes up to three times what counts tell. Of what is free beyond that, half is
-        /// taken at most, as others search meanwhile; and given back once it is known what was needed.
+        /// Where values differ from state to state, compiling takes up to three times the estimate from the counts. At most half of the
+        /// memory that is free beyond the estimate is taken, as others search meanwhile; what was not needed is given back.
         const MOST_OF_COUNTED: u64 = 3;
         let beyond = self.memory.free_for_large().saturating_sub(n_bytes) / 2;
         let n_bytes = n_bytes + beyond.min((MOST_OF_COUNTED - 1) * n_bytes);
@@ -108,7 +109,7 @@ impl Compiler {
         limits: Limits,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapper, ServiceError> {
-        /// What was taken is a good guess, not more.
+        /// The memory that was taken is only an estimate.
         const SLACK_BYTES: u64 = 16 << 20;
         let max_bytes = usize::try_from(held.n_bytes() + SLACK_BYTES).unwrap_or(usize::MAX);
         let mut limited = LimitedTime::new(interrupt, self.max_time, self.clock.clone());
@@ -134,8 +135,8 @@ impl Compiler {
         if let Some(mapper) = self.cache.get(key) {
             return Ok(watch::channel(Some(Ok(mapper))).1);
         }
-        // However soon its first requester leaves, it waits for its turn.
-        let place = place.map(|place| place.clone().with_patience(None));
+        // It waits for its turn even if its first requester leaves.
+        let place = place.map(|place| place.clone().waiting_until(None));
         if let Some(place) = &place {
             place.take()?;
         }
@@ -161,12 +162,12 @@ impl Compiler {
         place: Option<Admission>,
     ) -> Result<Arc<Mapper>, ServiceError> {
         let unknown = || unknown(&name, None);
-        // Deleted and registered anew in between, it has another hash; then the next request finds that.
+        // If the model was deleted and registered anew in between, its hash differs, and the next request finds the new one.
         let row = self.store.model(&name).await?.filter(|row| row.summary.hash == key.hash).ok_or_else(unknown)?;
         let n_attributes = row.summary.attributes.len();
         let needed = |size: ModelSize| Model::compiled_bytes(size.n_states, size.n_transitions, n_attributes as u64);
         let n_bytes = row.summary.size.map_or(0, needed);
-        // Off the async threads, as it may free what takes long to be freed.
+        // Off the async threads, as freeing evicted models may take long.
         let compiler = self.clone();
         let taking = self.tasks.spawn_blocking(move || compiler.take(n_bytes));
         let held = taking.await.map_err(|_| PoolError::Panicked)??;
@@ -178,12 +179,12 @@ impl Compiler {
                 (ModelText::Packed(Box::new(|| Ok(Box::new(reader)))), Some(feed(&self.store, pieces, to_reader)))
             }
         };
-        // What it was found to be when it was registered, whatever the limit is now.
+        // Whether it is lazy was decided when it was registered, whatever the limit is now.
         let limits = if key.is_lazy { Limits { max_states: 0, ..Limits::NONE } } else { Limits::NONE };
         let compiler = self.clone();
         let ModelSummary { name: model, hash: expected, .. } = row.summary;
         let job = move |interrupt: &mut dyn Interrupt| {
-            // That of pieces is checked as they come.
+            // The hash of pieces is checked as they are read.
             if let ModelText::Whole(text) = &text
                 && let Err(error) = check_hash(&model, &hex(Sha256::digest(text)), &expected)
             {
@@ -192,7 +193,7 @@ impl Compiler {
             let definition = text.read(Format::Json, Limits::NONE, interrupt);
             Ok(match definition {
                 Ok(definition) => compiler.compile(definition, held, limits, interrupt),
-                // What was once accepted is read again without faults.
+                // A definition that was accepted has no faults, unless the row is damaged.
                 Err(ReadError::Cancelled(_)) => Err(PoolError::Stopped.into()),
                 Err(error) => Err(corrupt_definition(&model, error.into())),
             })
@@ -218,7 +219,7 @@ impl Compiler {
     /// Puts a model that has just been compiled into the cache.
     pub(super) async fn put(&self, key: ModelKey, mapper: &Arc<Mapper>) {
         let (cache, mapper) = (Arc::clone(&self.cache), Arc::clone(mapper));
-        // Off the async threads, as what makes room for it may take long to be freed. It does not fail.
+        // Off the async threads, as freeing evicted models may take long. It does not fail.
         let _ = self.tasks.spawn_blocking(move || cache.insert(&key, &mapper)).await;
     }
 }
@@ -238,7 +239,7 @@ fn shared(error: &ServiceError, name: &str, pointer: &'static str) -> ServiceErr
         ServiceError::Store(StoreError::Corrupt { source, .. }) | ServiceError::Unreadable { source, .. } => {
             corrupt_definition(name, source.to_string().into())
         }
-        // Nothing else comes of compiling.
+        // Compiling fails in no other way.
         error => corrupt_definition(name, error.to_string().into()),
     }
 }
@@ -254,7 +255,7 @@ async fn feed(store: &Store, mut pieces: DefinitionReader, to_reader: PipeWriter
     Ok(())
 }
 
-/// Ends what takes too long, not counting the time in which it makes way for others.
+/// An interrupt with a time limit, which does not count the time in which the job makes way for others.
 pub(super) struct LimitedTime<'i> {
     inner: &'i mut dyn Interrupt,
     clock: Clock,

@@ -71,9 +71,9 @@ pub struct Difference {
     pub replayed: Distribution,
 }
 
-/// A learner that is ready to be drawn from.
+/// A learner with the last version of its weights.
 #[derive(Clone, Debug)]
-pub(super) struct Ready {
+pub(super) struct LearnerState {
     pub(super) sequence: i64,
     pub(super) name: String,
     pub(super) learner: Learner,
@@ -148,7 +148,7 @@ impl Etude {
     ///
     /// If there is no such learner, or it never had that version.
     pub async fn weights(&self, name: &Name, version: Option<u64>) -> Result<WeightsAnswer, ServiceError> {
-        let Ready { sequence, learner, weights, .. } = self.ready(name.as_str(), None).await?;
+        let LearnerState { sequence, learner, weights, .. } = self.learner_state(name.as_str(), None).await?;
         let weights = match version {
             Some(version) if version != weights.version => {
                 let found = self.store.weights(sequence, version).await?;
@@ -184,7 +184,7 @@ impl Etude {
     pub async fn learn(&self, name: &str, now: Timestamp) -> Result<WeightsAnswer, ServiceError> {
         // One at a time: two that fold the same rewards would make the same version.
         let _learning = self.learning.lock().await;
-        let Ready { sequence, learner, weights, .. } = self.ready(name, None).await?;
+        let LearnerState { sequence, learner, weights, .. } = self.learner_state(name, None).await?;
         let mut distribution = weights.distribution.clone();
         let mut reward_order = weights.reward_order;
         self.store
@@ -201,7 +201,7 @@ impl Etude {
             WeightsRecord { version: weights.version + 1, reward_order, distribution, updated_at: as_stored(now) };
         if self.store.fold_rewards(sequence, folded.clone()).await? == Fold::Outdated {
             // Deleted meanwhile, or another process has learned; what that made is as good.
-            let Ready { learner, weights, .. } = self.ready(name, None).await?;
+            let LearnerState { learner, weights, .. } = self.learner_state(name, None).await?;
             return Ok(weights_answer(name, &learner, weights));
         }
         let n_rewards = reward_order - weights.reward_order;
@@ -274,17 +274,21 @@ impl Etude {
     ///
     /// If there is none.
     pub async fn learned(&self, name: &Name) -> Result<(LearnerDocument, WeightsAnswer), ServiceError> {
-        let Ready { learner, weights, .. } = self.ready(name.as_str(), None).await?;
+        let LearnerState { learner, weights, .. } = self.learner_state(name.as_str(), None).await?;
         let definition = learner.clone().starting_from(weights.distribution.clone()).document();
         Ok((definition, weights_answer(name.as_str(), &learner, weights)))
     }
 
     /// The learner called `name` with the last version of its weights. `pointer` is where a request names it.
-    pub(super) async fn ready(&self, name: &str, pointer: Option<&'static str>) -> Result<Ready, ServiceError> {
+    pub(super) async fn learner_state(
+        &self,
+        name: &str,
+        pointer: Option<&'static str>,
+    ) -> Result<LearnerState, ServiceError> {
         let found = self.store.learner_and_weights(name).await?;
         let (row, weights) = found.ok_or_else(|| unknown(name, pointer))?;
         let learner = read_definition(&row)?;
-        Ok(Ready { sequence: row.sequence, name: row.name, learner, weights })
+        Ok(LearnerState { sequence: row.sequence, name: row.name, learner, weights })
     }
 
     pub(super) async fn learner_row(&self, name: &Name) -> Result<LearnerRecord, ServiceError> {
@@ -304,7 +308,7 @@ fn checked_definition(row: &LearnerRecord) -> Result<&str, ServiceError> {
     Err(ServiceError::unreadable("learners", "definition", &row.name, "it is not what its hash is of"))
 }
 
-/// What was once accepted is read again without faults.
+/// Reads a definition that was accepted before, and so has no faults unless the row is damaged.
 fn read_definition(row: &LearnerRecord) -> Result<Learner, ServiceError> {
     let corrupt = |error| ServiceError::unreadable("learners", "definition", &row.name, error);
     let document = document::parse(checked_definition(row)?.as_bytes()).map_err(|error| corrupt(error.to_string()))?;

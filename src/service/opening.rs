@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU32;
 
-use super::learners::Ready;
+use super::learners::LearnerState;
 use super::requests::{Names, base_weights};
 use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Object, Path};
@@ -53,7 +53,7 @@ pub(super) struct SessionOptions {
 /// Reads what needs the model, after the `general` options; the session's window may take about `max_bytes`.
 pub(super) fn read(
     mapper: &Mapper,
-    learner: Option<&Ready>,
+    learner: Option<&LearnerState>,
     general: Option<Options>,
     object: &Object<'_, '_>,
     max_bytes: usize,

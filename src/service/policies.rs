@@ -4,7 +4,7 @@ use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
 use uuid::Uuid;
 
-use super::learners::Ready;
+use super::learners::LearnerState;
 use super::requests::{Named, SentRequest, base_weights, check_request};
 use super::search::{Extent, MAX_INLINE_BYTES, Searched, follow, is_quick, max_quick_observations};
 use super::{Caller, Etude, ServiceError};
@@ -37,14 +37,15 @@ impl Etude {
         let body = body.into();
         let id = Uuid::now_v7().to_string();
         let stamp = Stamp { id: Some(id.clone()), ..Stamp::default() };
-        let weights = |model: &Model, learner: Option<&Ready>, faults: &mut Faults| {
+        let weights = |model: &Model, learner: Option<&LearnerState>, faults: &mut Faults| {
             base_weights(model, learner, faults).map(|weights| (weights, ()))
         };
         let searched = self.search(RequestKind::Policy, &body, stamp, caller, weights).await?;
         let Some((searched, ())) = searched else {
-            let check = |object: &Object<'_, '_>, model: &Model, learner: Option<&Ready>, faults: &mut Faults| {
-                check_request(object, model, |faults| base_weights(model, learner, faults), faults);
-            };
+            let check =
+                |object: &Object<'_, '_>, model: &Model, learner: Option<&LearnerState>, faults: &mut Faults| {
+                    check_request(object, model, |faults| base_weights(model, learner, faults), faults);
+                };
             return Err(Box::pin(self.explain(RequestKind::Policy, body, caller, check)).await);
         };
         // The next request can be read to where this one stands, while the disk writes.
@@ -67,7 +68,7 @@ impl Etude {
         body: &Bytes,
         stamp: Stamp,
         caller: Caller,
-        weights: impl FnOnce(&Model, Option<&Ready>, &mut Faults) -> Option<(Weights, T)> + Send + 'static,
+        weights: impl FnOnce(&Model, Option<&LearnerState>, &mut Faults) -> Option<(Weights, T)> + Send + 'static,
     ) -> Result<Option<(Searched, T)>, ServiceError> {
         let place = self.pool.admit_when_needed(caller.client);
         let Some(sent) = self.read_sent(kind, body, &place).await? else { return Ok(None) };
@@ -75,7 +76,7 @@ impl Etude {
         let names = names.filter(|names| faults.is_empty() && names.over_limits.is_empty());
         let Some(names) = names else { return Ok(None) };
         let deadline = self.deadline(&names, caller.arrived);
-        let place = place.with_patience(deadline);
+        let place = place.waiting_until(deadline);
         let named = self.find(&names, faults, &place, deadline).await?;
         let stamp = names.stamp(stamp, &named);
         let model = named.mapper.model();
@@ -120,7 +121,7 @@ fn search_sent<T>(
     sent: &SentRequest,
     demonstration: Option<Demonstration>,
     named: &Named,
-    weights: impl FnOnce(&Model, Option<&Ready>, &mut Faults) -> Option<(Weights, T)>,
+    weights: impl FnOnce(&Model, Option<&LearnerState>, &mut Faults) -> Option<(Weights, T)>,
     stamp: Stamp,
     (memory, extent): (&Memory, Extent),
     interrupt: &mut dyn Interrupt,
@@ -226,7 +227,7 @@ mod tests {
         let sent = SentRequest::read(RequestKind::Policy, &document.to_string().into(), &memory).unwrap().unwrap();
         let named = Named { learner: None, model_hash: "hash".to_owned(), mapper };
         let stamp = Stamp { model: "m".to_owned(), ..Stamp::default() };
-        let weights = |model: &Model, learner: Option<&Ready>, faults: &mut Faults| {
+        let weights = |model: &Model, learner: Option<&LearnerState>, faults: &mut Faults| {
             Some((base_weights(model, learner, faults)?, ()))
         };
         let extent = (&memory, Extent::Any);

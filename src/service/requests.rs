@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use serde_json::Value;
 use tokio_util::bytes::Bytes;
 
-use super::learners::Ready;
+use super::learners::LearnerState;
 use super::search::{MAX_INLINE_BYTES, max_quick_observations, take_for_demonstration};
 use super::{Admission, Caller, Etude, PoolError, ServiceError};
 use crate::memory::{Held, Memory};
@@ -127,7 +127,7 @@ pub(super) struct Names {
 
 /// What a request names.
 pub(super) struct Named {
-    pub(super) learner: Option<Ready>,
+    pub(super) learner: Option<LearnerState>,
     pub(super) model_hash: String,
     pub(super) mapper: Arc<Mapper>,
 }
@@ -138,7 +138,7 @@ impl Names {
         let stamp = Stamp { model: self.model.clone(), model_hash: named.model_hash.clone(), ..stamp };
         match &named.learner {
             None => stamp,
-            Some(Ready { name, weights, .. }) => {
+            Some(LearnerState { name, weights, .. }) => {
                 Stamp { learner: Some(name.clone()), weights_version: Some(weights.version), ..stamp }
             }
         }
@@ -215,7 +215,7 @@ impl Etude {
         deadline: Option<Instant>,
     ) -> Result<Named, ServiceError> {
         let learner = match &names.learner {
-            Some(learner) => self.ready(learner, Some("/learner")).await.map(Some),
+            Some(learner) => self.learner_state(learner, Some("/learner")).await.map(Some),
             None => Ok(None),
         };
         let mapper = self.known_mapper(&names.model, "/model", place, deadline).await;
@@ -237,7 +237,7 @@ impl Etude {
         kind: RequestKind,
         body: Bytes,
         caller: Caller,
-        check: impl FnOnce(&Object<'_, '_>, &Model, Option<&Ready>, &mut Faults) + Send + 'static,
+        check: impl FnOnce(&Object<'_, '_>, &Model, Option<&LearnerState>, &mut Faults) + Send + 'static,
     ) -> ServiceError {
         match self.faults_of(kind, body, caller, check).await {
             // Another model was given this name meanwhile, for which nothing is wrong.
@@ -252,7 +252,7 @@ impl Etude {
         kind: RequestKind,
         body: Bytes,
         caller: Caller,
-        check: impl FnOnce(&Object<'_, '_>, &Model, Option<&Ready>, &mut Faults) + Send + 'static,
+        check: impl FnOnce(&Object<'_, '_>, &Model, Option<&LearnerState>, &mut Faults) + Send + 'static,
     ) -> Result<Faults, ServiceError> {
         let place = self.pool.admit_when_needed(caller.client);
         let is_small = body.len() <= MAX_INLINE_BYTES;
@@ -261,7 +261,7 @@ impl Etude {
         // With the help of the model, more faults may be found; so those found without it wait.
         let Some(names) = names else { return Ok(faults) };
         let deadline = self.deadline(&names, caller.arrived);
-        let place = place.with_patience(deadline);
+        let place = place.waiting_until(deadline);
         let Named { learner, mapper, .. } = self.find(&names, faults, &place, deadline).await?;
         let n_observations = n_observations(&document);
         let is_quick = is_small && n_observations <= max_quick_observations(mapper.model());
@@ -314,9 +314,9 @@ pub(super) async fn parse(
 }
 
 /// The weights from which a request starts: the means of its learner, or the model's own.
-pub(super) fn base_weights(model: &Model, learner: Option<&Ready>, faults: &mut Faults) -> Option<Weights> {
+pub(super) fn base_weights(model: &Model, learner: Option<&LearnerState>, faults: &mut Faults) -> Option<Weights> {
     let schema = model.schema();
-    let Some(Ready { learner, weights, .. }) = learner else { return Some(schema.weights()) };
+    let Some(LearnerState { learner, weights, .. }) = learner else { return Some(schema.weights()) };
     let learned = learner.weights_for(schema, &weights.distribution.mean);
     learned.map_err(|missing| faults.note_at(&Path::Member(&Path::Root, "learner"), missing.to_string())).ok()
 }

@@ -8,7 +8,7 @@ use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
 use uuid::Uuid;
 
-use super::learners::{Ready, unknown};
+use super::learners::{LearnerState, unknown};
 use super::requests::check_request;
 use super::search::{Searched, write};
 use super::{Caller, Etude, Name, PoolError, ServiceError, as_stored};
@@ -62,7 +62,7 @@ impl Etude {
         caller: Caller,
     ) -> Result<TrialAnswer, ServiceError> {
         let body = body.into();
-        let Ready { sequence, name, learner, weights } = self.ready(name.as_str(), None).await?;
+        let LearnerState { sequence, name, learner, weights } = self.learner_state(name.as_str(), None).await?;
         let numbers = self.store.trial_numbers(sequence).await?;
         let id = Uuid::now_v7().to_string();
         let (policy_id, weights_version) = (Uuid::now_v7().to_string(), weights.version);
@@ -75,7 +75,7 @@ impl Etude {
         let (lease_s, learner) = (learner.lease_s(), Arc::new(learner));
         let draw = {
             let learner = Arc::clone(&learner);
-            move |model: &Model, _: Option<&Ready>, faults: &mut Faults| {
+            move |model: &Model, _: Option<&LearnerState>, faults: &mut Faults| {
                 check_attributes(&learner, model, faults);
                 // A request with faults takes no number: the next trial is the same as if it had not been made.
                 if !faults.is_empty() {
@@ -89,7 +89,7 @@ impl Etude {
         };
         let searched = self.search(RequestKind::Trial, &body, stamp, caller, draw).await?;
         let Some((searched, (number, weights))) = searched else {
-            let check = move |object: &Object<'_, '_>, model: &Model, _: Option<&Ready>, faults: &mut Faults| {
+            let check = move |object: &Object<'_, '_>, model: &Model, _: Option<&LearnerState>, faults: &mut Faults| {
                 let weights = |faults: &mut Faults| {
                     check_attributes(&learner, model, faults);
                     None
@@ -144,8 +144,13 @@ impl Etude {
     }
 
     /// Draws a trial for a policy that is still in the making. The caller stores it.
-    pub(super) async fn draw(&self, ready: &Ready, schema: &Schema, now: Timestamp) -> Result<Draw, ServiceError> {
-        let Ready { sequence, learner, weights, .. } = ready;
+    pub(super) async fn draw(
+        &self,
+        ready: &LearnerState,
+        schema: &Schema,
+        now: Timestamp,
+    ) -> Result<Draw, ServiceError> {
+        let LearnerState { sequence, learner, weights, .. } = ready;
         let numbers = self.store.trial_numbers(*sequence).await?;
         let number = numbers.take();
         let drawn = learner.draw(&weights.distribution, number);

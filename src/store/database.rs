@@ -1,14 +1,14 @@
-//! The files of the database, and the ways to them.
+//! The files of the database, and the connections to it.
 //!
 //! ```text
-//! etude.db       0600, as are the others; its identity (device and inode) is that of the first look at it
+//! etude.db       0600, as are the others; its identity is the device and inode found when it was first opened
 //! etude.db-lock  locked by the process that writes, for as long as it lives
 //! etude.db-wal, etude.db-shm: SQLite's
 //! ```
 //!
-//! The first way that a writer gets is the one by which the database is looked at: whose it is, whether it is whole, whether it has this
-//! version's schema. Where nothing can be written, the database is read all the same if that can be: until a writer gets its way.
-//! The file of the database is never opened here but by SQLite, which would lose its locks if another descriptor were closed.
+//! The writer's first connection checks the database: whose it is, whether it is whole, and whether it has this version's schema. While
+//! nothing can be written, the database is only read, until a connection that writes can be opened. Only SQLite opens the file of the
+//! database: its locks would be lost if another descriptor of the file were closed.
 
 mod files;
 mod readers;
@@ -30,16 +30,16 @@ pub(super) use readers::N_READERS;
 pub(super) use readers::{Readers, checkpoint};
 use readers::{look_at, options, readers};
 
-/// Pages of the log, of 4 KiB, over which a commit copies it itself. That is rare: readers do it beside the writer before, but cannot
-/// come to its end as long as others write, and only then it begins anew.
+/// Size of the log, in pages of 4 KiB, from which on a commit copies it itself. That is rare, as a reader copies it beside the writer
+/// before. But a reader cannot copy the end of the log while others write, and the log begins anew only once all of it was copied.
 const MAX_LOG_PAGES: &str = "16384";
 
 /// Whether others are kept from the database.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Locking {
-    /// By a lock on the file beside it.
+    /// Other processes are kept out, by a lock on the file beside the database.
     Exclusive,
-    /// Not, as there are none.
+    /// They are not.
     None,
 }
 
@@ -48,22 +48,22 @@ pub(super) enum Locking {
 pub(super) struct Database {
     path: PathBuf,
     locking: Locking,
-    /// Held while this lives.
+    /// The file that is locked while this lives.
     lock: Option<File>,
-    /// `None` until there is a file.
+    /// The file of the database. `None` until there is one.
     identity: Option<Identity>,
-    /// That of the log, which is there as long as any way to the database is open.
+    /// The file of the log, which exists while any connection is open.
     log_identity: Option<Identity>,
-    /// Whether a writer has had its way, and with it the look at the database; since then, there are ways to read that go with it.
+    /// Whether a connection that writes was opened, and the database checked by it. Since then, the readers are opened beside it.
     is_looked_at: bool,
-    /// Whether there is a log: not where memory cannot be shared between processes.
+    /// Whether there is a log. There is none where processes cannot share memory.
     has_log: bool,
-    /// `None` until there is a way to read.
+    /// `None` until the database could be read.
     readers: Option<Arc<Readers>>,
 }
 
 impl Database {
-    /// The database at `path`, which is resolved now: whatever becomes of the working directory or of links later.
+    /// The database at `path`. Links and the working directory are resolved now, and may change later.
     ///
     /// # Errors
     ///
@@ -75,7 +75,7 @@ impl Database {
         Ok(Self { path, locking, lock, identity, log_identity, is_looked_at: false, has_log: false, readers })
     }
 
-    /// The ways to read.
+    /// The connections that read.
     ///
     /// # Errors
     ///
@@ -84,11 +84,11 @@ impl Database {
         self.readers.clone().ok_or(StoreError::Closed)
     }
 
-    /// Opens a way to write, and ways to read beside it.
+    /// Opens a connection that writes, and at the first time the readers.
     ///
     /// # Errors
     ///
-    /// [`StoreError::Unavailable`] if it may go through later; whatever else speaks against using the database.
+    /// [`StoreError::Unavailable`] if it may go through later; another error if the database cannot be used at all.
     pub(super) async fn connect(&mut self) -> Result<SqliteConnection, StoreError> {
         match self.try_connect().await {
             Err(error) => Err(self.diagnose(error).await),
@@ -109,12 +109,12 @@ impl Database {
             }
             return Ok(connection);
         };
-        // The ways to read that there are without a writer keep its own from being opened as they should, and take locks away when they
-        // are closed. So that is done first, once it looks as if it were worth it, and undone if it was not.
+        // Readers that were opened without a writer keep the writer's connection from being opened as it should, and closing them later
+        // would take locks away. So they are closed first, if something can be written now, and opened again if the writer fails.
         let probed = probe_aside(&self.path).await;
         let mut place = readers.pool.write().await;
         if let Err(unavailable) = probed {
-            // Where that was tried before, and then there were not even ways to read.
+            // An earlier attempt has closed the readers, and could not open them again.
             if place.is_closed() {
                 *place = self.look_at(Depth::Schema).await?;
             }
@@ -131,7 +131,7 @@ impl Database {
         connection
     }
 
-    /// Opens a way to write, and for the first of them, ways to read that go with it.
+    /// Opens a connection that writes, and with the first one the readers.
     async fn open(&mut self) -> Result<(SqliteConnection, Option<SqlitePool>), StoreError> {
         let writing = options(&self.path).synchronous(SqliteSynchronous::Full);
         let mut connection = writing.pragma("wal_autocheckpoint", MAX_LOG_PAGES).connect().await?;
@@ -155,7 +155,8 @@ impl Database {
         let mode: String = sqlx::query_scalar("PRAGMA journal_mode = WAL").fetch_one(&mut *connection).await?;
         self.has_log = mode == "wal";
         schema::migrate(connection).await?;
-        // A file that can only be read has been opened all the same. That it is locked is no reason not to have it open.
+        // SQLite opens a file that can only be read without an error, so a write is tried. If the file is merely locked, the connection
+        // is good.
         let written =
             sqlx::query("UPDATE service SET last_alive_ms = last_alive_ms WHERE FALSE").execute(&mut *connection);
         match written.await.map_err(StoreError::from) {
@@ -169,11 +170,11 @@ impl Database {
         Ok(Some(readers))
     }
 
-    /// Opens ways to read, which leave the database and its directory as they are as far as can be.
+    /// Opens readers only. The database and its directory are left as they are, as far as SQLite can.
     ///
     /// # Errors
     ///
-    /// If it cannot be read, or not be understood without being changed.
+    /// If the database cannot be read, or would have to be changed first.
     pub(super) async fn read_only(&mut self, depth: Depth) -> Result<(), StoreError> {
         let pool = self.look_at(depth).await?;
         self.readers = Some(Arc::new(Readers { pool: RwLock::new(pool) }));
@@ -183,21 +184,21 @@ impl Database {
     async fn look_at(&self, depth: Depth) -> Result<SqlitePool, StoreError> {
         let options = options(&self.path).read_only(true);
         match look_at(options.clone(), depth).await {
-            // Without room for the memory that is shared, or leave to make the file for it, only a file that nobody writes to can be
-            // read: as it is, without what its log has.
+            // SQLite cannot make its `-shm` file: no room, or no permission. Then the database can only be read as a file that nobody
+            // writes to, without its log, which must be empty.
             Err(StoreError::Unavailable(_)) if self.is_log_empty() => look_at(options.immutable(true), depth).await,
             pool => pool,
         }
     }
 
-    /// Makes sure that what was just written is in the database's file and its log, as whoever opens them by their names finds them.
+    /// Makes sure that the files just written to are still the ones that have the names of the database and of its log.
     ///
     /// # Errors
     ///
     /// [`Unavailable::Gone`] if not.
     pub(super) fn check_written(&mut self) -> Result<(), StoreError> {
         if self.has_log && self.log_identity.is_none() {
-            // From now on it stays, as readers have it open.
+            // From now on the log stays, as readers have it open.
             self.log_identity = Some(Identity::of(&self.beside("-wal")).map_err(|_| Unavailable::Gone)?);
         }
         self.check_files()
@@ -216,24 +217,24 @@ impl Database {
         }
     }
 
-    /// Closes a way to write, however that ends: what was not committed is undone by whoever opens the database next.
+    /// Closes the connection that writes, and ignores an error of that: whoever opens the database next undoes what was not committed.
     pub(super) async fn disconnect(&mut self, connection: SqliteConnection) {
         let was_there = self.check_files().is_ok();
         let _ = connection.close().await;
-        // Whoever closes the last way to the database removes its log, of which nothing is left to be done then.
+        // The last connection that is closed removes the log, after everything in it was copied.
         if was_there && self.is_log_missing() {
             self.log_identity = None;
         }
     }
 
-    /// What is behind an error of SQLite, as far as can be found out.
+    /// The cause of an error of SQLite, as far as can be found out.
     pub(super) async fn diagnose(&self, error: StoreError) -> StoreError {
         let StoreError::Unavailable(unavailable) = error else { return error };
         if self.check_files().is_err() {
             return Unavailable::Gone.into();
         }
         if let Unavailable::Failing { .. } = unavailable {
-            // A disk that has no room is not always told from one that fails otherwise.
+            // SQLite does not always tell a full disk from one that fails.
             return probe_aside(&self.path).await.err().unwrap_or(unavailable).into();
         }
         unavailable.into()
@@ -244,7 +245,7 @@ impl Database {
             return Ok(());
         }
         let path = self.beside("-lock");
-        // Not truncated, as nothing is in it. It stays when the process ends: whoever removed it could remove another's.
+        // The file stays when the process ends: if it were removed, it could be another process's lock by then.
         let opened = OpenOptions::new().write(true).create(true).truncate(false).mode(MODE).open(&path);
         let opened = opened.or_else(|error| if is_read_only(&error) { File::open(&path) } else { Err(error) });
         let file = opened.map_err(|source| match unavailable(&source) {
@@ -261,7 +262,7 @@ impl Database {
         }
     }
 
-    /// Keeps others from files that were there before, and that only this process writes to.
+    /// Takes the permissions of other users from files that were there before and that only this process writes to.
     fn keep_from_others(&self) {
         if self.locking == Locking::None {
             return;
@@ -282,7 +283,7 @@ impl Database {
         }
     }
 
-    /// Makes an empty file, which is an empty database; others by SQLite have its mode.
+    /// Makes an empty file, which is an empty database. SQLite gives the files beside it the same mode.
     fn create(&mut self) -> Result<(), StoreError> {
         let made = OpenOptions::new().write(true).create_new(true).mode(MODE).open(&self.path);
         match made {
@@ -308,7 +309,7 @@ impl Database {
         fs::metadata(self.beside("-wal")).is_err_and(|error| error.kind() == ErrorKind::NotFound)
     }
 
-    /// The file beside the database whose name ends so.
+    /// The file beside the database whose name has this suffix.
     fn beside(&self, end: &str) -> PathBuf {
         let mut name = self.path.clone().into_os_string();
         name.push(end);

@@ -7,9 +7,9 @@
 //!    +------ reads ----------------> pool of readers (query_only), one of which copies the log to the database now and then
 //! ```
 //!
-//! A write that was answered is on disk, in the file that has the database's name. Where nothing can be written, reading goes on. Rows become domain types here and nowhere else; times are milliseconds since 1970,
-//! documents are JSON text, in compressed pieces where it is long. Of a policy, what could be told from the rest is left out, and
-//! put back when it is read.
+//! A write that was answered is on disk, in the file that has the database's name. While nothing can be written, reading goes on. Rows
+//! become domain types here and nowhere else. Times are milliseconds since 1970; documents are JSON text, long ones in compressed pieces.
+//! Members of a policy that follow from others are not stored, and computed when it is read.
 
 mod alive;
 mod arrivals;
@@ -98,7 +98,7 @@ impl Store {
                 if database.is_empty() {
                     return Err(StoreError::Create { path: path.to_owned(), source: io::Error::other(unavailable) });
                 }
-                // What cannot be read either says less than this.
+                // If it cannot be read either, the first error says more.
                 if database.read_only(Depth::Whole).await.is_err() {
                     return Err(error);
                 }
@@ -140,17 +140,17 @@ impl Store {
 
     /// Takes no more reads or writes. Once the writer has ended, all that was written stands in a single file.
     pub async fn close(&self) {
-        // The last connection to be closed folds in the log; that must be the writer's.
+        // The last connection that is closed copies the log to the database, so the writer's must be the last.
         self.readers.close().await;
         self.writer.close();
     }
 
-    /// A way to read, for one statement after another.
+    /// A connection that reads.
     async fn reader(&self) -> Result<PoolConnection<Sqlite>, StoreError> {
         self.readers.one().await
     }
 
-    /// Another one whenever a model was registered or deleted, before whoever did so is told; `None` if that is not known now.
+    /// A number that changes whenever a model is registered or deleted, before that is answered; `None` if it is not known now.
     pub(crate) fn models_generation(&self) -> Option<u64> {
         self.writer.models_generation()
     }
@@ -171,7 +171,7 @@ impl Store {
     ///
     /// If not.
     pub async fn check(&self, clock: &Clock, every: Duration) -> Result<(), StoreError> {
-        // Whoever asks meanwhile is told the same.
+        // Callers that come meanwhile wait here, and are told the same.
         let mut checked = self.checked.lock().await;
         if let Some((at, known)) = *checked
             && clock.elapsed(at) < CHECK_EVERY

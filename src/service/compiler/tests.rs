@@ -63,7 +63,7 @@ async fn whoever_leaves_before_a_cold_model_is_ready_leaves_nothing_behind() {
     let mut others = Vec::new();
     for _ in 0..50 {
         let deadline = Some(Clock::system().instant());
-        let place = etude.pool().admit_when_needed(Client::LOCAL).with_patience(deadline);
+        let place = etude.pool().admit_when_needed(Client::LOCAL).waiting_until(deadline);
         let left = etude.mapper("world", "/model", Some(&place), deadline).await;
         assert!(matches!(left, Err(ServiceError::Compiling { .. })), "{left:?}");
     }

@@ -7,14 +7,15 @@
 //! ```
 //!
 //! A job is admitted while there is a place for its client, waits for its turn, and runs on a thread. What has run for longer than a
-//! [`MOMENT`](place::MOMENT) may hold all threads but some, and makes way for the long jobs of other clients: it keeps what it has done and waits for its
-//! next turn, so that small requests are answered while any number of large ones run. Whoever waits for a job may go away at
-//! any time: it then leaves the queue, or is told to stop when it next asks its [`Interrupt`].
+//! [`MOMENT`](place::MOMENT) is *long*. Long jobs never hold all threads, and make way for those of other clients: a job that makes way
+//! keeps its progress and waits for its next turn. So small requests are answered while any number of large ones run. If the caller of a
+//! job goes away, the job leaves the queue, or is told to stop when it next asks its [`Interrupt`].
 //!
-//! Bodies are read on threads of their own, by the same rules, as how long a request may wait is written in its body. A job that has
-//! to be answered by some time runs beside the pool if it has waited until then: to finish at once is all that it can do. What
-//! nobody waits for runs where there is a thread to spare, and is stopped as soon as somebody needs that. And a job that is over
-//! before a change of threads would have paid for itself runs where it is ([`SearchPool::run_here`]).
+//! - Bodies are read on threads of their own, by the same rules: a request's deadline is written in its body, so that nobody knows it
+//!   before.
+//! - A job whose deadline comes while it waits runs beside the pool. It can do nothing but finish at once.
+//! - A background job runs only while there is a spare thread, and is stopped as soon as another job needs that.
+//! - A job that is shorter than a change of threads runs on the caller's thread ([`SearchPool::run_here`]).
 
 mod place;
 mod threads;
@@ -32,13 +33,13 @@ use tokio_util::task::TaskTracker;
 use super::Client;
 use crate::clock::Clock;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
-use place::Place;
+use place::PoolPlace;
 use threads::{Threads, Turn};
 pub(crate) use turns::Places;
 use turns::{Class, Level};
 use watch::{Job, Watch, give_way};
 
-/// How long a job that nobody waits for may go on when it has taken the last thread: longer than most jobs keep theirs.
+/// How long a background job may go on once no thread is free: longer than most jobs keep theirs.
 const LAST_THREAD_KEPT: Duration = Duration::from_millis(100);
 
 /// Bodies over this size take longer than a moment to be read.
@@ -73,7 +74,7 @@ pub enum PoolError {
 #[derive(Clone, Debug)]
 pub struct SearchPool(Arc<Shared>);
 
-/// What all jobs share, which is counted as a whole, not part by part: every request has a place of its own.
+/// What all jobs share. It is behind one `Arc`, so that the clone that each request keeps is cheap.
 #[derive(Debug)]
 struct Shared {
     searching: Arc<Threads>,
@@ -111,7 +112,7 @@ impl SearchPool {
     /// A place in the pool for a request of `client`, which is taken with the first job that runs by it: small requests may need none.
     #[must_use]
     pub fn admit_when_needed(&self, client: Client) -> Admission {
-        Admission { pool: self.clone(), client, place: Arc::default(), patience: None }
+        Admission { pool: self.clone(), client, place: Arc::default(), wait_until: None }
     }
 
     /// Runs `job` for `client` when it is its turn, however many wait. For callers that are bounded in number themselves.
@@ -160,7 +161,7 @@ impl SearchPool {
         self.run_holding((held, turn), reading, |_| Ok(job())).await
     }
 
-    /// Runs `job`, which nobody waits for, if there is a thread to spare: of several, another one stays free when it begins.
+    /// Runs a background job, if there is a thread to spare: where there are several threads, one more stays free when it begins.
     ///
     /// # Errors
     ///
@@ -286,16 +287,16 @@ pub struct Admission {
     pool: SearchPool,
     client: Client,
     /// Once it is taken.
-    place: Arc<OnceLock<Arc<Place>>>,
-    /// Until when jobs wait for a thread.
-    patience: Option<Instant>,
+    place: Arc<OnceLock<Arc<PoolPlace>>>,
+    /// Until when jobs wait for a thread of the pool; `None` for as long as it takes.
+    wait_until: Option<Instant>,
 }
 
 impl Admission {
-    /// The same place, whose jobs wait for a thread of the pool until `patience` at most, and then run beside it.
+    /// The same place, whose jobs wait for a thread of the pool until `wait_until` at most, and then run on a thread beside it.
     #[must_use]
-    pub fn with_patience(self, patience: Option<Instant>) -> Self {
-        Self { patience, ..self }
+    pub fn waiting_until(self, wait_until: Option<Instant>) -> Self {
+        Self { wait_until, ..self }
     }
 
     /// Takes the place, if it was not taken before.
@@ -308,7 +309,7 @@ impl Admission {
     }
 
     /// The place, which is taken if it was not before.
-    fn place(&self) -> Result<Arc<Place>, PoolError> {
+    fn place(&self) -> Result<Arc<PoolPlace>, PoolError> {
         if let Some(place) = self.place.get() {
             return Ok(Arc::clone(place));
         }
@@ -316,7 +317,7 @@ impl Admission {
         if !threads.lines().turns.admit(self.client, Class::Short) {
             return Err(PoolError::Busy);
         }
-        let place = Place {
+        let place = PoolPlace {
             threads: Arc::clone(threads),
             client: self.client,
             is_long: AtomicBool::new(false),
@@ -354,10 +355,10 @@ impl Admission {
     {
         let (place, client) = (self.place()?, self.client);
         let waiting = self.pool.turn(&self.pool.0.searching, client, place.class(), place.level());
-        let turn = match self.patience {
+        let turn = match self.wait_until {
             None => Some(waiting.await?),
-            // Nothing if the patience ends first.
-            Some(patience) => tokio::time::timeout_at(patience.into(), waiting).await.ok().transpose()?,
+            // `None` if that time comes first.
+            Some(until) => tokio::time::timeout_at(until.into(), waiting).await.ok().transpose()?,
         };
         self.pool.run_holding((), Job { client, turn, place: Some(place), deadline }, job).await
     }

@@ -13,7 +13,7 @@ pub(super) const MOMENT: Duration = Duration::from_millis(10);
 
 /// A place in the pool, counted among the short or the long ones.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(super) struct PoolPlace {
     pub(super) threads: Arc<Threads>,
     pub(super) client: Client,
     pub(super) is_long: AtomicBool,
@@ -21,7 +21,7 @@ pub(super) struct Place {
     pub(super) spent_us: AtomicU64,
 }
 
-impl Place {
+impl PoolPlace {
     /// How long its jobs have run.
     pub(super) fn level(&self) -> Level {
         level(Duration::from_micros(self.spent_us.load(Ordering::Relaxed)))
@@ -45,7 +45,7 @@ impl Place {
     }
 }
 
-impl Drop for Place {
+impl Drop for PoolPlace {
     fn drop(&mut self) {
         self.threads.lines().turns.leave(self.client, self.class());
     }

@@ -160,7 +160,7 @@ async fn a_job_that_has_made_way_finishes_in_time_all_the_same() {
     let deadline = Clock::system().instant() + 10 * MOMENT;
     assert_eq!(place.clone().run(Some(deadline), until_cancelled).await, Ok(()));
     // Its request is long now, and would wait for the others.
-    let impatient = place.with_patience(Some(Clock::system().instant()));
+    let impatient = place.waiting_until(Some(Clock::system().instant()));
     assert_eq!(impatient.run(Some(deadline), until_cancelled).await, Ok(()));
     assert_eq!(pool.n_jobs(), 3, "the others still run");
 }

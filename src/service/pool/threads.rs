@@ -43,7 +43,7 @@ impl Threads {
         Self(Mutex::new(Lines { clock, turns, waiting: FxHashMap::default(), n_parked: 0 }))
     }
 
-    /// What a panic has left behind is whole.
+    /// The lines. A panic while they were locked leaves them whole.
     pub(super) fn lines(&self) -> MutexGuard<'_, Lines> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -101,7 +101,7 @@ impl Waiting {
                     self.ticket = None;
                     return Turn { threads: Arc::clone(&self.threads), class: self.class };
                 }
-                // Then a thread may be lent that was not before.
+                // By now long jobs may have been lent another thread.
                 () = tokio::time::sleep(LENT_AFTER), if self.class == Class::Long => self.threads.lines().pass_on(),
             }
         }
@@ -114,7 +114,7 @@ impl Drop for Waiting {
         let mut lines = self.threads.lines();
         lines.waiting.remove(&ticket);
         if !lines.turns.give_up(self.client, self.class, ticket) {
-            // It was granted, and nobody has noticed.
+            // Its turn was granted, but never used.
             lines.turns.stop(self.class);
         }
         lines.pass_on();

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 
-use super::place::{MOMENT, Place, level};
+use super::place::{MOMENT, PoolPlace, level};
 use super::threads::{Threads, Turn, Waiting};
 use super::turns::Class;
 use crate::clock::Clock;
@@ -24,17 +24,17 @@ const LOOK_EVERY: Duration = Duration::from_millis(1);
 /// Most jobs that have made way, each of which keeps a thread of the operating system; more are refused.
 const MAX_PARKED: usize = 256;
 
-/// Lets the threads that talk to clients and to the disk come before this one, from now on: they need little, and soon.
+/// Lowers the priority of this thread for good, so that threads which talk to clients and to the disk run first.
 pub(super) fn give_way() {
-    /// Where all processors are wanted, a thirtieth of what others have: a search that runs is then interrupted at once by a thread that has
-    /// an answer to send.
+    /// About a thirtieth of a normal thread's share while all processors are busy: a thread that has an answer to send then preempts a
+    /// search at once.
     const NICENESS: i32 = 15;
     thread_local! {
         static HAS_GIVEN_WAY: Cell<bool> = const { Cell::new(false) };
     }
     #[cfg(target_os = "linux")]
     if !HAS_GIVEN_WAY.replace(true) {
-        // Threads have priorities of their own here. Where this one keeps its, things are as they were.
+        // On Linux each thread has its own priority. If it cannot be set, the thread only competes with the others.
         let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
     }
 }
@@ -45,7 +45,7 @@ pub(super) struct Job {
     /// `None` beside the pool.
     pub(super) turn: Option<Turn>,
     /// `None` if its caller is bounded in number.
-    pub(super) place: Option<Arc<Place>>,
+    pub(super) place: Option<Arc<PoolPlace>>,
     pub(super) deadline: Option<Instant>,
 }
 

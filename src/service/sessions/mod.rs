@@ -230,7 +230,7 @@ impl Etude {
         };
         // Nobody says how long it may take.
         let deadline = caller.arrived.checked_add(time_until_finish(self.time_limits.default_deadline));
-        let place = self.pool.admit_when_needed(caller.client).with_patience(deadline);
+        let place = self.pool.admit_when_needed(caller.client).waiting_until(deadline);
         let (hash, mapper) = self.mapper(&row.model, "/model", Some(&place), deadline).await?;
         drop(place);
         // Registered anew, the same world may have become too large to be known in full.

@@ -26,7 +26,7 @@ impl Identity {
     }
 }
 
-/// The path without links, as SQLite names the files beside it; of a file that is not there yet, that of its directory.
+/// The path without links, by which SQLite names the files beside it. If there is no file yet, the links of its directory are resolved.
 pub(super) fn resolve(path: &Path) -> io::Result<PathBuf> {
     match fs::canonicalize(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => {}
@@ -37,7 +37,7 @@ pub(super) fn resolve(path: &Path) -> io::Result<PathBuf> {
     Ok(fs::canonicalize(directory)?.join(name))
 }
 
-/// Makes a file its owner's alone, if that is this process's user. Says whether it was not.
+/// Takes the permissions of others from a file of this process's user. Says whether they had any.
 pub(super) fn keep_from_others(path: &Path) -> io::Result<bool> {
     let file = match fs::symlink_metadata(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(false),
@@ -50,14 +50,14 @@ pub(super) fn keep_from_others(path: &Path) -> io::Result<bool> {
     Ok(is_to_be_kept)
 }
 
-/// Writes a little beside the database, and removes it, on a thread of its own, as a disk may take its time.
+/// Finds out whether the disk takes a temporary file beside the database, on a blocking thread, as a disk may be slow.
 pub(super) async fn probe_aside(path: &Path) -> Result<(), Unavailable> {
     let path = path.to_owned();
     tokio::task::spawn_blocking(move || probe(&path)).await.unwrap_or(Ok(()))
 }
 
 fn probe(path: &Path) -> Result<(), Unavailable> {
-    /// More than what is left over in a page of a full disk.
+    /// More than the last block of a full disk may have left.
     const N_BYTES: usize = 64 * 1024;
     let directory = path.parent().unwrap_or(Path::new("."));
     let written = tempfile::tempfile_in(directory).and_then(|mut file| {

@@ -1,4 +1,4 @@
-//! The ways to read, and what every way to the database has.
+//! Connections that read, and what all connections have in common.
 
 use std::path::Path;
 use std::time::Duration;
@@ -16,7 +16,7 @@ const BUSY_TIMEOUT: Duration = Duration::from_secs(5);
 /// Readers at the same time. Reads are short, and there are few cores. One of them copies the log now and then.
 pub(in crate::store) const N_READERS: u32 = 5;
 
-/// Statements that a connection keeps prepared: all that there are, those with a number of rows as often as there are numbers.
+/// Statements that a connection keeps prepared: enough for all. A statement for several rows counts once for each number of rows.
 const N_STATEMENTS: usize = 256;
 
 /// Copies what is in the log to the file of the database, as far as others let `connection`.
@@ -25,19 +25,19 @@ pub(in crate::store) async fn checkpoint(connection: &mut SqliteConnection) -> R
     Ok(())
 }
 
-/// The ways to read.
+/// The connections that read.
 #[derive(Debug)]
 pub(in crate::store) struct Readers {
-    /// Locked while one takes the place of another.
+    /// Locked for writing while another pool takes its place.
     pub(super) pool: RwLock<SqlitePool>,
 }
 
 impl Readers {
-    /// One of them, until it is dropped. While others take their place, these are waited for.
+    /// One of them, until it is dropped. While the pool is replaced, the new one is waited for.
     ///
     /// # Errors
     ///
-    /// If none comes free in time, or there are no more.
+    /// If none comes free in time, or the pool is closed.
     pub(in crate::store) async fn one(&self) -> Result<PoolConnection<Sqlite>, StoreError> {
         Ok(self.pool.read().await.acquire().await?)
     }
@@ -66,17 +66,17 @@ pub(super) fn options(path: &Path) -> SqliteConnectOptions {
         .disable_statement_logging()
 }
 
-/// Ways to read, all of them now, which stay: opened later, one could need room that there is none of, or find another file.
+/// Opens all readers now, and keeps them: one that is opened later could lack room on the disk, or find another file.
 pub(super) async fn readers(options: SqliteConnectOptions) -> Result<SqlitePool, StoreError> {
     let pool = SqlitePoolOptions::new().min_connections(N_READERS).max_connections(N_READERS);
-    // Until a connection has read, SQLite holds nothing open for it, and whoever closes another one may remove the log.
+    // SQLite opens the log with a connection's first read. Before that, closing another connection may remove it.
     let pool = pool.idle_timeout(None).max_lifetime(None).after_connect(|connection, _| {
         Box::pin(async move { sqlx::query("SELECT 1 FROM sqlite_schema").execute(connection).await.map(drop) })
     });
     Ok(pool.connect_with(options).await?)
 }
 
-/// Ways to read a database that is whole, and has this version's schema.
+/// Opens readers of a database that is whole, as far as `depth` asks, and has this version's schema.
 pub(super) async fn look_at(options: SqliteConnectOptions, depth: Depth) -> Result<SqlitePool, StoreError> {
     let mut connection = options.connect().await?;
     schema::check_version(&mut connection).await?;

@@ -15,13 +15,13 @@ pub(in crate::store) const MAX_LARGE_BYTES: usize = 512 << 10;
 /// Most requests that wait in a line. Beyond this, those who ask wait to get in line, which slows their clients down.
 pub(super) const MAX_WAITING: usize = 1024;
 
-/// What waits for the writer, in two lines. Those of a line are written in the order in which they came, and nothing is said about those
-/// of two.
+/// Requests that wait for the writer, in two lines. Requests of a line are written in the order in which they came; between the lines
+/// there is no order.
 #[derive(Debug)]
 pub(super) struct Lines {
     /// All of it goes into the next group.
     small: mpsc::Receiver<Job>,
-    /// A part of it goes into the next group. As whoever writes waits for the answer, all of them have their turns.
+    /// A part of it goes into the next group. Each caller waits for its answer before it writes again, so that all have their turns.
     large: mpsc::Receiver<Job>,
     closing: CancellationToken,
     has_small_ended: bool,
@@ -29,7 +29,7 @@ pub(super) struct Lines {
 }
 
 impl Lines {
-    /// The lines, and the ways to get in: that of what is small, and of what is large.
+    /// The lines, and their senders: for small requests, and for large ones.
     pub(super) fn new(closing: CancellationToken) -> (Self, [mpsc::Sender<Job>; 2]) {
         let (small_end, small) = mpsc::channel(MAX_WAITING);
         let (large_end, large) = mpsc::channel(MAX_WAITING);

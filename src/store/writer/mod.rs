@@ -1,14 +1,14 @@
 //! The one writer, which groups commits.
 //!
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies it in one
-//! transaction, and answers all of it after the commit. Before it takes it, it lets everybody go on who is ready to and may bring it
-//! more: so groups grow with the load, and nobody waits for a clock. What is small waits in a line of its own, and a group has all of
-//! it, but of what is large only about as much as a disk writes in no time: so nobody waits behind what others have sent. Observations, which are most of it, only arrive with a commit,
-//! and are settled in their table later (`arrivals`). A group of nothing but observations, or nothing but policies, takes a single
-//! statement, as each costs the driver a change of threads.
+//! transaction, and answers all of it after the commit. It yields once before it takes a group, so that ready tasks can enqueue: groups
+//! grow with the load, and no timer is needed. Small and large requests wait in lines of their own. A group takes all small requests, but
+//! only about a MiB of large ones, so that small requests never wait long behind large ones. Observations, which are most requests, are
+//! written to `arrivals` with a commit, and moved to their table later. A group of observations alone, or of policies alone, takes a
+//! single statement, as each statement costs the driver a change of threads.
 //!
-//! After an error nothing is known of the connection: a transaction may be open or not, whatever the driver has counted. So it is closed,
-//! and whoever writes next opens another. Nothing is acknowledged that is not in the file which has the database's name then.
+//! After an error the state of the connection is unknown: a transaction may still be open. So the connection is closed, and the next
+//! group opens another. A write is acknowledged only if the file that was written to still has the database's name.
 
 mod group;
 mod lines;
@@ -48,13 +48,13 @@ const LINE_TIMEOUT: Duration = Duration::from_secs(5);
 /// What is written to the log between two checkpoints, roughly: as much as SQLite itself lets be written.
 const CHECKPOINT_BYTES: usize = 4 << 20;
 
-/// What the writer copies itself, roughly, of what was logged meanwhile; if there is more, it is copied with the rest the next time.
+/// Most that the writer copies itself of what was logged during a checkpoint, roughly; more is left to the next checkpoint.
 const REST_BYTES: usize = 1 << 20;
 
 /// What a commit writes whatever it holds, roughly: four pages.
 const COMMIT_BYTES: usize = 16 << 10;
 
-/// The way to the writer.
+/// A handle to the writer.
 #[derive(Clone, Debug)]
 pub(super) struct Writer {
     small: mpsc::Sender<Job>,
@@ -63,7 +63,7 @@ pub(super) struct Writer {
     models_generation: ModelsGeneration,
 }
 
-/// The generation of models that the database has, as far as is known: read by whoever opens a way to write, and forgotten with that.
+/// The generation of models in the database, if it is known: read when the writer's connection is opened, and forgotten when it is closed.
 #[derive(Clone, Debug, Default)]
 struct ModelsGeneration(Arc<AtomicU64>);
 
@@ -81,8 +81,8 @@ impl ModelsGeneration {
 }
 
 impl Writer {
-    /// Starts the writer in `tasks`, with its way to the database if there is one yet, and ways to read beside it. It ends when it is
-    /// closed or dropped, and everything waiting has been written.
+    /// Starts the writer in `tasks`, with its connection if there is one yet. It ends once it was closed or dropped, and all that waited has
+    /// been written.
     pub(super) fn start(
         database: Database,
         connection: Option<SqliteConnection>,
@@ -106,21 +106,21 @@ impl Writer {
         writer
     }
 
-    /// The way to no writer.
+    /// A handle without a writer.
     pub(super) fn none() -> Self {
         let (writer, _) = Self::with_lines();
         writer.close();
         writer
     }
 
-    /// The way to whoever takes what is in the lines.
+    /// The handle to a writer that takes from these lines.
     fn with_lines() -> (Self, Lines) {
         let closing = CancellationToken::new();
         let (lines, [small, large]) = Lines::new(closing.clone());
         (Self { small, large, closing, models_generation: ModelsGeneration::default() }, lines)
     }
 
-    /// Another one whenever a model was registered or deleted, before whoever did so is told; `None` if that is not known now.
+    /// A number that changes whenever a model is registered or deleted, before that is answered; `None` if it is not known now.
     pub(super) fn models_generation(&self) -> Option<u64> {
         self.models_generation.get()
     }
@@ -135,7 +135,7 @@ impl Writer {
         self.closing.cancelled().await;
     }
 
-    /// Applies `verb`, and returns once that is on disk. Whoever goes away does not undo it; nor do those of the three that follow.
+    /// Applies `verb`, and returns once that is on disk. Dropping the future does not undo it, here and in the three methods that follow.
     ///
     /// # Errors
     ///
@@ -221,7 +221,7 @@ impl Open {
     async fn run(mut self, mut lines: Lines) {
         let mut group = Vec::with_capacity(MAX_GROUP);
         loop {
-            // Whoever is ready to go on may have something for this group too.
+            // It yields once, so that ready tasks can enqueue.
             tokio::task::yield_now().await;
             if !lines.take(&mut group).await {
                 break;
@@ -229,9 +229,9 @@ impl Open {
             match self.commit(&mut group).await {
                 Ok(()) => group.drain(..).for_each(|job| job.tell(Ok(()))),
                 Err(StoreError::Unavailable(unavailable)) => {
-                    // Each on its own would fare no better.
+                    // Each of them alone would fail in the same way.
                     group.drain(..).for_each(|job| job.tell(Err(unavailable.into())));
-                    // What has waited meanwhile has waited as long for the lock.
+                    // Requests that came meanwhile have waited as long for the lock.
                     if unavailable == Unavailable::Locked {
                         lines.drain().for_each(|job| job.tell(Err(unavailable.into())));
                     }
@@ -254,7 +254,7 @@ impl Open {
         self.close().await;
     }
 
-    /// Applies `group`. If it cannot be, what was known is forgotten, and the connection with it.
+    /// Applies `group`. After an error, the connection is closed, and what was known of the database is forgotten.
     async fn commit(&mut self, group: &mut [Job]) -> Result<(), StoreError> {
         if let Err(error) = self.try_commit(group).await {
             return Err(self.failed(error).await);
@@ -286,8 +286,8 @@ impl Open {
         Ok(())
     }
 
-    /// Copies what little was logged while the rest was copied beside the writing, so that the log begins anew. One that only grows has
-    /// its size to make durable with every commit, which takes twice the time.
+    /// Copies the little that was logged during the last checkpoint, so that the log begins anew. Every commit to a log that grows must make
+    /// its new size durable too, which takes twice the time.
     async fn finish_checkpoint(&mut self) {
         if self.checkpoint.as_ref().is_none_or(|checkpoint| !checkpoint.is_finished()) {
             return;
@@ -308,7 +308,7 @@ impl Open {
             let readers = Arc::clone(&self.readers);
             self.checkpoint = Some(self.tasks.spawn(async move {
                 if let Err(error) = readers.checkpoint().await {
-                    // A commit does it, once the log is long; and where nothing can be written, writers are told so.
+                    // If the log becomes long, a commit copies it; if nothing can be written, the next writes fail.
                     tracing::debug!(error = &error as &dyn std::error::Error, "the log was not copied");
                 }
             }));
@@ -336,7 +336,7 @@ impl Open {
         if !self.known.arrivals.is_empty()
             && let Err(error) = settle(&mut connection, &mut self.known.arrivals).await
         {
-            // They are durable where they are.
+            // Observations are durable in `arrivals` too.
             tracing::warn!(
                 error = &error as &dyn std::error::Error,
                 "observations were left for the next start to settle"
