@@ -24,7 +24,7 @@ use crate::service::StoreError;
 use crate::stream::Rooms;
 use crate::telemetry;
 
-/// How long answers may take to be sent after searches were aborted.
+/// How long answers may take to be sent, once searches were aborted.
 const ABORT_GRACE: Duration = Duration::from_secs(2);
 
 /// How often measurements are condensed.
@@ -171,13 +171,13 @@ impl Server {
         }
         etude.close().await;
         tasks.close();
-        // A search that does not look up would keep the process; it ends without it.
+        // A search that never asks whether to stop would keep the process alive; the process ends without it.
         let ended = tokio::time::timeout(ABORT_GRACE, tasks.wait()).await;
         tracing::info!(is_clean = ended.is_ok(), "stopped");
     }
 }
 
-/// The settings, with no more connections than the process may have.
+/// The settings, with no more connections than the process can have open files.
 fn within_limits(config: &ServeConfig) -> ServeConfig {
     let config_within = config.within(raise_file_limit());
     let (wanted, max_connections) = (config.max_connections, config_within.max_connections);
@@ -187,7 +187,7 @@ fn within_limits(config: &ServeConfig) -> ServeConfig {
     config_within
 }
 
-/// Raises the limit of open files, each of which a connection needs, as far as it goes. Gives what it is then.
+/// Raises the limit of open files as far as is allowed, as each connection needs one. Returns the new limit.
 fn raise_file_limit() -> u64 {
     let limit = getrlimit(Resource::Nofile);
     let (Some(soft), hard) = (limit.current, limit.maximum) else { return u64::MAX };

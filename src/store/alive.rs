@@ -16,7 +16,7 @@ use super::{StoreError, as_integer};
 pub(super) struct NoteAlive {
     /// When.
     pub(super) now: Timestamp,
-    /// Signs of life come at least so often. Twice as long without any is time in which there was none to be given.
+    /// How often signs of life come at least. If twice this time passes without any, the service was not alive meanwhile.
     pub(super) every: Duration,
 }
 

@@ -23,19 +23,19 @@ use sqlx::SqliteConnection;
 use super::sessions::{self, NewObservations, OpenSession, Owner, SessionRefusal};
 use super::{StoreError, corrupt};
 
-/// Arrivals over this are settled with the next commit. Beyond it there is little left to be gained, and the commit that
-/// settles takes longer.
+/// Once `arrivals` has more bytes than this, they are settled with the next commit. A larger table would save little, and settling it would
+/// take longer.
 const MAX_BYTES: usize = 1 << 20;
 
 /// What the writer knows of open sessions and of the table `arrivals`.
 #[derive(Debug, Default)]
 pub(super) struct Arrivals {
-    /// Open sessions, by id: who owns them and how many observations they have, those in `arrivals` included. Whoever has some there is
-    /// among them.
+    /// Open sessions, by id: who owns them and how many observations they have, those in `arrivals` included. Every session with
+    /// observations in `arrivals` is among them.
     open: HashMap<String, OpenSession>,
     /// Size of the table.
     n_bytes: usize,
-    /// SQLite's number for what others have written. `None` if nothing is known, also not about what the table holds.
+    /// SQLite's number that changes when others write (`data_version`). `None` if nothing is known, neither of sessions nor of the table.
     data_version: Option<i64>,
 }
 
@@ -44,7 +44,7 @@ pub(super) struct Arrivals {
 pub(super) struct Accepted {
     /// For each of the group, whether it is accepted.
     pub(super) answers: Vec<Result<(), SessionRefusal>>,
-    /// The row for those that are; `None` if none did.
+    /// The row with the accepted ones; `None` if there are none.
     row: Option<String>,
 }
 
@@ -64,12 +64,12 @@ impl Arrivals {
         self.n_bytes == 0
     }
 
-    /// Forgets what it knew: of what failed, or was written by others, it cannot be said what is in the database.
+    /// Forgets everything: after a failure, or when others have written, the content of the database is unknown.
     pub(super) fn forget(&mut self) {
         *self = Self::default();
     }
 
-    /// Forgets what it knew if others have written since; within a transaction that writes.
+    /// Forgets everything if others have written since; within a transaction that writes.
     pub(super) async fn check(&mut self, connection: &mut SqliteConnection) -> Result<(), StoreError> {
         if self.is_known() && self.data_version != Some(data_version(connection).await?) {
             self.forget();
@@ -121,8 +121,8 @@ impl Arrivals {
         Ok(())
     }
 
-    /// Adds the row of what was accepted, outside of a transaction: one statement, which is durable when this returns. Says
-    /// whether it was added; it was not if others have written meanwhile.
+    /// Adds the row with the accepted observations by one statement without a transaction; durable when this returns. Says whether it was
+    /// added; it was not if others have written meanwhile.
     pub(super) async fn add_at_once(
         &mut self,
         connection: &mut SqliteConnection,
@@ -252,7 +252,7 @@ fn together(rows: &[String]) -> Result<BTreeMap<String, Arrived>, StoreError> {
     Ok(by_session)
 }
 
-/// What was accepted was next; only a foreign hand in the tables can bring this about.
+/// Accepted observations always come next in their session, unless somebody else has changed the tables.
 fn refused(session_id: &str, seq: u32) {
     tracing::error!(session = session_id, seq, "stored observations do not follow on those of their session");
 }

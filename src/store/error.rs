@@ -1,4 +1,4 @@
-//! Why the store could not do as told, by what the caller can do.
+//! The errors of the store, by what the caller can do about them.
 
 use std::io;
 use std::path::PathBuf;

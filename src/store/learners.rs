@@ -229,7 +229,7 @@ impl Store {
     }
 }
 
-/// Looked for every second, however many learners there are: only those that have something to fold are in the index.
+/// This runs every second, however many learners there are. The index has only those with rewards to fold.
 const BEHIND: &str = "SELECT name FROM learners WHERE has_pending = 1 ORDER BY sequence";
 
 fn read_learner(row: &SqliteRow) -> Result<LearnerRecord, StoreError> {

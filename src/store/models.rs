@@ -40,12 +40,12 @@ pub struct ModelSize {
     pub n_transitions: u64,
 }
 
-/// What tells models that are ready to be searched apart.
+/// The key of a compiled model.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct ModelKey {
     /// SHA-256 of its canonical text.
     pub hash: String,
-    /// Whether it is searched lazily. A world was found to be that, or not, by the limit when it was registered.
+    /// Whether it is searched lazily, which the limit on states has decided when the model was registered.
     pub is_lazy: bool,
 }
 
@@ -139,7 +139,7 @@ impl Store {
         row.map(read).transpose()
     }
 
-    /// What the model called `name` is known by.
+    /// The key of the model called `name`.
     ///
     /// # Errors
     ///

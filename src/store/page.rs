@@ -6,8 +6,8 @@ use sqlx::sqlite::SqliteRow;
 
 use super::StoreError;
 
-/// A page ends with the item that brings the text of its rows to this size. An answer has a few times as much, and with a few of
-/// them at once a small service stays small; most lists do not come near it with as many items as may be asked for.
+/// A page ends with the item that brings the text of its rows to this size, in bytes. An answer takes a few times as much memory. Most
+/// lists stay far below it, however many items are asked for.
 pub(super) const MAX_BYTES: usize = 1 << 20;
 
 /// A part of a long list.
@@ -34,8 +34,8 @@ pub(super) struct Rows<T> {
 }
 
 impl<T> Rows<T> {
-    /// Makes a page of at most `limit` of `rows`, one at least. Either the query asked for one more than that, or `rest` says whether
-    /// there are any.
+    /// Makes a page of the first of `rows`: at least one if there is any, and at most `limit`. Either the query has asked for one row more
+    /// than `limit`, or `rest` says whether there are more.
     ///
     /// # Errors
     ///
@@ -85,8 +85,8 @@ pub(super) enum Rest {
     IsMore,
 }
 
-/// How many of the next rows, which have so many bytes, make a page of at most `limit`, and what comes after them: for rows that may be
-/// so long that none of them is read ahead.
+/// How many of the next rows make a page of at most `limit`, and what comes after them, by the sizes of the rows in bytes. For rows that
+/// may be too long to be read ahead.
 pub(super) fn fitting(sizes: &[i64], limit: u32) -> (u32, Rest) {
     let (mut n_rows, mut n_bytes) = (0, 0_u64);
     for size in sizes {
@@ -137,7 +137,7 @@ fn text<'r>(row: &'r SqliteRow, column: &str) -> Option<&'r [u8]> {
     row.try_get::<Option<&[u8]>, _>(column).ok().flatten()
 }
 
-/// A name, an id or a number, whatever is wrong with it.
+/// A name, an id or a number, as text, even of a row that is damaged.
 fn shown(row: &SqliteRow, column: &str) -> Option<String> {
     let number = row.try_get::<i64, _>(column).ok().map(|number| number.to_string());
     number.or_else(|| text(row, column).map(|text| String::from_utf8_lossy(text).into_owned()))

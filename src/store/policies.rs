@@ -1,7 +1,7 @@
 //! The table of policies.
 //!
-//! What is stored of a policy is never changed, and has a checksum. The link to the one that refines it is a column of its own, and
-//! becomes part of the text when that is read.
+//! The text and the steps of a policy are never changed, and have a checksum. The id of the policy that refines it is a column of its own,
+//! and is put into the text when that is read.
 
 use std::sync::OnceLock;
 
@@ -30,7 +30,7 @@ pub struct NewPolicy {
 }
 
 impl NewPolicy {
-    /// How much there is to be written.
+    /// How many bytes there are to be written.
     pub(super) fn n_bytes(&self) -> usize {
         self.summary.len() + self.steps.len()
     }
@@ -93,7 +93,7 @@ impl Store {
     ///
     /// [`StoreError::NoRoom`] if there is not so much, or if the database failed.
     pub async fn policy_within(&self, id: &str, memory: &Memory) -> Result<Option<(String, Option<Held>)>, StoreError> {
-        /// As it is stored, and as it is read from that: steps in short take up to four times as much then.
+        /// The stored bytes, and the text that is written from them: unpacked steps take up to four times as many bytes as packed ones.
         const COPIES: usize = 6;
         let read = async {
             let Some(row) = self.policy_row(id, MAX_INLINE_BYTES).await? else { return Ok(None) };
@@ -104,7 +104,7 @@ impl Store {
             }
             memory.hold(&mut held, COPIES * n_bytes)?;
             drop(row);
-            // Of what is stored, nothing but the link changes.
+            // Nothing but the link changes between the two reads.
             let Some(row) = self.policy_row(id, n_bytes).await? else { return Ok(None) };
             self.read_policy(&row, held, memory).await.map(Some)
         };
@@ -172,12 +172,12 @@ fn corrupt<E: Into<Box<dyn std::error::Error + Send + Sync>>>(column: &'static s
     super::corrupt(TABLE, column)
 }
 
-/// What tells whether a policy is as it was written: CRC-32, of the summary in the upper half and of the steps in the lower one.
+/// The checksum of a policy: CRC-32 of the summary in the upper half, of the steps in the lower half.
 fn checksum(summary: &str, steps: &[u8]) -> i64 {
     half_checksum(summary) | i64::from(crc32fast::hash(steps))
 }
 
-/// The same, of the summary alone.
+/// The upper half of the checksum, which is that of the summary.
 fn half_checksum(summary: &str) -> i64 {
     i64::from(crc32fast::hash(summary.as_bytes())) << 32
 }
@@ -226,12 +226,12 @@ fn n_bytes_of(row: &SqliteRow) -> Result<usize, StoreError> {
     usize::try_from(n_bytes).map_err(corrupt("steps"))
 }
 
-/// Most that a link makes it longer.
+/// Most bytes that a link adds to the text.
 const MAX_LINK_BYTES: usize = 64;
 
 /// The text of a policy or its summary, with the link to the policy that refines it, if there is one.
 fn linked(mut text: String, row: &SqliteRow) -> Result<String, StoreError> {
-    /// How all of them end that were not refined yet when they were written.
+    /// The end of every text, as no policy was refined yet when it was written.
     const NOT_REFINED: &str = r#""refined_by":null}"#;
     let refined_by: Option<&str> = row.try_get("refined_by")?;
     let Some(refined_by) = refined_by else { return Ok(text) };
@@ -251,14 +251,13 @@ pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -
 /// Policies that are stored in up to so many bytes are read at once, without asking for their size first.
 const MAX_INLINE_BYTES: usize = 32 * 1024;
 
-/// Policies of up to so many bytes are written where they are asked for, which takes a millisecond or so; larger ones on a thread of
-/// their own.
+/// Policies of up to so many bytes are written on the caller's thread, which takes a millisecond or so; larger ones on a blocking thread.
 const MAX_INLINE_ANSWER_BYTES: usize = 1 << 20;
 
-/// Most policies that a statement inserts. Each number of them is a statement of its own, which is prepared once and kept.
+/// Most policies that one statement inserts. For each number of policies there is a statement, which is prepared once and kept.
 const MAX_ROWS: usize = 64;
 
-/// Most bytes of them, which the driver has a copy of meanwhile, unless one alone has more.
+/// Most bytes of the policies of one statement, unless one policy alone has more: the driver copies them.
 const MAX_ROWS_BYTES: usize = 1 << 20;
 
 /// Adds policies in this order, within a transaction.

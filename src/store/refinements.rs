@@ -6,7 +6,7 @@ use super::policies::{self, NewPolicy};
 use super::writer::{Verb, Writing};
 use super::{Store, StoreError};
 
-/// How often a refinement is taken up. What has ended the process, or was ended with it, so many times would do so for ever.
+/// Most attempts at a refinement. One during which the process ended so many times may be what ends it, and is given up.
 pub const MAX_ATTEMPTS: u32 = 3;
 
 /// A policy that is to be refined.
@@ -23,7 +23,7 @@ pub struct NewRefinement {
 }
 
 impl NewRefinement {
-    /// How much there is to be written.
+    /// How many bytes there are to be written.
     pub(super) fn n_bytes(&self) -> usize {
         self.request.len()
     }
@@ -85,7 +85,7 @@ impl Store {
         self.writer.write(BeginRefinement(policy_id.to_owned())).await
     }
 
-    /// Takes an attempt back, which has ended for reasons that are not its own.
+    /// Takes back an attempt that was ended for another reason than the refinement itself.
     ///
     /// # Errors
     ///

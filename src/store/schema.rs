@@ -76,10 +76,10 @@ pub(super) async fn check_version(connection: &mut SqliteConnection) -> Result<(
     Ok(())
 }
 
-/// Refuses what another program has made. An empty database is anybody's.
+/// Refuses a database of another program. An empty one may be used.
 pub(super) async fn check_whose(connection: &mut SqliteConnection) -> Result<(), StoreError> {
     let id: i64 = sqlx::query_scalar("PRAGMA application_id").fetch_one(&mut *connection).await?;
-    // Whoever was killed while it made the first tables has left `_sqlx_migrations`.
+    // A process that was killed while it made the first tables has left `_sqlx_migrations` alone.
     let has_tables = "SELECT EXISTS (SELECT 1 FROM sqlite_schema
          WHERE name NOT LIKE 'sqlite\\_%' ESCAPE '\\' AND tbl_name != '_sqlx_migrations')";
     if id == APPLICATION_ID || (id == 0 && !sqlx::query_scalar::<_, bool>(has_tables).fetch_one(connection).await?) {

@@ -7,8 +7,8 @@
 //! - Of jobs of a kind, clients take turns: each is served once before one of them is served again. Of a client's jobs, the one that
 //!   has run least is served first (a level is twice as long as the one before it), and of those the first to come.
 //! - A long job makes way for one that has run less, and, once it had its share, for another client's.
-//! - A client may have as many places as it leaves to others: so one that asks for as much as it can leaves half of all, two
-//!   leave a quarter.
+//! - A client may have at most as many places as are left free for others: one client leaves at least half of all places free, two leave
+//!   a quarter.
 
 use std::collections::{BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
@@ -17,7 +17,7 @@ use rustc_hash::FxHashMap;
 
 use crate::service::Client;
 
-/// Threads that only short jobs use: one of these may be in the middle of something that takes it longer than it should.
+/// Threads that only short jobs use. There is more than one, as a short job may run longer than it should before it is noticed.
 const N_SHORT_THREADS: usize = 2;
 
 /// How long nothing short must have come before another thread is lent to long jobs.
@@ -100,7 +100,7 @@ impl Turns {
         self.places(class).give_back(client);
     }
 
-    /// Something short came at `now`, whether it needs a thread or not.
+    /// Notes that a short job came at `now`, whether it needs a thread or not.
     pub(super) fn note_short(&mut self, now: Instant) {
         self.last_short = self.last_short.max(Some(now));
     }

@@ -202,7 +202,7 @@ impl Store {
         Ok(opened)
     }
 
-    /// Makes whoever asks the owner of a session, if that is open; for this, something came for it at `at`. Nothing is accepted from
+    /// Makes the caller the owner of a session, if that is open, and counts as activity of the session at `at`. Nothing is accepted from
     /// earlier owners from then on.
     ///
     /// # Errors
@@ -248,8 +248,7 @@ impl Store {
     }
 
     /// Ends open sessions that were last active longer than `idle` before `now`, and forgets their observations:
-    /// [`MAX_EXPIRED_AT_ONCE`] of them, if there are more. Time without service does not count, of which this is a sign, as
-    /// [`Self::note_alive`] is.
+    /// at most [`MAX_EXPIRED_AT_ONCE`] of them. Time without service does not count. This is a sign of life, as [`Self::note_alive`] is.
     ///
     /// # Errors
     ///
@@ -264,7 +263,7 @@ impl Store {
         self.writer.write(ExpireSessions { before, alive: NoteAlive { now, every } }).await
     }
 
-    /// Brings observations that have arrived to their table, whoever's they are. Where nothing can be written, gives them, by session.
+    /// Moves the observations of all sessions from `arrivals` to their table. If nothing can be written, returns them by session instead.
     async fn settle(&self) -> Result<BTreeMap<String, Arrived>, StoreError> {
         let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM arrivals)");
         if !query.fetch_one(&mut *self.reader().await?).await? {

@@ -20,7 +20,7 @@ use crate::store::{StoreError, as_integer, corrupt, count, policies, refinements
 #[derive(Debug)]
 pub(in crate::store) struct SettleObservations;
 
-/// Makes whoever asks the owner of a session.
+/// Makes the caller the owner of a session.
 #[derive(Debug)]
 pub(super) struct TakeSession {
     pub(super) id: String,
@@ -153,7 +153,7 @@ impl Verb for ExpireSessions {
     }
 }
 
-/// Why nothing was done to a session by somebody who is not its owner, or of which there is none that is open.
+/// Why nothing was done: the session is not open, or the caller is not its owner.
 async fn refusal(connection: &mut SqliteConnection, id: &str) -> Result<SessionRefusal, StoreError> {
     let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM sessions WHERE id = $1 AND status = 'open')");
     let is_open = query.bind(id).fetch_one(connection).await?;

@@ -43,7 +43,7 @@ async fn append_at_once(
     }
     let accepted = arrivals.accept(connection, &news).await?;
     if accepted.answers.iter().any(Result::is_err) || !arrivals.add_at_once(connection, &accepted).await? {
-        // That takes a closer look.
+        // The transaction that follows finds out why.
         arrivals.forget();
         return Ok(false);
     }
@@ -89,8 +89,8 @@ fn answer_policies(group: &mut [Job]) {
     }
 }
 
-/// Applies `group` in one transaction: observations and policies first, rewards last, each all together. Nobody was answered yet, so that
-/// any order is one in which they may have come.
+/// Applies `group` in one transaction: observations and policies first, rewards last, each kind together. As nobody was answered yet, the
+/// requests of a group may be applied in any order.
 async fn transact(
     connection: &mut SqliteConnection,
     known: &mut Known,
@@ -129,7 +129,7 @@ async fn append(
 ) -> Result<(), StoreError> {
     let are_read = group.iter().any(|job| matches!(job, Job::Other(verb) if verb.reads_observations()));
     let news = observations(group);
-    // Whoever has nothing to do with observations does not wait for them.
+    // A group without observations does not wait for them to be settled.
     if !are_read && news.is_empty() {
         return Ok(());
     }
