@@ -49,7 +49,7 @@ impl DefinitionReader {
     }
 }
 
-/// Makes sure that what is stored of a definition is what was registered.
+/// Checks the hash of a stored definition against the one that was registered.
 pub(super) fn check_hash(model: &str, hash: &str, expected: &str) -> Result<(), ServiceError> {
     if hash == expected {
         return Ok(());
@@ -59,15 +59,15 @@ pub(super) fn check_hash(model: &str, hash: &str, expected: &str) -> Result<(), 
 
 /// The text of a model on its way in.
 pub enum ModelText {
-    /// At hand.
+    /// In memory.
     Whole(Vec<u8>),
-    /// At hand, to be decompressed while it is read.
+    /// In memory, to be decompressed while it is read.
     Packed(OpenText),
     /// To be read as the client sends it.
     Arriving(OpenText),
 }
 
-/// Opens a text, on the thread that will read it: to find its beginning, some of it must be read.
+/// Opens a text, on the thread that will read it, as opening already reads its beginning.
 pub type OpenText = Box<dyn FnOnce() -> io::Result<Box<dyn BufRead + Send>> + Send>;
 
 impl ModelText {
@@ -88,7 +88,7 @@ impl ModelText {
         matches!(self, Self::Whole(text) if text.len() <= MAX_INLINE_BYTES)
     }
 
-    /// The same text, of which what is kept is held against `memory` as it is read.
+    /// The same text, which takes from `memory`, as it is read, what is kept of it.
     pub(super) fn counted(self, memory: &Memory) -> Self {
         let open = match self {
             Self::Whole(text) if text.len() as u64 <= SMALL_BYTES => return Self::Whole(text),
@@ -98,7 +98,7 @@ impl ModelText {
             Self::Packed(open) | Self::Arriving(open) => open,
         };
         let memory = memory.clone();
-        // Once its turn has come.
+        // The memory is taken only when the text is read.
         Self::Packed(Box::new(move || {
             let held = memory.try_take(SMALL_BYTES).map_err(io::Error::other)?;
             Ok(Box::new(Counted { inner: open()?, held, n_bytes: 0 }))
@@ -106,7 +106,7 @@ impl ModelText {
     }
 }
 
-/// A text of a model that is read, and what is kept of it.
+/// A text of a model that is read, and the memory for what is kept of it.
 struct Counted {
     inner: Box<dyn BufRead + Send>,
     held: Held,
@@ -114,7 +114,7 @@ struct Counted {
 }
 
 impl Counted {
-    /// Of a text, about twice as much is kept until it is compiled: values as numbers, and lists that grow.
+    /// Until a text is compiled, about so many bytes are kept for each of its bytes: values as numbers, and lists that grow.
     const KEPT: u64 = 2;
 }
 
@@ -168,7 +168,7 @@ pub(super) struct DefinitionWriter {
     hash: Sha256,
     /// The last piece. Less than [`PIECE_BYTES`].
     piece: Vec<u8>,
-    /// Whether that is all there is.
+    /// Whether that is the whole text so far.
     is_whole: bool,
     pieces: Option<mpsc::Sender<Vec<u8>>>,
 }

@@ -29,7 +29,7 @@ pub struct ModelAnswer {
     pub summary: ModelSummary,
     /// The definition.
     pub definition: ModelDefinition,
-    /// For what is kept, if that is much.
+    /// The memory for the summary, if that is much.
     _held: Option<Held>,
 }
 
@@ -38,11 +38,11 @@ pub struct ModelAnswer {
 pub enum ModelDefinition {
     /// JSON.
     Text(Box<RawValue>),
-    /// Too large to be held: to be read with this.
+    /// Too large to be kept in memory: read piece by piece.
     Pieces(DefinitionReader),
 }
 
-/// Who sends models that are read as they come. A client that sends slowly keeps others from nothing but its own place.
+/// Uploads of models that are read as they come. A client that sends slowly takes nothing from others but its own place.
 #[derive(Debug)]
 pub(super) struct Uploads(Mutex<Places>);
 
@@ -101,7 +101,7 @@ impl Etude {
         caller: Caller,
     ) -> Result<(Registered, ModelSummary), ServiceError> {
         let limits = self.limits;
-        // Where something is registered already, nothing is stored or compiled; what it is then depends on the hash.
+        // If the name is taken, nothing is stored or compiled: the hash decides whether it is the same model.
         let existing = self.store.model_key(name.as_str()).await?;
         let is_new = existing.is_none();
         let (writer, pieces) = definition_writer(is_new);
@@ -117,7 +117,7 @@ impl Etude {
             let job = move |interrupt: &mut dyn Interrupt| Ok(prepare(read, interrupt));
             tokio::join!(self.pool.run_patiently(caller.client, job), self.store_pieces(pieces))
         } else if !is_new && text.is_small() {
-            // There is nothing to be compiled or stored.
+            // The name is taken, so nothing is compiled or stored.
             let job = |interrupt: &mut dyn Interrupt| Ok(prepare(text.read(format, limits, interrupt), interrupt));
             (self.pool.run_here(None, job), Ok(None))
         } else {
@@ -129,11 +129,11 @@ impl Etude {
             };
             tokio::join!(place.run(None, job), self.store_pieces(pieces))
         };
-        // If storing has failed, preparing has for that reason.
+        // The first error is that of storing: preparing fails because of it.
         let stored = stored?;
         let Prepared { text, hash, compiled } = prepared??;
         let Some(Compiled { mapper, attributes, actions }) = compiled else {
-            // What is there is looked up once more: it may have been deleted meanwhile.
+            // Looked up again, as the model may have been deleted meanwhile.
             let existing = self.store.model(name.as_str()).await?.ok_or(PoolError::Busy)?.summary;
             return if existing.hash == hash {
                 Ok((Registered::Already, existing))
@@ -216,7 +216,7 @@ impl Etude {
         Ok((self.store.models(after, limit).await?, held))
     }
 
-    /// Takes what reading and writing so many bytes of attributes and actions needs, if that is much: labels may take any number of bytes.
+    /// Takes the memory for reading and writing `n_bytes` of attributes and actions, if that is much: labels may have any length.
     fn take_for_summary(&self, n_bytes: u64) -> Result<Option<Held>, NoRoom> {
         const COPIES: u64 = 8;
         (n_bytes > SMALL_BYTES / COPIES).then(|| self.memory.try_take(COPIES * n_bytes)).transpose()

@@ -52,7 +52,7 @@ impl Owners {
             owner.taken_over = taken_over.clone();
             Arc::clone(&owner.driving)
         };
-        // Whoever stops waiting here leaves nothing behind either.
+        // A caller that stops waiting here leaves nothing behind either.
         let owners = Arc::clone(&self.owners);
         let mut ownership = Ownership { id: id.to_owned(), taken_over, owners, driving: None };
         tokio::select! {
