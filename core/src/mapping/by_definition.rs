@@ -3,7 +3,7 @@
 
 use serde_json::Value;
 
-use super::{Problem, Request};
+use super::{Mapper, Problem, Request};
 use crate::document::{Faults, Place};
 use crate::interrupt::Uninterrupted;
 use crate::model::{Definition, Limits, Model, StateIdx};
@@ -12,6 +12,11 @@ use crate::model::{Definition, Limits, Model, StateIdx};
 pub(super) fn compiled(document: &Value) -> Model {
     let definition = Definition::read(document, Limits::NONE, &mut Uninterrupted).unwrap();
     Model::compile(&definition, Limits::NONE, &mut Uninterrupted).unwrap()
+}
+
+/// The model that a document defines, prepared.
+pub(super) fn prepared(document: &Value) -> Mapper {
+    Mapper::new(compiled(document), &mut Uninterrupted).unwrap()
 }
 
 /// The problem of a request.

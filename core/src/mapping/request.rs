@@ -292,15 +292,6 @@ impl<'m> Request<'m> {
         for observation in problem.demonstration.iter() {
             let is_spent = online.n_expanded().saturating_add(n_states) > self.settings.budget.max_expansions;
             let signal = if is_spent { Signal::Finish } else { interrupt.poll() };
-            match signal {
-                Signal::Continue => {}
-                Signal::Finish => {
-                    let stopped_by = if is_spent { StoppedBy::MaxExpansions } else { StoppedBy::Deadline };
-                    let spent = (online.n_expanded(), online.n_generated());
-                    return self.complete(mapper, online.into_moves(), stopped_by, spent, interrupt);
-                }
-                Signal::Cancel => return Err(Cancelled),
-            }
             let mut is_over = false;
             let mut until_over = || match interrupt.poll() {
                 Signal::Finish => {
@@ -309,11 +300,16 @@ impl<'m> Request<'m> {
                 }
                 signal => signal,
             };
-            let stopped_by = match online.observe(observation, &mut until_over) {
-                Ok(_) => continue,
-                Err(Stopped::Cancelled(_)) if is_over => StoppedBy::Deadline,
-                Err(Stopped::Cancelled(cancelled)) => return Err(cancelled),
-                Err(Stopped::Memory) => StoppedBy::Memory,
+            let stopped_by = match signal {
+                Signal::Cancel => return Err(Cancelled),
+                Signal::Finish if is_spent => StoppedBy::MaxExpansions,
+                Signal::Finish => StoppedBy::Deadline,
+                Signal::Continue => match online.observe(observation, &mut until_over) {
+                    Ok(_) => continue,
+                    Err(Stopped::Cancelled(_)) if is_over => StoppedBy::Deadline,
+                    Err(Stopped::Cancelled(cancelled)) => return Err(cancelled),
+                    Err(Stopped::Memory) => StoppedBy::Memory,
+                },
             };
             let spent = (online.n_expanded(), online.n_generated());
             return self.complete(mapper, online.into_moves(), stopped_by, spent, interrupt);

@@ -180,7 +180,7 @@ fn states_that_are_found_count_as_memory() {
     let mapper = mapper_within(LAZY, &model);
     let request = json!({"model": "m", "demonstration": demonstration});
     let mut faults = Faults::default();
-    let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
     let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
     let expanded = |max_bytes| {
         let settings = Settings { budget: Budget { max_bytes, ..Budget::DEFAULT }, ..Settings::default() };
@@ -200,7 +200,7 @@ fn start_faults(model: &Value, start: &Value) -> Vec<String> {
     let mapper = mapper_within(LAZY, model);
     let request = json!({"model": "m", "demonstration": [{"x": 0}], "start": start});
     let mut faults = Faults::default();
-    let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
     Request::read(mapper.model(), &object, &mut faults);
     assert!(faults.listed().iter().all(|fault| fault.pointer == "/start"), "{faults}");
     faults.listed().iter().map(|fault| fault.detail.clone()).collect()

@@ -212,7 +212,7 @@ fn a_long_search_is_cut_short_wherever_it_is() {
     let request = long_request(2_000, &json!({}));
     let mapper = mapper(&example("figure-4/model.json"));
     let mut faults = Faults::default();
-    let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
     let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
     let settings = request.settings;
     let map_until = |n: u32, signal: Signal| {
@@ -314,7 +314,7 @@ fn long_request(n_observations: usize, options: &Value) -> Value {
 fn map_until(request: &Value, n: u32, signal: Signal) -> (u32, Result<Mapping, Cancelled>) {
     let mapper = mapper(&example("figure-4/model.json"));
     let mut faults = Faults::default();
-    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
     let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
     let mut n_polls = 0;
     let mut interrupt = || {
@@ -331,7 +331,7 @@ fn a_policy_that_is_not_optimal_says_what_ran_out_and_one_that_is_says_nothing()
     for (heuristic, n_observations) in [("default", 16), ("default", 200), ("none", 200), ("paper", 200)] {
         let request = long_request(n_observations, &json!({"heuristic": heuristic}));
         let mut faults = Faults::default();
-        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
         let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
         let map = |budget, signal: Signal| {
             let settings = Settings { budget, ..request.settings };
@@ -356,7 +356,7 @@ fn a_search_takes_as_much_memory_as_its_problem_is_large_and_its_budget_at_most(
     let bytes = |mapper: &Mapper, n_observations, heuristic: &str| {
         let request = long_request(n_observations, &json!({"heuristic": heuristic}));
         let mut faults = Faults::default();
-        let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+        let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
         let request = Request::read(mapper.model(), &object, &mut faults).unwrap();
         let n_bytes = mapper.search_bytes(&request.problem, request.settings);
         let within = Budget { max_bytes: n_bytes, ..Budget::DEFAULT };

@@ -165,7 +165,7 @@ fn rush(n: u32, n_observations: u32) -> Value {
 
 fn read<'m>(mapper: &'m Mapper, request: &Value) -> Result<Request<'m>, Faults> {
     let mut faults = Faults::default();
-    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
     let read = Request::read(mapper.model(), &object, &mut faults);
     faults.check(read)
 }

@@ -31,7 +31,7 @@ pub(crate) fn mapper_within(limits: Limits, model: &Value) -> Mapper {
 
 pub(crate) fn solve(mapper: &Mapper, request: &Value) -> Policy {
     let mut faults = Faults::default();
-    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
     let read = Request::read(mapper.model(), &object, &mut faults);
     let request = faults.check(read).unwrap();
     let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();

@@ -3,7 +3,7 @@ use serde_json::json;
 
 use super::*;
 use crate::interrupt::Uninterrupted;
-use crate::mapping::by_definition::{compiled, fitted};
+use crate::mapping::by_definition::{fitted, prepared};
 use crate::mapping::{Demonstration, HeuristicName, Problem, Settings};
 use crate::model::Origin;
 
@@ -18,10 +18,6 @@ fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Mapper {
         "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
     });
     prepared(&document)
-}
-
-fn prepared(document: &serde_json::Value) -> Mapper {
-    Mapper::new(compiled(document), &mut Uninterrupted).unwrap()
 }
 
 /// Two loops of as many states each. From state 0 either can be entered, and none is left. All attributes tell all states

@@ -3,7 +3,7 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::interrupt::{Signal, Uninterrupted};
-use crate::mapping::by_definition::{compiled, fitted, problem};
+use crate::mapping::by_definition::{fitted, prepared, problem};
 use crate::mapping::heuristic::HeuristicName;
 use crate::mapping::heuristic::projected::MAX_ENTRIES;
 use crate::mapping::mapper::Status;
@@ -24,10 +24,6 @@ fn belt(n_places: usize, n_observations: usize) -> (Mapper, Value) {
     });
     let seen = (0..n_observations).map(|i| json!({"place": i % n_places, "dial": i * 2 % 10}));
     (prepared(&model), json!({"model": "belt", "demonstration": seen.collect::<Value>()}))
-}
-
-fn prepared(document: &Value) -> Mapper {
-    Mapper::new(compiled(document), &mut Uninterrupted).unwrap()
 }
 
 /// A body in a world of small numbers, and a demonstration. States look alike now and then, and actions may cost nothing.
