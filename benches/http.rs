@@ -172,7 +172,7 @@ impl Searched {
         let mapper: &'static Mapper = Box::leak(Box::new(mapper));
         let request = serde_json::from_str(request)?;
         let mut faults = Faults::default();
-        let object = Place::root(&request).object(&Request::FIELDS, &mut faults);
+        let object = Place::root(&request).object(Request::FIELDS, &mut faults);
         let read = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
         Ok(Self { mapper, problem: read.ok_or("no request")?.problem })
     }

@@ -136,7 +136,7 @@ fn measure(case: Case, max_bytes: usize) -> (Option<StoppedBy>, usize) {
     let Case { mapper, request, heuristic, max_expansions } = case;
     let mapper = Arc::new(mapper);
     let mut faults = Faults::default();
-    let object = Place::root(&request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(&request).object(Request::FIELDS, &mut faults).unwrap();
     let mut request = Request::read(mapper.model(), &object, &mut faults).unwrap();
     request.settings.heuristic = heuristic;
     request.settings.budget = Budget { max_expansions, max_bytes };

@@ -65,7 +65,7 @@ impl Map {
 
         let request = self.request()?;
         let mut faults = Faults::default();
-        let object = Place::root(&request).object(&Request::FIELDS, &mut faults);
+        let object = Place::root(&request).object(Request::FIELDS, &mut faults);
         let read = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
         let what = format!("the request made of {}", self.demonstration.display());
         let asked = faults.check(read).map_err(|faults| CliError::Faults { what, faults })?;

@@ -6,7 +6,7 @@ use reqwest::Client;
 use serde_json::{Value, json};
 
 use super::stream::client;
-use super::stream::frames::{Frame, Step, refused};
+use super::stream::frames::{Frame, StepFrame, refused};
 use super::{CliError, render};
 use etude_core::attribute::{ByAttribute, Scalar};
 
@@ -109,7 +109,7 @@ fn changed(
     changes.collect::<Vec<_>>().join(" ")
 }
 
-fn committed(weights: Option<&ByAttribute<f64>>, step: &Step) -> String {
+fn committed(weights: Option<&ByAttribute<f64>>, step: &StepFrame) -> String {
     let how = if step.proven { "proven" } else { "lookahead" };
     format!(
         "{:>2} {:<5} {:>2} {:<10} {how:<9} {}",

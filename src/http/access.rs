@@ -15,7 +15,7 @@ use super::problem::{Problem, ProblemKind};
 use super::request_id::REQUEST_ID;
 use etude_core::document::Quoted;
 
-/// How long browsers may keep what a preflight was answered.
+/// How long browsers may cache the answer to a preflight.
 const PREFLIGHT_MAX_AGE: Duration = Duration::from_hours(1);
 
 /// Which hosts and origins are allowed, besides the service's own.
@@ -88,7 +88,7 @@ impl Access {
     }
 }
 
-/// Browsers name the page with whatever may change something; where they say that there is one and not which, none is allowed.
+/// Browsers send the page's origin with every request that may change something. An opaque origin (`null`) is never allowed.
 fn check_without_origin(method: &Method, headers: &HeaderMap) -> Result<(), Problem> {
     match headers.get("sec-fetch-site").map(HeaderValue::as_bytes) {
         None | Some(b"same-origin" | b"none") => Ok(()),
@@ -168,7 +168,7 @@ fn machine_names() -> Vec<String> {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let name = name.trim().trim_end_matches('.');
     let first = name.split('.').next().unwrap_or_default();
-    // What is no name, such as `(none)`, is asked for by nobody.
+    // Nobody asks for a value that is no name, such as `(none)`.
     [name, first].into_iter().filter(|name| !name.is_empty()).map(str::to_owned).collect()
 }
 

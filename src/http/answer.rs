@@ -18,14 +18,14 @@ use crate::clock::timer_now;
 use crate::memory::{self, Held, Memory, NoRoom};
 use crate::service::ServiceError;
 
-/// Bodies and answers up to this are not counted: the budget of memory keeps room for what is small.
+/// Bodies and answers up to this size are not counted: the memory budget reserves room for small ones.
 #[expect(clippy::cast_possible_truncation, reason = "64 KiB")]
 pub(super) const UNCOUNTED_BYTES: usize = memory::UNCOUNTED_BYTES as usize;
 
 /// How long a client may take to read an answer, however slowly it does.
 const READ_TIMEOUT: Duration = Duration::from_mins(1);
 
-/// Slowest that an answer may be read beyond [`READ_TIMEOUT`]: its memory is not there for others until then.
+/// Least rate at which an answer must be read once [`READ_TIMEOUT`] has passed. Until it is read, its memory is not free for others.
 const MIN_BYTES_PER_S: u64 = 64 * 1024;
 
 /// A JSON answer.
@@ -45,7 +45,7 @@ pub(super) fn json_text(status: StatusCode, text: String) -> Response {
 
 /// An answer whose JSON comes in parts.
 pub(super) fn json_stream(parts: impl Stream<Item = Result<Bytes, ServiceError>> + Send + 'static) -> Response {
-    // Too late for another answer: the connection is closed in the middle, which no client takes for the end.
+    // It is too late for another answer. The connection is closed in the middle of this one, so that no client takes it for complete.
     let parts = parts.inspect_err(|error| {
         tracing::error!(error = error as &dyn std::error::Error, "an answer was cut off");
     });
@@ -112,7 +112,7 @@ pub(super) fn holding(bytes: Bytes, held: Option<Held>) -> Bytes {
 struct Paced {
     body: Body,
     held: Option<Held>,
-    /// What the body has given and this has not.
+    /// Data from the body that was not handed on yet.
     rest: Bytes,
     n_given: u64,
     /// How long the client was waited for.

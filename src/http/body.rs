@@ -1,8 +1,8 @@
 //! Reading bodies.
 //!
 //! Nobody waits for a client for ever, and nobody takes a client's word for how much will come: each body has a limit in bytes and a
-//! least speed, and takes memory as its bytes come. Who is refused is answered at once; what is still to come of the body is read
-//! beside that, for a while.
+//! least speed, and takes memory as its bytes come. A refused request is answered at once; the rest of its body is read and discarded
+//! meanwhile, for a limited time.
 
 use std::io::{self, BufRead};
 use std::time::Duration;
@@ -27,14 +27,14 @@ use etude_core::model::Format;
 /// How long a client may take to send its body, however slowly it comes.
 const BODY_TIMEOUT: Duration = Duration::from_mins(1);
 
-/// Slowest that a body may come beyond [`BODY_TIMEOUT`]: it keeps others from sending theirs.
+/// Least rate of a body once [`BODY_TIMEOUT`] has passed. A slower one keeps others from sending theirs.
 const MIN_BYTES_PER_S: u64 = 64 * 1024;
 
 /// How long the rest of a body that is not wanted is read and thrown away. Most clients only look at the answer once they have sent
 /// everything; past this, they find the connection closed.
 const DISCARD_TIMEOUT: Duration = Duration::from_secs(10);
 
-/// How much of it is read, as a multiple of the limit.
+/// Most bytes of an unwanted body that are read and thrown away, as a multiple of the limit.
 const MAX_DISCARDED_LIMITS: usize = 64;
 
 /// Bodies of models up to this size, in bytes, are buffered whole before they are read.
@@ -200,7 +200,7 @@ impl Arriving {
     /// Reads on beside the answer.
     fn discard(self, context: &Context) {
         let Self { stream, limit, waited, .. } = self;
-        // Who was too slow already is not waited for.
+        // A client that was too slow already is not waited for.
         if waited < BODY_TIMEOUT {
             discard(stream, limit.n_bytes, context);
         }
@@ -227,7 +227,7 @@ impl<S: Send + Sync> FromRequestParts<S> for NoForm {
 
 /// Refuses a request without a look at its body.
 pub(super) fn refuse(request: Request, context: &Context, problem: Problem) -> Problem {
-    // Whoever asks for leave to send gets the answer instead.
+    // A client that sent `Expect: 100-continue` gets the answer instead.
     if !request.headers().contains_key(EXPECT) {
         discard(request.into_body().into_data_stream(), context.max_body_bytes, context);
     }

@@ -46,7 +46,7 @@ impl<'m> Collected<'m> {
     pub(super) fn push(&mut self, chunk: &[u8]) -> Result<(), NoRoom> {
         let n_bytes = self.bytes.len() + chunk.len();
         if n_bytes > self.bytes.capacity() {
-            // Not by what was announced, which need not come.
+            // By what has arrived: a client need not send what it has announced.
             let capacity = n_bytes.next_power_of_two();
             self.hold(capacity)?;
             self.bytes.reserve_exact(capacity - self.bytes.len());

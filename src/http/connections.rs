@@ -35,7 +35,7 @@ use tokio_util::sync::CancellationToken;
 use tower::ServiceExt;
 
 use super::answer::UNCOUNTED_BYTES;
-use super::places::{Activity, Busy, Place, Places};
+use super::places::{Activity, Busy, ConnectionPlace, Places};
 use super::problem::{Problem, ProblemKind};
 use super::stalled::Stalled;
 use crate::clock::timer_now;
@@ -44,12 +44,14 @@ use crate::service::{self, Client};
 /// How much a connection may read ahead, also of a request's head: held by each, and not counted.
 const READ_AHEAD_BYTES: usize = 32 * 1024;
 
-/// How soon a peer that has gone without a word is noticed: when nothing came for so long, it is asked, so often, so many times.
+/// Idle time of a connection before TCP keepalive sends its first probe.
 const KEEPALIVE_AFTER: Duration = Duration::from_secs(30);
+/// Time between probes.
 const KEEPALIVE_EVERY: Duration = Duration::from_secs(10);
+/// Unanswered probes after which the peer counts as gone.
 const KEEPALIVE_RETRIES: u32 = 3;
 
-/// How long what was sent may stay unacknowledged.
+/// How long sent data may stay unacknowledged (`TCP_USER_TIMEOUT`).
 const UNACKNOWLEDGED_TIMEOUT: Duration = Duration::from_mins(1);
 
 /// How much of what is sent may wait in the kernel before more is taken. With more, a client that reads slowly but steadily may seem
@@ -141,10 +143,11 @@ pub async fn serve(listener: TcpListener, router: Router, limits: ConnectionLimi
     while connections.join_next().await.is_some() {}
 }
 
-/// Serves a connection until it ends, or what runs on it when the other end of `end` is dropped has ended.
+/// Serves a connection until it ends. Once the other end of `end` is dropped, only the request or stream that runs then is
+/// finished.
 async fn serve_connection(
     builder: http1::Builder,
-    socket: Stalled<TcpStream, Place>,
+    socket: Stalled<TcpStream, ConnectionPlace>,
     activity: Arc<Activity>,
     client: Client,
     router: Router,
@@ -199,7 +202,7 @@ fn until_given(response: Response, busy: Busy) -> Response {
     response.map(|body| Body::new(BusyBody { body, _busy: busy }))
 }
 
-/// The body of an answer, until whose end the connection is busy.
+/// The body of an answer. The connection counts as busy until the body ends.
 struct BusyBody {
     body: Body,
     _busy: Busy,
@@ -222,7 +225,7 @@ impl HttpBody for BusyBody {
     }
 }
 
-/// Sets up a socket. What cannot be set is missed by nobody but operators.
+/// Sets the options of a socket. Failures are ignored: a connection works without them.
 fn prepare(stream: &TcpStream) {
     let socket = SockRef::from(stream);
     let keepalive = TcpKeepalive::new().with_time(KEEPALIVE_AFTER).with_interval(KEEPALIVE_EVERY);
@@ -248,7 +251,7 @@ fn is_of_one_connection(error: &io::Error) -> bool {
     matches!(error.kind(), ConnectionAborted | ConnectionRefused | ConnectionReset)
 }
 
-/// What a newcomer is answered for whom there is no place.
+/// The answer to a newcomer if all places are taken.
 fn refusal() -> String {
     let problem = Problem::new(ProblemKind::Busy, "as many connections are open as may be");
     let body = problem.text();
@@ -266,7 +269,7 @@ async fn refuse(mut stream: TcpStream, refusal: Arc<str>) -> io::Result<()> {
     let _ = tokio::time::timeout(REFUSAL_TIMEOUT / 2, stream.read(&mut begun)).await;
     stream.write_all(refusal.as_bytes()).await?;
     stream.shutdown().await?;
-    // Who closes with something unread takes the answer back.
+    // Closing a socket with unread data resets the connection, and the answer may be lost.
     tokio::io::copy(&mut stream.take(MAX_REFUSED_BYTES), &mut tokio::io::sink()).await?;
     Ok(())
 }

@@ -13,7 +13,7 @@ use super::stalled::Watcher;
 use crate::clock::timer_now;
 use crate::service::Client;
 
-/// Connections among which one that makes room is looked for: what a newcomer may cost when all places are taken.
+/// Most connections that are examined to find one that makes room. It bounds the work for a newcomer when all places are taken.
 const MAX_LOOKED_AT: usize = 1024;
 
 /// How much longer than others a stream is waited for: it has timeouts of its own, and says goodbye after those.
@@ -24,7 +24,7 @@ const STREAM_GRACE: Duration = Duration::from_secs(15);
 pub(super) struct Places {
     table: Mutex<Table>,
     max: usize,
-    /// Most of one client's.
+    /// Most places of one client.
     max_each: usize,
     opened: Instant,
 }
@@ -59,7 +59,7 @@ impl Places {
 
     /// A place for a connection of `client`, and what hears of its end; `None` if all are taken and nobody makes room. Who has
     /// as many as one may have makes room for itself.
-    pub(super) fn enter(self: &Arc<Self>, client: Client) -> Option<(Place, oneshot::Receiver<()>)> {
+    pub(super) fn enter(self: &Arc<Self>, client: Client) -> Option<(ConnectionPlace, oneshot::Receiver<()>)> {
         let mut table = self.table();
         if table.n_by_client.get(&client).is_some_and(|n_taken| *n_taken >= self.max_each) {
             table.make_room(Some(client)).then_some(())?;
@@ -80,7 +80,7 @@ impl Places {
         };
         *table.n_by_client.entry(client).or_default() += 1;
         metrics::gauge!("etude_connections").increment(1);
-        Some((Place { places: Arc::clone(self), slot, number, activity }, ended))
+        Some((ConnectionPlace { places: Arc::clone(self), slot, number, activity }, ended))
     }
 
     /// Ends the connection that has been without a request longest, if there is one.
@@ -145,21 +145,21 @@ impl Table {
 
 /// A connection's place, until this is dropped.
 #[derive(Debug)]
-pub(super) struct Place {
+pub(super) struct ConnectionPlace {
     places: Arc<Places>,
     slot: usize,
     number: u64,
     activity: Arc<Activity>,
 }
 
-impl Place {
+impl ConnectionPlace {
     /// What the connection does.
     pub(super) fn activity(&self) -> &Arc<Activity> {
         &self.activity
     }
 }
 
-impl Drop for Place {
+impl Drop for ConnectionPlace {
     fn drop(&mut self) {
         let mut table = self.places.table();
         // Another may have it already.
@@ -169,7 +169,7 @@ impl Drop for Place {
     }
 }
 
-impl Watcher for Place {
+impl Watcher for ConnectionPlace {
     fn is_writing(&self, is_writing: bool) {
         self.activity.is_writing.store(is_writing, Ordering::Relaxed);
     }
@@ -248,7 +248,7 @@ impl Busy {
         }
     }
 
-    /// What came of the request goes on until the connection ends.
+    /// The connection stays busy until it ends.
     pub(super) fn for_ever(mut self) {
         self.0 = None;
     }
@@ -273,7 +273,7 @@ mod tests {
     }
 
     /// Enters at a moment of its own.
-    async fn enter(places: &Arc<Places>, n: u8) -> Option<(Place, oneshot::Receiver<()>)> {
+    async fn enter(places: &Arc<Places>, n: u8) -> Option<(ConnectionPlace, oneshot::Receiver<()>)> {
         tokio::time::advance(std::time::Duration::from_millis(1)).await;
         places.enter(client(n))
     }

@@ -17,15 +17,15 @@ pub(super) trait Watcher: Unpin {
     fn grace(&self) -> Duration;
 }
 
-/// A socket that fails with [`io::ErrorKind::TimedOut`] once nothing of what is written has gone for a while: not a byte was read at
-/// the other end, nor room made for one in between.
+/// A socket that fails with [`io::ErrorKind::TimedOut`] once a write has made no progress for a while: the other end has read nothing, and no
+/// buffer in between has taken a byte.
 #[derive(Debug)]
 pub(super) struct Stalled<S, W> {
     socket: S,
     watcher: W,
     /// How long nothing may be read before the socket fails, besides what the watcher adds.
     timeout: Duration,
-    /// Whether what was to be written last found no room.
+    /// Whether the last write found no room.
     is_waiting: bool,
     /// Made when it is first needed, as most answers go at once.
     alarm: Option<Pin<Box<Sleep>>>,

@@ -19,7 +19,7 @@ pub trait Weighed {
     fn n_bytes(&self) -> usize;
 }
 
-/// A queue with room for `max_bytes`; what is larger takes all of it.
+/// A queue with room for `max_bytes`. An item that is larger takes all of the room.
 #[must_use]
 pub fn queue<T: Weighed>(max_bytes: u32) -> (Sender<T>, Receiver<T>) {
     let (sender, items) = mpsc::unbounded_channel();
@@ -113,7 +113,7 @@ impl<T> Receiver<T> {
     }
 }
 
-/// Whoever waits for room is told that nobody receives any more.
+/// Tells senders that wait for room that the receiver is gone.
 impl<T> Drop for Receiver<T> {
     fn drop(&mut self) {
         self.close();

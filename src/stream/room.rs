@@ -74,7 +74,7 @@ impl Rooms {
         if !self.places().take(client) {
             return Err(NotAdmitted::NoPlace);
         }
-        let place = Place { rooms: self.clone(), client };
+        let place = StreamPlace { rooms: self.clone(), client };
         Ok(Room { _small: self.try_take(STREAM_BYTES)?, reading: Mutex::default(), place })
     }
 
@@ -111,12 +111,12 @@ pub struct Taken {
 
 /// A place for a stream, until this is dropped.
 #[derive(Debug)]
-struct Place {
+struct StreamPlace {
     rooms: Rooms,
     client: Client,
 }
 
-impl Drop for Place {
+impl Drop for StreamPlace {
     fn drop(&mut self) {
         self.rooms.places().give_back(self.client);
     }
@@ -128,7 +128,7 @@ pub struct Room {
     /// For the frame that comes.
     reading: Mutex<Vec<Taken>>,
     _small: Taken,
-    place: Place,
+    place: StreamPlace,
 }
 
 /// There was no memory for a frame for as long as it may wait for that.

@@ -9,9 +9,8 @@
 //!              +--> dropped and counted, while nobody takes them away
 //! ```
 //!
-//! Nobody who logs ever waits for whoever reads the log: a pipe that is full would stop the whole service. Lines for which there is
-//! no room are dropped, also those that warn of something. How many is measured (`etude_log_lines_dropped_total`) and, once
-//! lines are taken away again, logged.
+//! Logging never waits for the reader of the log: else a full pipe would stop the whole service. Lines for which there is no room are
+//! dropped, warnings included. Their number is measured (`etude_log_lines_dropped_total`) and logged once the reader goes on.
 //!
 //! This is not `tracing-appender`, which does the same as fast: where lines are stuck at the end of the process, it says so on
 //! standard output, and waits for ever if that leads into the same pipe.
@@ -23,7 +22,7 @@ use std::time::Duration;
 use tracing::{Level, Metadata};
 use tracing_subscriber::fmt::MakeWriter;
 
-/// How long a line may wait for others. Whoever reads along does not notice it.
+/// How long a line may wait for others: too short for a reader to notice.
 const WRITE_EVERY: Duration = Duration::from_millis(10);
 
 /// Most bytes of lines that wait to be written, some 16,000 lines: a second of a busy service. While they are written, as many wait again.
@@ -71,7 +70,7 @@ impl LogLines {
             loop {
                 writing.take(&mut taken);
                 if writer.write_all(&taken).and_then(|()| writer.flush()).is_err() {
-                    // There is nowhere to tell that nothing can be told, but for the measurements.
+                    // Only the measurements can show that logging fails.
                     count_dropped(taken.split(|byte| *byte == b'\n').skip(1).count() as u64);
                 }
                 writing.wait_for_more();

@@ -70,7 +70,7 @@ pub fn start_logging(config: &LogConfig, default_filter: &str) -> Result<Logging
     Ok(Logging(lines))
 }
 
-/// Has panics logged, not written to standard error by whoever panics, who would wait where nobody reads that.
+/// Logs panics. Rust's own hook writes to standard error, which blocks the thread if nobody reads it.
 pub fn log_panics() {
     std::panic::set_hook(Box::new(|panic| {
         let backtrace = std::backtrace::Backtrace::capture();

@@ -21,7 +21,7 @@ struct Written {
 /// The policy that `request` gives, and what it is written as.
 fn follow(mapper: &Mapper, request: &Value, stamp: &Stamp) -> (Policy, Written) {
     let mut faults = Faults::default();
-    let object = Place::root(request).object(&Request::FIELDS, &mut faults).unwrap();
+    let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
     let read = Request::read(mapper.model(), &object, &mut faults);
     let request = faults.check(read).unwrap();
     let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();

@@ -107,7 +107,7 @@ impl Attribute {
             }
             (Kind::Cyclic { scale, cycle }, Value::Number(o), Value::Number(s)) => {
                 let period = cycle.period();
-                // Reduced before they are subtracted, of which each may be as large as floats are.
+                // Reduced before the subtraction, which could overflow: each value may be as large as floats are.
                 let along = (o.rem_euclid(period) - s.rem_euclid(period)).abs();
                 along.min(period - along) / scale
             }

@@ -67,7 +67,7 @@ impl Learner {
         self.lease_s
     }
 
-    /// The same learner, starting from `distribution` instead. How what was learned in one place starts another.
+    /// The same learner, starting from `distribution` instead: to begin with what another learner has learned.
     #[must_use]
     pub fn starting_from(self, distribution: Distribution) -> Self {
         Self { initial: distribution, ..self }

@@ -16,8 +16,8 @@ pub(super) enum Extras {
 /// Most extra actions under one observation; a body that needs more is not worth following greedily.
 const MAX_EXTRAS: usize = 64;
 
-/// How much work completions may be after an interrupt said to finish, in looks at a distance: tens of milliseconds with a
-/// few attributes. Most demonstrations are followed to their end by then; for the rest of the others it is skipped on.
+/// Work that completions may do after an interrupt said to finish, in looked-up distances: tens of milliseconds with a few attributes. That
+/// is enough for most demonstrations; the rest of a longer one is skipped.
 pub(super) const GRACE: u64 = 1 << 20;
 
 /// What completions may still spend, all of those of a search together.

@@ -28,9 +28,9 @@ pub(crate) struct ActiveAttribute<'m> {
     /// `[n_observations]`.
     rows: Vec<u32>,
     domain: &'m [Value],
-    /// By number and domain index. Shape `[1 + n_observed, domain.len()]`, the first row zero; empty if that would be too large,
+    /// Terms by number and domain index. Shape `[1 + n_observed, domain.len()]`, the first row zero; empty if it would be too large.
     table: Vec<f64>,
-    /// where these are the observed values, in the order of their numbers.
+    /// The observed values in the order of their numbers, if there is no table.
     untabled: Vec<Value>,
 }
 

@@ -39,13 +39,13 @@
 //! their entries, as large tables may take longer than the search (`mapper::by_default`). What moves cost is said in `recurrence`,
 //! for all of them.
 //!
-//! **Ties.** Among mappings of equal cost the search returns the one that it comes to first, which is determined: what was
-//! found is given up only for what costs less. Of a node's successors `skip` is found first, then, by action, `match` before `extra`;
-//! the first way found to a node at its least cost is kept; costs are compared as the sums of floats along the path. Small problems
-//! are searched layer by layer, those nodes first that beams keep, and in the order in which they were found. In others nodes are
-//! expanded in the order of `f` to a thousandth, the most recently found of equals first. A search that takes long may be
-//! replaced by a sweep over all nodes, from the last observation back, in which a node is left by a skip unless a match is cheaper, and by
-//! a match unless an extra action is; when it is depends on the problem and the budget alone.
+//! **Ties.** Answers are deterministic. The first path found to a node wins ties: it is replaced only by a cheaper one, by the sums of
+//! floats along the paths. A node's successors are generated in this order: the `skip`, then for each action the `match` and the `extra`.
+//!
+//! - `search::layered` expands each layer in the order in which its nodes were found, those within a beam first.
+//! - `search::best_first` expands nodes in the order of `f` to a thousandth, the most recently found of equals first.
+//! - `search::sweep` leaves a node by the skip unless a match is cheaper, and by a match unless an extra action is cheaper. Whether it
+//!   replaces a best-first search depends on the problem and the budget alone.
 
 mod budget;
 #[cfg(test)]

@@ -16,7 +16,7 @@ pub(in crate::cli) enum Frame {
     Hello,
     Opened { session: String, weights: ByAttribute<f64>, received: u32 },
     Received { seq: u32 },
-    Step(Step),
+    Step(StepFrame),
     Done { policy_id: Option<String>, status: Status, cost: Cost },
     Error { problem: Problem },
 }
@@ -24,7 +24,7 @@ pub(in crate::cli) enum Frame {
 /// A committed step.
 #[derive(Debug, Deserialize)]
 #[expect(clippy::struct_field_names, reason = "one word for one thing, as in the frame")]
-pub(in crate::cli) struct Step {
+pub(in crate::cli) struct StepFrame {
     pub(in crate::cli) step: u32,
     pub(in crate::cli) observation: u32,
     #[serde(rename = "move")]

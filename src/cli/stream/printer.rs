@@ -6,7 +6,7 @@ use std::io::Write;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use super::frames::{Frame, Problem, Step};
+use super::frames::{Frame, Problem, StepFrame};
 use crate::cli::{CliError, render};
 use etude_core::attribute::ByAttribute;
 
@@ -98,7 +98,7 @@ impl<'o, W: Write> Printer<'o, W> {
         self.progress.println(text);
     }
 
-    fn readable(&mut self, step: &Step) -> String {
+    fn readable(&mut self, step: &StepFrame) -> String {
         let state = render::state(self.weights.as_ref(), &step.state);
         let action = step.action.as_deref().unwrap_or("-");
         self.widths = (self.widths.0.max(action.len()), self.widths.1.max(state.chars().count()));

@@ -12,9 +12,10 @@ pub(super) struct SharedWays(Rows<SharedWay>);
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct SharedWay {
     pub(super) from: ValueIdx,
-    /// The attribute's share of the action's cost: the least of all ways between the two values.
+    /// The attribute's share of the action's cost: the least over all ways between the two values.
     pub(super) share: f64,
-    /// Which part of the least distance it pays if the action is extra: the least of all ways, which may be another one's.
+    /// Part of the least distance that it pays if the action is extra: the least over all ways between the two values, so that `share` and
+    /// `part` may be those of different ways.
     pub(super) part: f64,
 }
 

@@ -1,4 +1,4 @@
-//! Searches that get more help the longer they take.
+//! The search of large problems, which gets larger tables, and at last a sweep, the longer it takes.
 
 use super::{Budget, Buffers, Mapper, Mapping, Settings, conclude, within};
 use crate::interrupt::{Cancelled, Interrupt};
@@ -11,9 +11,8 @@ use crate::mapping::{Problem, StoppedBy};
 use crate::model::{Space, StateIdx};
 
 impl Mapper {
-    /// Searches best first, with more help the longer it takes: at first with tables of projections only where they are small,
-    /// then with all of them; and where it has still looked at a good part of all nodes, what is left is to [`sweep`] over all of
-    /// them, which takes a fraction of the time for each.
+    /// Searches best first, in up to three stages: with the small tables of projections only, then with all of them; and once a good part
+    /// of all nodes was expanded, [`sweep`] goes over all nodes instead, which takes a fraction of the time for each.
     pub(super) fn best_first<S: Space>(
         &self,
         space: &mut S,
@@ -111,7 +110,8 @@ impl Mapper {
     }
 }
 
-/// What mappings cost at least, given what it costs to go on from a layer: to come there, they cost no less than the estimate falls. 0 if there are so many states that it would take long.
+/// A lower bound of the cost of all mappings, from the exact costs-to-go of a layer: as the estimate is consistent, a path to a node costs
+/// at least what the estimate falls by along it. 0 if the model has too many states to compute it quickly.
 fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &KnownLayer) -> f64 {
     /// That takes some ten milliseconds.
     const MAX_STATES: StateIdx = 1 << 17;
@@ -130,7 +130,7 @@ fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &KnownLayer
     (estimate(0, &problem.start_row) + least_rise) * (1.0 - SLACK)
 }
 
-/// What two searches for the same mappings found together, of which the later one is `found`.
+/// Merges the results of two searches of one problem; `found` is that of the later one.
 fn joined(before: Found, found: Found) -> Found {
     let mut paths = found.paths;
     paths.extend(before.paths);
@@ -144,20 +144,20 @@ fn joined(before: Found, found: Found) -> Found {
     }
 }
 
-/// When a search that takes long gets more help.
+/// Thresholds at which a search that takes long gets larger tables or a sweep.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Patience {
     /// Most nodes, observations times states, of a problem that is searched layer by layer.
     pub(super) max_layered_nodes: usize,
-    /// Most entries of the tables of a search's first attempt,
+    /// Most entries of the tables of a search's first attempt, unless `few_entries_per_observation` allows more.
     few_entries: usize,
-    /// or so many per observation, if that is more.
+    /// The same limit for each observation.
     few_entries_per_observation: usize,
     /// How many entries of a table take as long as an expansion.
     entries_per_expansion: u64,
-    /// After how many expansions all nodes are looked at instead,
+    /// Expansions after which a sweep replaces the search, unless `nodes_per_expansion` allows more.
     min_expansions_before_sweep: u64,
-    /// or after one for so many nodes, if that is more.
+    /// The search may expand one in this many of all nodes before a sweep replaces it.
     nodes_per_expansion: u64,
 }
 

@@ -65,7 +65,7 @@ use layer::{Layer, Sweep};
 pub(crate) use memory::longest_lookahead;
 use memory::{keeps, n_terms};
 use repair::{Predecessors, Repair, Repaired};
-use window::{Place, Window};
+use window::{NodePlace, Window};
 
 /// A step that will not be revised.
 #[derive(Clone, Debug, PartialEq)]
@@ -307,7 +307,7 @@ impl OnlineMapping {
         }
     }
 
-    fn commit_at(&mut self, place: Place, is_proven: bool) -> CommittedStep {
+    fn commit_at(&mut self, place: NodePlace, is_proven: bool) -> CommittedStep {
         let step = self.window.step(&self.model, place);
         self.commit(step, is_proven)
     }

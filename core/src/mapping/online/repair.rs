@@ -1,19 +1,19 @@
-//! New ways for survivors that have lost theirs, where these are few.
+//! Repairs the paths of survivors that have lost theirs, where these are few.
 //!
-//! What the window's nodes say was true of some root. As a root's ways are among those of the root before it, a node whose way
-//! is *lost*, because it does not lead from the root, says too little at most: a lower bound. A node is *sound* if its source
-//! is, and if it still costs what its source's cost makes of it. Two passes give every survivor a sound node again:
+//! The costs in the window may refer to an older root. Every path from the present root continues a path from the older one, so an old cost is
+//! a lower bound. A node is *sound* if its path comes from the present root: its source is sound, and its cost follows from its source's. All
+//! others are *lost*. Two passes give every survivor a sound path again:
 //!
-//! - back from the newest layer: a wanted node's new way leads over a sound node, which gives an upper bound, or over a lost
-//!   one whose lower bound is less; only those of the latter are wanted in their turn;
-//! - forward again: wanted nodes get their ways from sound ones, layer by layer, by Dijkstra's algorithm within a layer.
+//! - backwards from the newest layer, the nodes are collected for which a new path is *wanted*. Sound predecessors of a wanted node give an
+//!   upper bound of its cost; a lost predecessor is wanted too if its lower bound promises less;
+//! - forwards, wanted nodes get their paths from sound ones, layer by layer, by Dijkstra's algorithm within a layer.
 //!
-//! Nodes that nobody wanted stay lost, as lower bounds for the next time.
+//! Lost nodes that were not wanted keep their lower bounds for the next repair.
 
 use std::collections::BinaryHeap;
 
 use super::layer::{Source, Sweep};
-use super::window::{Place, Window, action};
+use super::window::{NodePlace, Window, action};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::mapping::MoveKind;
 use crate::mapping::open_list::CheapestFirst;
@@ -80,7 +80,7 @@ pub(super) struct Repair<'r> {
     /// By layer.
     wanted: Vec<Vec<StateIdx>>,
     /// Nodes in hand of [`Self::is_sound`], kept for its memory.
-    chain: Vec<Place>,
+    chain: Vec<NodePlace>,
 }
 
 impl<'r> Repair<'r> {
@@ -139,33 +139,33 @@ impl<'r> Repair<'r> {
         Ok(Repaired::All)
     }
 
-    fn at(&self, (index, state): Place) -> usize {
+    fn at(&self, (index, state): NodePlace) -> usize {
         index * self.n_states + state as usize
     }
 
     /// Wants a new way to a lost node.
-    fn want(&mut self, place: Place) {
+    fn want(&mut self, place: NodePlace) {
         let at = self.at(place);
         self.standings[at] = Standing::Wanted;
         self.wanted[place.0].push(place.1);
     }
 
-    fn cost(&self, (index, state): Place) -> f64 {
+    fn cost(&self, (index, state): NodePlace) -> f64 {
         self.window.layers[index].costs[state as usize]
     }
 
-    fn distance(&self, (index, state): Place) -> f64 {
+    fn distance(&self, (index, state): NodePlace) -> f64 {
         self.window.layers[index].observed.distance(self.model, state)
     }
 
     /// What it costs to come from `origin` to `place`, with this distance.
-    fn arrive(&self, origin: Place, action_cost: f64, place: Place, distance: f64) -> f64 {
+    fn arrive(&self, origin: NodePlace, action_cost: f64, place: NodePlace, distance: f64) -> f64 {
         let kind = if origin.0 == place.0 { MoveKind::Extra } else { MoveKind::Match };
         kind.arrive(self.cost(origin) + action_cost, distance)
     }
 
     /// Whether a node's way leads from the root and costs what it says. Every node of the way is noted as what it is.
-    fn is_sound(&mut self, mut place: Place) -> bool {
+    fn is_sound(&mut self, mut place: NodePlace) -> bool {
         let root = (0, self.window.root);
         let mut is_sound = loop {
             let at = self.at(place);
@@ -196,7 +196,7 @@ impl<'r> Repair<'r> {
     }
 
     /// Whether a node still costs what its source's cost makes of it, as those that survivors hang on do.
-    fn is_consistent(&self, place: Place) -> bool {
+    fn is_consistent(&self, place: NodePlace) -> bool {
         let (index, state) = place;
         let node = self.window.layers[index].node(state);
         if node.is_alive() {
@@ -215,7 +215,7 @@ impl<'r> Repair<'r> {
     }
 
     /// Calls with each node that a step leads from to `place`, and what the step's action costs.
-    fn each_origin(&mut self, (index, state): Place, mut look: impl FnMut(&mut Self, Place, f64)) {
+    fn each_origin(&mut self, (index, state): NodePlace, mut look: impl FnMut(&mut Self, NodePlace, f64)) {
         if index > 0 {
             look(self, (index - 1, state), 0.0);
         }
@@ -292,7 +292,7 @@ impl<'r> Repair<'r> {
     }
 
     /// Gives a wanted node a way.
-    fn set(&mut self, (index, state): Place, (cost, source): (f64, Source)) {
+    fn set(&mut self, (index, state): NodePlace, (cost, source): (f64, Source)) {
         let layer = &mut self.window.layers[index];
         layer.costs[state as usize] = cost;
         layer.set_source(state, source);

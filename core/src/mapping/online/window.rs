@@ -8,7 +8,7 @@ use crate::mapping::{Move, MoveKind};
 use crate::model::{ActionIdx, Model, StateIdx};
 
 /// A node's place: the index of its layer in the window, and its state.
-pub(super) type Place = (usize, StateIdx);
+pub(super) type NodePlace = (usize, StateIdx);
 
 /// Layers from the root's to the newest.
 #[derive(Debug)]
@@ -86,7 +86,7 @@ impl Window {
     }
 
     /// The source of a node; `None` of the root.
-    pub(super) fn source(&self, place: Place) -> Option<Place> {
+    pub(super) fn source(&self, place: NodePlace) -> Option<NodePlace> {
         let (index, state) = place;
         let source = self.layers[index].node(state).source;
         if source == Source::NONE {
@@ -143,7 +143,7 @@ impl Window {
     }
 
     /// Counts a node as a child of its source, and so on up if that brings the source to life.
-    fn attach(&mut self, mut place: Place) {
+    fn attach(&mut self, mut place: NodePlace) {
         while let Some((index, state)) = self.source(place) {
             if !self.layers[index].add_child(state) {
                 return;
@@ -153,7 +153,7 @@ impl Window {
     }
 
     /// Lets a childless node die, and so on up, but not the root. The layer at `held` is not thinned.
-    fn cut(&mut self, mut place: Place, held: usize) {
+    fn cut(&mut self, mut place: NodePlace, held: usize) {
         while place != (0, self.root) {
             let source = self.source(place);
             let (index, state) = place;
@@ -187,12 +187,12 @@ impl Window {
     }
 
     /// The only child of the root, if the root has just one, and is not in the newest layer itself.
-    pub(super) fn only_child(&self, model: &Model) -> Option<Place> {
+    pub(super) fn only_child(&self, model: &Model) -> Option<NodePlace> {
         let root = self.root;
         if self.layers.len() == 1 || self.layers[0].node(root).n_children != 1 {
             return None;
         }
-        let is_child = |(index, state): Place| {
+        let is_child = |(index, state): NodePlace| {
             self.layers[index].node(state).is_alive() && self.source((index, state)) == Some((0, root))
         };
         let successors = model.graph().successors(root).iter().map(|transition| transition.to);
@@ -200,7 +200,7 @@ impl Window {
     }
 
     /// Makes a node the root. Layers before its own go.
-    pub(super) fn advance(&mut self, (index, state): Place) {
+    pub(super) fn advance(&mut self, (index, state): NodePlace) {
         if index == 0 {
             self.layers[0].kill(self.root);
         }
@@ -217,7 +217,7 @@ impl Window {
     }
 
     /// The places of the way from the root, without it, to the state `survivor` of the newest layer.
-    pub(super) fn path(&self, survivor: StateIdx) -> Vec<Place> {
+    pub(super) fn path(&self, survivor: StateIdx) -> Vec<NodePlace> {
         let mut path = Vec::new();
         let mut place = (self.layers.len() - 1, survivor);
         while place != (0, self.root) {
@@ -230,7 +230,7 @@ impl Window {
     }
 
     /// The step that leads to a node.
-    pub(super) fn step(&self, model: &Model, place: Place) -> Move {
+    pub(super) fn step(&self, model: &Model, place: NodePlace) -> Move {
         let (index, state) = place;
         let source = self.layers[index].node(state).source;
         let (kind, action) = if source.is_within() {

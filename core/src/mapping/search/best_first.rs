@@ -19,7 +19,7 @@ use std::ops::Range;
 
 use super::buckets::Buckets;
 use super::nodes::{Arrival, BlockIdx, NO_NODE, NodeId, Nodes, Position, Reached};
-use super::seen::{Estimates, Seen, SeenIdx, Way};
+use super::seen::{Estimates, Seen, SeenIdx, SeenWay};
 use super::{End, Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
@@ -49,9 +49,9 @@ pub(in crate::mapping) struct SearchBuffers {
 #[derive(Debug, Default)]
 struct Open {
     buckets: Buckets,
-    /// Those of the observation that a probe is at,
+    /// Of the observation that a probe is at.
     probed: BinaryHeap<CheapestFirst>,
-    /// and those that it has found of the next.
+    /// Of the observation after it, found by the probe.
     ahead: Vec<CheapestFirst>,
 }
 
@@ -151,7 +151,7 @@ struct Search<'s, 'p, S> {
     unspent_until: u64,
     /// The last observation.
     last: u32,
-    /// What is less than this cheaper, as a part of the cost, is not looked for.
+    /// Relative tolerance: mappings that are cheaper by less are not searched for.
     rounding: f64,
     meter: Meter<'s>,
 }
@@ -161,7 +161,8 @@ impl<S: Space> Search<'_, '_, S> {
     /// advance counts among those of the observation.
     fn probe(&mut self, width: u64, Open { buckets, probed, ahead }: &mut Open) -> Result<End, Cancelled> {
         // With the room for more, as they come.
-        let max_known = self.left_bytes(buckets) / (2 * size_of::<(CheapestFirst, Option<u32>)>());
+        let left = self.budget.beside(self.size_bytes(buckets)).beside(self.space.found_bytes());
+        let max_known = left.max_bytes / (2 * size_of::<(CheapestFirst, Option<u32>)>());
         // Of each observation, the last of those that are open, and where the one before it is.
         let mut last_of: Vec<Option<u32>> = vec![None; self.problem.last()];
         let mut known = Vec::new();
@@ -292,9 +293,9 @@ impl<S: Space> Search<'_, '_, S> {
     /// Looks whether there are expansions left, and memory; gives what there is not.
     #[cold]
     fn check_budget(&mut self, buckets: &mut Buckets) -> Result<(), StoppedBy> {
-        /// How many expansions may be done between two looks at the memory,
+        /// Most expansions between two looks at the memory.
         const LOOK_EVERY: u64 = 16;
-        /// and how many ways may be followed: they find as many nodes, and twice as many where blocks begin.
+        /// Most ways followed between two looks. Each finds up to one node, and up to two where blocks begin.
         const N_WAYS: u64 = 1 << 10;
         /// Beyond this part of the memory, what grows takes at once what may be left for it: to grow bit by bit, it would be copied.
         const SMALL: usize = 16;
@@ -326,11 +327,6 @@ impl<S: Space> Search<'_, '_, S> {
         nodes + self.seen.size_bytes() + buckets.size_bytes()
     }
 
-    /// How much memory is left.
-    fn left_bytes(&self, buckets: &Buckets) -> usize {
-        self.budget.beside(self.size_bytes(buckets)).beside(self.space.found_bytes()).max_bytes
-    }
-
     /// Follows the moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper
     /// way.
     #[inline]
@@ -353,7 +349,7 @@ impl<S: Space> Search<'_, '_, S> {
         self.n_expanded += 1;
         self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
         for way in ways {
-            let Way { cost, to: state, action } = self.seen.way(way);
+            let SeenWay { cost, to: state, action } = self.seen.way(way);
             let cost = g + cost;
             let mut block = self.nodes.find(state, next);
             if self.nodes.may_take(block, next, cost) {

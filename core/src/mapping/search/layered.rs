@@ -190,7 +190,7 @@ struct Search<'s> {
     nodes: &'s mut LayeredNodes,
     /// Mappings of this cost or more are of no interest.
     limit: f64,
-    /// What is less than this cheaper, as a part of the cost, is not looked for.
+    /// Relative tolerance: mappings that are cheaper by less are not searched for.
     rounding: f64,
     /// The last state of the cheapest mapping that was found.
     cheapest: Option<StateIdx>,

@@ -1,8 +1,8 @@
 //! The nodes that a search has found.
 //!
-//! Nodes of one state at neighbouring observations lie together, in a *block*: an action is looked at both as a match and as an extra
-//! action, which lead to neighbours, and most often each of them is known already and was come to more cheaply. Of a block,
-//! that takes one look into the index and one at the costs.
+//! Nodes of one state at neighbouring observations lie together, in a *block*. An action is tried both as a match and as an extra action,
+//! which lead to neighbouring nodes of one state; mostly both nodes are known already by cheaper paths. To find that out takes one look into the
+//! index and one at the costs of the block.
 
 use super::index::{Index, Key, NO_BLOCK};
 use super::seen::{Estimates, Seen, SeenIdx};
@@ -67,29 +67,30 @@ pub(super) struct Arrival {
 
 /// The last step of the way to a node: its parent, [`NO_NODE`] for the first, and the action, or [`NO_ACTION`].
 #[derive(Clone, Copy, Debug)]
-struct Link {
+struct LastLink {
     parent: NodeId,
     action: ActionIdx,
 }
 
-const NO_LINK: Link = Link { parent: NO_NODE, action: NO_ACTION };
+const NO_LINK: LastLink = LastLink { parent: NO_NODE, action: NO_ACTION };
 
-/// Below which cost, before the distance is paid, a way to each node of a block is of interest: the cheapest that was found or turned
-/// away, or what the limit leaves. A line of the cache.
+/// Upper bounds, one per node of a block, on the cost of a path before the node's distance is paid: costlier paths are discarded. A bound
+/// is the cost of the cheapest path that was found or discarded, or follows from the search's limit. One cache line.
 #[derive(Clone, Copy, Debug)]
 #[repr(align(64))]
 struct Costs([f64; BLOCK_LEN]);
 
 const NO_LIMITS: Costs = Costs([f64::INFINITY; BLOCK_LEN]);
 
-/// What is known of a node, in bits: its estimate was made,
+/// Bit of a node's marks: its estimate was computed.
 const ESTIMATED: u8 = 1;
-/// a way to it was found,
+/// Bit of a node's marks: a path to it was found.
 const FOUND: u8 = 2;
-/// it was expanded since its way last became cheaper;
+/// Bit of a node's marks: it was expanded since its path last became cheaper.
 const CLOSED: u8 = 4;
-/// and how the way ends.
+/// Bit of a node's marks: its path ends with a skip.
 const SKIPPED_TO: u8 = 8;
+/// Bit of a node's marks: its path ends with an extra action.
 const LINGERED_TO: u8 = 16;
 
 /// Blocks of nodes, in the order in which the first node of each was found.
@@ -99,7 +100,7 @@ pub(super) struct Nodes {
     marks: Vec<[u8; BLOCK_LEN]>,
     costs: Vec<Costs>,
     estimates: Vec<[Estimate; BLOCK_LEN]>,
-    links: Vec<[Link; BLOCK_LEN]>,
+    links: Vec<[LastLink; BLOCK_LEN]>,
     index: Index,
 }
 
@@ -110,7 +111,7 @@ const BLOCK_BYTES: usize = size_of::<Key>()
     + size_of::<[u8; BLOCK_LEN]>()
     + size_of::<Costs>()
     + size_of::<[Estimate; BLOCK_LEN]>()
-    + size_of::<[Link; BLOCK_LEN]>();
+    + size_of::<[LastLink; BLOCK_LEN]>();
 
 impl Nodes {
     /// Forgets all nodes, and keeps the memory. There will be nodes at so many observations.
@@ -260,7 +261,7 @@ impl Nodes {
                 MoveKind::Extra => LINGERED_TO,
                 MoveKind::Start | MoveKind::Match => 0,
             };
-        self.links[at][in_block] = Link { parent, action };
+        self.links[at][in_block] = LastLink { parent, action };
         (reached.f < limit).then_some(reached)
     }
 
@@ -307,7 +308,7 @@ impl Nodes {
         let mut moves = Vec::new();
         while id != NO_NODE {
             let (block, in_block) = split(id);
-            let Link { parent, action } = self.links[block][in_block];
+            let LastLink { parent, action } = self.links[block][in_block];
             let Position { state, observation, kind } = self.step(id);
             let kind = if parent == NO_NODE { MoveKind::Start } else { kind };
             let action = (action != NO_ACTION).then_some(action);

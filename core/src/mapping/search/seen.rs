@@ -12,16 +12,16 @@ pub(super) type SeenIdx = u32;
 
 /// A way out of a state.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Way {
+pub(super) struct SeenWay {
     /// What the action costs.
     pub(super) cost: f64,
     pub(super) to: SeenIdx,
     pub(super) action: ActionIdx,
 }
 
-/// The states that were seen, with all that a search looks at again and again: it sees few of a model's states, but each at many
-/// observations and from many sides. So they are close together in memory, however large the model is, and other searches of
-/// the model find them there.
+/// The states that searches of a model have reached, with copies of what a search reads most. A search reaches few of a model's states,
+/// but each at many observations and by many ways; the copies lie close together in memory, however large the model is. They are kept for
+/// later searches of the model.
 #[derive(Debug, Default)]
 pub(super) struct Seen {
     numbers: FxHashMap<StateIdx, SeenIdx>,
@@ -29,15 +29,15 @@ pub(super) struct Seen {
     bounds: Vec<Bounds>,
     /// By state, the last search that came to it.
     came: Vec<SearchNumber>,
-    ways: Vec<Way>,
+    ways: Vec<SeenWay>,
     /// The states' classes in the tables of estimates. Shape `[n_seen, columns.len()]`.
     classes: Vec<u32>,
     columns: Vec<ChangingColumn>,
     /// This search.
     search: SearchNumber,
-    /// What this search came to, whether or not others were there before: states,
+    /// States that this search has reached, including those that earlier searches reached.
     n_states: usize,
-    /// and ways out of those that it explored.
+    /// Ways out of the states that this search has explored.
     n_ways: usize,
 }
 
@@ -91,12 +91,12 @@ impl Seen {
     /// How much memory those take that this search came to, in bytes: the same whether or not others were there before.
     pub(super) fn size_bytes(&self) -> usize {
         let state_bytes = STATE_BYTES + self.columns.len() * size_of::<u32>();
-        self.n_states * (state_bytes + ENTRY_BYTES) + self.n_ways * size_of::<Way>()
+        self.n_states * (state_bytes + ENTRY_BYTES) + self.n_ways * size_of::<SeenWay>()
     }
 
     /// How much memory those take, in bytes, if they are all of a model, of so many transitions and attributes.
     pub(super) fn bytes_for(n_states: usize, n_transitions: usize, n_attributes: usize) -> usize {
-        n_states * (STATE_BYTES + n_attributes * size_of::<u32>() + ENTRY_BYTES) + n_transitions * size_of::<Way>()
+        n_states * (STATE_BYTES + n_attributes * size_of::<u32>() + ENTRY_BYTES) + n_transitions * size_of::<SeenWay>()
     }
 
     /// Makes room for `growth` times as many, once there is hardly any left.
@@ -112,7 +112,7 @@ impl Seen {
     pub(super) fn kept_bytes(&self) -> usize {
         self.numbers.capacity() * size_of::<(StateIdx, SeenIdx)>()
             + self.states.capacity() * STATE_BYTES
-            + self.ways.capacity() * size_of::<Way>()
+            + self.ways.capacity() * size_of::<SeenWay>()
             + self.classes.capacity() * size_of::<u32>()
     }
 
@@ -170,7 +170,7 @@ impl Seen {
             for transition in space.successors(state) {
                 let to = self.number_of(transition.to, space, projected);
                 let cost = actions[usize::from(transition.action)].cost;
-                self.ways.push(Way { cost, to, action: transition.action });
+                self.ways.push(SeenWay { cost, to, action: transition.action });
             }
             begin..self.ways.len()
         } else {
@@ -186,7 +186,7 @@ impl Seen {
 
     /// The way out of a state that is there.
     #[inline]
-    pub(super) fn way(&self, at: usize) -> Way {
+    pub(super) fn way(&self, at: usize) -> SeenWay {
         self.ways[at]
     }
 

@@ -124,15 +124,15 @@ fn section_len(problem: &Problem<'_>, budget: Budget) -> Option<usize> {
 struct Sweep<'s, 'i> {
     problem: &'s Problem<'s>,
     ways: &'s Ways,
-    /// What was looked at last,
+    /// The observation of the layer that was done last.
     observation: usize,
-    /// what its states cost there,
+    /// By state, the distance at `observation`.
     distances: Vec<f64>,
-    /// and what going on from them costs.
+    /// By state, the cost-to-go from `observation`.
     here: Vec<f64>,
-    /// What being at each state costs at the observation after that, and going on from there.
+    /// By state, the distance at the next observation plus the cost-to-go from there.
     next: Vec<f64>,
-    /// How many layers were done.
+    /// Layers done, counting those that were done twice.
     n_stepped: usize,
     workspace: Workspace,
     meter: Meter<'i>,

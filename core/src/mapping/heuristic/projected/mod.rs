@@ -44,9 +44,9 @@ pub(crate) struct Projected<'p> {
     columns: Vec<Column<'p>>,
     /// By class, one attribute after the other.
     table: Table<Estimate>,
-    /// What the columns come to that no action changes. Shape `[n_observations]`, with room for whole chunks.
+    /// Sums, per observation, of the columns that no action changes. Shape `[n_observations]`, padded to whole chunks.
     unchanged: Vec<Estimate>,
-    /// The other columns, in order.
+    /// The columns that actions change, in order.
     changing: Vec<ChangingColumn>,
     /// Positions of attributes that take part in the distance but are in no table.
     untabled: Vec<usize>,
@@ -108,7 +108,7 @@ impl<'p> Projected<'p> {
             + size_of_val(self.least_terms.as_slice())
     }
 
-    /// How many entries the tables would have that were left out, because only few were asked for.
+    /// Entries of the tables that were left out because the room asked for was small.
     pub(in crate::mapping) fn n_left_out(&self) -> u64 {
         self.n_left_out
     }
@@ -118,26 +118,26 @@ impl<'p> Projected<'p> {
         &self.changing
     }
 
-    /// Whether something is said of states with this row: what no action changes is as it is at the start.
+    /// Whether estimates hold for a state with this row: attributes that no action changes must have their value at the start.
     pub(in crate::mapping) fn speaks_of(&self, values: &[u32]) -> bool {
         let mut constant = self.columns.iter().map(|column| column.projection).filter(|own| own.is_constant());
         constant.all(|own| values[own.position] == self.problem.start_row[own.position])
     }
 
-    /// The classes of the state with this row, by their numbers in the table: one of each of the
-    /// [changing columns](Self::changing_columns).
+    /// The classes of the state with this row: one for each of the [changing columns](Self::changing_columns), in order.
     #[inline]
     pub(in crate::mapping) fn classes(&self, values: &[u32]) -> impl Iterator<Item = u32> {
         self.changing.iter().map(|column| column.offset + values[column.position as usize])
     }
 
-    /// Whether that and what is the same for all states is all that an estimate is made of.
+    /// Whether the tables give whole estimates, so that none depends on an attribute without a table.
     #[inline]
     pub(in crate::mapping) fn are_all_in_columns(&self) -> bool {
         self.untabled.is_empty()
     }
 
-    /// What the node of a state costs that the start leads to and that is of [these classes](Self::classes). `values` gives its row.
+    /// The estimate for a state that is reachable from the start, by its [classes](Self::classes). `values` gives its row, and is called only
+    /// if some attribute has no table.
     #[inline]
     pub(in crate::mapping) fn estimate<'v>(
         &self,
@@ -155,14 +155,14 @@ impl<'p> Projected<'p> {
         sum
     }
 
-    /// The same for as many observations from `first` on, if they are [all in columns](Self::are_all_in_columns). After the last
-    /// observation it is nothing.
+    /// The estimates for [`CHUNK_LEN`] observations from `first` on, if they are [all in columns](Self::are_all_in_columns); zero past the
+    /// last observation.
     #[inline]
     pub(in crate::mapping) fn estimate_chunk(&self, first: usize, classes: &[u32]) -> [Estimate; CHUNK_LEN] {
         self.sum_chunk(self.unchanged[first..].first_chunk().copied().unwrap_or_default(), first, classes)
     }
 
-    /// The same, but of these classes alone, to be added to `sums`.
+    /// `sums` with the entries of these classes added, for [`CHUNK_LEN`] observations from `first` on.
     #[inline]
     pub(in crate::mapping) fn sum_chunk(
         &self,
@@ -177,7 +177,7 @@ impl<'p> Projected<'p> {
         sums
     }
 
-    /// What is not in the columns.
+    /// The terms of attributes without a table.
     #[inline(never)]
     fn others(&self, observation: usize, values: &[u32]) -> Estimate {
         let mut sum = Estimate::default();

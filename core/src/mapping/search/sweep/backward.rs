@@ -2,9 +2,9 @@
 //!
 //! This is the [recurrence](crate::mapping::MoveKind) backwards, for all states at once.
 //!
-//! The first two are looked up for one state after the other. Extra actions lead to others at the same observation, so these are gone
-//! over again and again until few of them change, and the rest is done by Dijkstra's algorithm. A way replaces one that was found only
-//! if it is cheaper, so ways to go on end at the next observation, even where actions cost nothing.
+//! Skips and matches are done in one pass over the states. Extra actions lead to states at the same observation, so passes are repeated
+//! until few states change, and Dijkstra's algorithm does the rest. Only a cheaper way replaces another, so chains of extra actions end even
+//! where actions cost nothing.
 
 use std::collections::BinaryHeap;
 use std::hint::select_unpredictable;
@@ -18,16 +18,16 @@ use crate::model::{ActionIdx, Model, Rows, StateIdx};
 #[derive(Debug)]
 pub(super) struct Ways {
     /// By the state that they leave.
-    out: Rows<Way>,
+    out: Rows<SweepWay>,
     /// The same ways, by the state to which they lead; of each, where it comes from.
-    into: Rows<Way>,
+    into: Rows<SweepWay>,
     /// By action.
     costs: Vec<f64>,
 }
 
 /// A way between two states, as one of them sees it.
 #[derive(Clone, Copy, Debug)]
-struct Way {
+struct SweepWay {
     /// The other state.
     state: StateIdx,
     action: ActionIdx,
@@ -115,7 +115,7 @@ impl Ways {
     /// What the interrupt of `meter` said, if that was not to continue.
     pub(super) fn new(model: &Model, meter: &mut Meter<'_>) -> Result<Option<Self>, Signal> {
         let graph = model.graph();
-        let ways = graph.iter().map(|(from, to)| (from, Way { state: to.to, action: to.action, number: 0 }));
+        let ways = graph.iter().map(|(from, to)| (from, SweepWay { state: to.to, action: to.action, number: 0 }));
         let mut out = Rows::try_of_entries(graph.n_states(), ways, || meter.go_on(1))?;
         for state in 0..graph.n_states() {
             let ways = out.of_mut(state);
@@ -126,14 +126,14 @@ impl Ways {
         }
         let rows = out.iter().zip(0..);
         let reversed =
-            rows.flat_map(|(ways, from)| ways.iter().map(move |way| (way.state, Way { state: from, ..*way })));
+            rows.flat_map(|(ways, from)| ways.iter().map(move |way| (way.state, SweepWay { state: from, ..*way })));
         let into = Rows::try_of_entries(graph.n_states(), reversed, || meter.go_on(1))?;
         Ok(Some(Self { out, into, costs: model.actions().iter().map(|action| action.cost).collect() }))
     }
 
     /// How much memory the ways of so many states take, in bytes.
     pub(super) fn bytes_for(n_states: usize, n_ways: usize) -> usize {
-        2 * (n_states * size_of::<u32>() + n_ways * size_of::<Way>())
+        2 * (n_states * size_of::<u32>() + n_ways * size_of::<SweepWay>())
     }
 
     /// Writes to `here` what it costs to go on from each state at an observation with these `distances`, if being at it at the next one
@@ -218,7 +218,7 @@ impl Ways {
     fn cheapest(
         &self,
         cost: f64,
-        ways: &[Way],
+        ways: &[SweepWay],
         arrivals: &[f64],
         link_by: impl Fn(u16) -> GoOnLink,
     ) -> (f64, Option<GoOnLink>) {
