@@ -77,7 +77,7 @@ fn what_does_not_fit_is_not_projected_and_changes_no_optimum() {
         let request = json!({"model": "line", "demonstration": seen});
         let mut faults = etude_core::document::Faults::default();
         let place = etude_core::document::Place::root(&request);
-        let object = place.object(&etude_core::mapping::Request::FIELDS, &mut faults).unwrap();
+        let object = place.object(etude_core::mapping::Request::FIELDS, &mut faults).unwrap();
         let request = etude_core::mapping::Request::read(mapper.model(), &object, &mut faults).unwrap();
         let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();
         (mapping.cost, mapping.status)
