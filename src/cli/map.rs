@@ -85,7 +85,7 @@ impl Map {
             elapsed_us: as_micros(clock.elapsed(started)),
             ..Stamp::default()
         };
-        let policy = Policy::new(stamp, &asked.problem, &mapping);
+        let policy = Policy::new(&stamp, &asked.problem, &mapping)?;
         if self.json {
             serde_json::to_writer(&mut *out, &policy).map_err(io::Error::from)?;
             writeln!(out)?;

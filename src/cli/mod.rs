@@ -80,6 +80,9 @@ enum CliError {
     /// An observation could not be mapped.
     #[error(transparent)]
     Stopped(#[from] etude_core::mapping::Stopped),
+    /// A policy could not be written.
+    #[error(transparent)]
+    WritePolicy(#[from] etude_core::mapping::WriteError),
     /// A model could not be prepared.
     #[error(transparent)]
     Interrupted(#[from] etude_core::interrupt::Interrupted),

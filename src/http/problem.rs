@@ -12,7 +12,7 @@ use utoipa::{IntoResponses, ToSchema};
 use super::encoding::{BodyError, Encoding};
 use super::request_id::RequestId;
 use crate::memory::NoRoom;
-use crate::service::{self, PoolError, ServiceError};
+use crate::service::{self, Kind, PoolError, ServiceError};
 use crate::service::{StoreError, Unavailable};
 use etude_core::document::{Fault, Faults, ParseError};
 
@@ -284,11 +284,11 @@ impl From<ServiceError> for Problem {
             ServiceError::Body(error) => Self::unreadable(&error),
             ServiceError::Unknown { kind, pointer, .. } => {
                 let problem = match kind {
-                    "policy" => ProblemKind::UnknownPolicy,
-                    "learner" => ProblemKind::UnknownLearner,
-                    "session" => ProblemKind::UnknownSession,
-                    "trial" => ProblemKind::UnknownTrial,
-                    _ => ProblemKind::UnknownModel,
+                    Kind::Model => ProblemKind::UnknownModel,
+                    Kind::Policy => ProblemKind::UnknownPolicy,
+                    Kind::Learner => ProblemKind::UnknownLearner,
+                    Kind::Session => ProblemKind::UnknownSession,
+                    Kind::Trial => ProblemKind::UnknownTrial,
                 };
                 let fault =
                     pointer.map(|pointer| Fault { line: None, pointer: pointer.to_owned(), detail: detail.clone() });

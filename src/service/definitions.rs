@@ -7,7 +7,7 @@ use tokio::sync::mpsc;
 
 use super::hash::hex;
 use super::search::MAX_INLINE_BYTES;
-use super::{Etude, ServiceError};
+use super::{Etude, Kind, ServiceError};
 use crate::memory::{Held, Memory, SMALL_BYTES};
 use crate::store::{ModelSummary, PIECE_BYTES, Store};
 use etude_core::interrupt::Interrupt;
@@ -142,7 +142,7 @@ impl BufRead for Counted {
 }
 
 pub(super) fn unknown(name: &str, pointer: Option<&'static str>) -> ServiceError {
-    ServiceError::Unknown { kind: "model", name: name.to_owned(), pointer }
+    ServiceError::Unknown { kind: Kind::Model, name: name.to_owned(), pointer }
 }
 
 pub(super) fn corrupt_definition(model: &str, source: Box<dyn std::error::Error + Send + Sync>) -> ServiceError {

@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 
 use super::hash::hash_of;
-use super::{Etude, Name, Registered, ServiceError, as_stored};
+use super::{Etude, Kind, Name, Registered, ServiceError, as_stored};
 use crate::store::{Deletion, Fold, LearnerRecord, NewLearner, Page, Registration, WeightsRecord};
 use etude_core::document;
 use etude_core::learning::{Distribution, Learner, LearnerDocument};
@@ -297,7 +297,7 @@ impl Etude {
 }
 
 pub(super) fn unknown(name: &str, pointer: Option<&'static str>) -> ServiceError {
-    ServiceError::Unknown { kind: "learner", name: name.to_owned(), pointer }
+    ServiceError::Unknown { kind: Kind::Learner, name: name.to_owned(), pointer }
 }
 
 /// The text of a definition, if it is the one that was accepted.

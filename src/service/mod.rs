@@ -52,7 +52,9 @@ pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
 pub(crate) use pool::Places;
 pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
-pub use sessions::{CommittedSteps, Ended, Observation, Received, Resumed, RewardState, Session, SessionError};
+pub use sessions::{
+    CommittedSteps, Ended, Observation, Received, Resumed, RewardState, Session, SessionError, SessionPolicy,
+};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 pub use trials::TrialAnswer;
@@ -132,6 +134,35 @@ impl TimeLimits {
     };
 }
 
+/// What has a name or an id.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// A model.
+    Model,
+    /// A policy.
+    Policy,
+    /// A learner.
+    Learner,
+    /// A session.
+    Session,
+    /// A trial.
+    Trial,
+}
+
+impl Kind {
+    /// What it is called in problems.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Model => "model",
+            Self::Policy => "policy",
+            Self::Learner => "learner",
+            Self::Session => "session",
+            Self::Trial => "trial",
+        }
+    }
+}
+
 /// Why the service could not do as asked.
 #[derive(Debug, thiserror::Error)]
 pub enum ServiceError {
@@ -148,10 +179,10 @@ pub enum ServiceError {
     #[error("the body could not be read")]
     Body(#[source] std::io::Error),
     /// There is nothing of this kind with this name or id.
-    #[error("there is no {kind} {}", Quoted(name))]
+    #[error("there is no {} {}", kind.name(), Quoted(name))]
     Unknown {
         /// What was looked for.
-        kind: &'static str,
+        kind: Kind,
         /// By which name or id.
         name: String,
         /// Where the request's body names it, if it does.

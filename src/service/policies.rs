@@ -7,7 +7,7 @@ use uuid::Uuid;
 use super::learners::LearnerState;
 use super::requests::{Named, SentRequest, base_weights, check_request};
 use super::search::{Extent, MAX_INLINE_BYTES, Searched, follow, is_quick, max_quick_observations};
-use super::{Caller, Etude, ServiceError};
+use super::{Caller, Etude, Kind, ServiceError};
 use crate::memory::{Held, Memory};
 use crate::store::Page;
 use etude_core::attribute::Weights;
@@ -97,7 +97,7 @@ impl Etude {
     ///
     /// If there is none, or no memory for it.
     pub async fn policy(&self, id: &str) -> Result<(String, Option<Held>), ServiceError> {
-        let unknown = || ServiceError::Unknown { kind: "policy", name: id.to_owned(), pointer: None };
+        let unknown = || ServiceError::Unknown { kind: Kind::Policy, name: id.to_owned(), pointer: None };
         self.store.policy_within(id, &self.memory).await?.ok_or_else(unknown)
     }
 

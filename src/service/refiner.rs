@@ -23,13 +23,13 @@ use uuid::Uuid;
 
 use super::refined::RefinedRequest;
 use super::requests::most_demonstration_bytes;
-use super::search::{PolicyText, as_micros, report, take_for_search, write_policy};
-use super::{Etude, PoolError, ServiceError};
+use super::search::{PolicyText, as_micros, report, take_for_search};
+use super::{Etude, Kind, PoolError, ServiceError};
 use crate::memory::Memory;
 use crate::store::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError};
 use etude_core::attribute::Weights;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
-use etude_core::mapping::{Demonstration, Mapper, Policy, Problem, Request, Settings, Stamp, Status};
+use etude_core::mapping::{Demonstration, Mapper, Policy, Problem, Request, Settings, Stamp, Status, WrittenPolicy};
 use etude_core::model::{Model, Origin, StateIdx};
 
 /// The first pause after a refinement that did not come to its end.
@@ -178,7 +178,7 @@ impl Etude {
         if hash != model_hash {
             // Another one is there under its name.
             let name = refined.model.into_owned();
-            return Err(ServiceError::Unknown { kind: "model", name, pointer: None });
+            return Err(ServiceError::Unknown { kind: Kind::Model, name, pointer: None });
         }
         let (texts, held) = match (&session_id, refined.demonstration) {
             (Some(session), _) => {
@@ -261,7 +261,8 @@ fn optimum(
     if mapping.status != Status::Optimal || Policy::check_steps(mapper.model(), &mapping).is_err() {
         return Ok(Ok(None));
     }
-    Ok(write_policy(stamp, &request.problem, &mapping).map(|(_, row)| Some(row)))
+    let written = WrittenPolicy::new(&stamp, &request.problem, &mapping).map_err(ServiceError::from);
+    Ok(written.and_then(|written| PolicyText::of(stamp, written)).map(Some))
 }
 
 #[cfg(test)]

@@ -14,7 +14,7 @@ use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::store::{NewPolicy, NewRefinement, pack_steps};
 use etude_core::document::{Faults, Path};
 use etude_core::interrupt::{Cancelled, Interrupt};
-use etude_core::mapping::{Demonstration, Mapper, Mapping, Policy, Problem, Request, Stamp, Status, WrittenPolicy};
+use etude_core::mapping::{Demonstration, Mapper, Mapping, Policy, Request, Stamp, Status, WrittenPolicy};
 use etude_core::model::Model;
 
 /// Bodies up to this size are parsed where they arrive, which takes less than a millisecond; larger ones in the pool. Likewise
@@ -83,22 +83,16 @@ pub(super) struct PolicyText {
 }
 
 impl PolicyText {
+    /// That of the policy `written`, which has the id of `stamp`.
+    pub(super) fn of(stamp: Stamp, written: WrittenPolicy<'_>) -> Result<Self, ServiceError> {
+        let (summary, steps) = written.into_stored();
+        Ok(Self { id: stamp.id.unwrap_or_default(), summary, steps: pack_steps(&steps)? })
+    }
+
     pub(super) fn at(self, created_at: Timestamp) -> NewPolicy {
         let Self { id, summary, steps } = self;
         NewPolicy { id, summary, steps, created_at }
     }
-}
-
-/// Writes the policy of `mapping`, which has an id: as it will be answered, and as it will be stored.
-pub(super) fn write_policy(
-    stamp: Stamp,
-    problem: &Problem<'_>,
-    mapping: &Mapping,
-) -> Result<(String, PolicyText), ServiceError> {
-    let written = WrittenPolicy::new(&stamp, problem, mapping)?;
-    let WrittenPolicy { answer, summary, steps } = written;
-    let steps = pack_steps(&steps)?;
-    Ok((answer, PolicyText { id: stamp.id.unwrap_or_default(), summary, steps }))
 }
 
 /// Follows what `request` asks for with what that needs of `memory`, and writes the policy, unless that is too large. `observed` is the text
@@ -141,7 +135,9 @@ pub(super) fn follow(
         refined.observing_text(observed)?.waiting(&stamp, None)
     });
     let written = refinement.transpose().and_then(|refinement| {
-        let (policy, row) = write_policy(stamp, &request.problem, &mapping)?;
+        let written = WrittenPolicy::new(&stamp, &request.problem, &mapping)?;
+        let policy = written.answer(None)?;
+        let row = PolicyText::of(stamp, written)?;
         // What was estimated may have been too little.
         memory.hold(&mut held, N_COPIES * policy.len() + n_refined_bytes)?;
         Ok(Searched { policy, row, refinement, held })

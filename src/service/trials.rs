@@ -11,7 +11,7 @@ use uuid::Uuid;
 use super::learners::{LearnerState, unknown};
 use super::requests::check_request;
 use super::search::{Searched, write};
-use super::{Caller, Etude, Name, PoolError, ServiceError, as_stored};
+use super::{Caller, Etude, Kind, Name, PoolError, ServiceError, as_stored};
 use crate::memory::Held;
 use crate::store::{FailureAnswer, NewReward, NewTrial, Opened, Page, RewardAnswer, TrialRecord, TrialStatus};
 use etude_core::attribute::{Schema, Weights};
@@ -288,7 +288,7 @@ fn check_attributes(learner: &Learner, model: &Model, faults: &mut Faults) {
 }
 
 fn unknown_trial(id: &str) -> ServiceError {
-    ServiceError::Unknown { kind: "trial", name: id.to_owned(), pointer: None }
+    ServiceError::Unknown { kind: Kind::Trial, name: id.to_owned(), pointer: None }
 }
 
 fn read_policy(policy: String, id: &str) -> Result<Box<RawValue>, ServiceError> {

@@ -14,7 +14,7 @@ use super::page::{Rest, Rows};
 use super::refinements::NewRefinement;
 use super::{Page, Store, StoreError, as_integer};
 use crate::memory::{Held, Memory};
-use etude_core::mapping::{ShortSteps, StoredPolicy};
+use etude_core::mapping::{ShortSteps, WrittenPolicy};
 
 /// A policy to be stored.
 #[derive(Clone, Debug)]
@@ -208,14 +208,14 @@ fn write_answer(
     memory: &Memory,
 ) -> Result<Option<(String, Option<Held>)>, StoreError> {
     let steps = postcard::from_bytes(steps).map_err(corrupt("steps"))?;
-    let stored = StoredPolicy::read(summary, steps).map_err(corrupt("steps"))?;
+    let stored = WrittenPolicy::read(summary, steps).map_err(corrupt("steps"))?;
     let n_bytes = stored.answer_bytes().map_err(corrupt("steps"))?;
     if n_bytes > max_bytes {
         return Ok(None);
     }
     let mut held = None;
     memory.hold(&mut held, n_bytes)?;
-    let answer = stored.answer(n_bytes).map_err(corrupt("steps"))?;
+    let answer = stored.answer(Some(n_bytes)).map_err(corrupt("steps"))?;
     debug_assert!(answer.len() + MAX_LINK_BYTES <= n_bytes, "{} of {n_bytes}", answer.len());
     Ok(Some((answer, held)))
 }
@@ -326,7 +326,7 @@ mod tests {
 
     use super::*;
     use etude_core::interrupt::Uninterrupted;
-    use etude_core::mapping::{Demonstration, Mapper, Problem, Stamp, WrittenPolicy};
+    use etude_core::mapping::{Demonstration, Mapper, Problem, Stamp};
     use etude_core::model::{Definition, Limits, Model};
 
     /// A policy of a line of so many states with long names, which goes all the way: its answer, its summary and its steps as they are
@@ -352,7 +352,9 @@ mod tests {
         let problem = Problem::new(mapper.model(), demonstration, weights, None);
         let mapping = mapper.map(&problem, etude_core::mapping::Settings::default(), &mut Uninterrupted).unwrap();
         let stamp = Stamp { id: Some(id.to_owned()), ..Stamp::default() };
-        let WrittenPolicy { answer, summary, steps } = WrittenPolicy::new(&stamp, &problem, &mapping).unwrap();
+        let written = WrittenPolicy::new(&stamp, &problem, &mapping).unwrap();
+        let answer = written.answer(None).unwrap();
+        let (summary, steps) = written.into_stored();
         (answer, summary, pack_steps(&steps).unwrap())
     }
 

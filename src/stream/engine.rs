@@ -492,7 +492,7 @@ fn ends(error: &SessionError) -> Over {
             not_allowed(&detail)
         }
         SessionError::Service(ServiceError::Unknown { kind, .. }) => {
-            Over::because(Closed::Unknown, StreamProblem::new(&format!("unknown-{kind}"), detail))
+            Over::because(Closed::Unknown, StreamProblem::new(&format!("unknown-{}", kind.name()), detail))
         }
         SessionError::Service(ServiceError::Pool(PoolError::Stopped) | ServiceError::Store(StoreError::Closed)) => {
             Over::because(Closed::GoingAway, StreamProblem::new("stopping", detail))

@@ -5,9 +5,10 @@ use std::io;
 use serde::Serialize;
 use serde_json::Value;
 
+use crate::service::SessionPolicy;
 use etude_core::attribute::{ByAttribute, Scalar};
 use etude_core::document::{Fault, Faults, Place};
-use etude_core::mapping::{CommittedStep, Cost, MoveKind, Policy, Status, Step};
+use etude_core::mapping::{CommittedStep, Cost, MoveKind, Status, Step};
 
 /// What a client sends.
 #[derive(Clone, Debug, PartialEq)]
@@ -279,14 +280,10 @@ impl<'f> From<&'f CommittedStep> for StepFrame<'f> {
     }
 }
 
-impl<'f> From<&'f Policy> for ServerFrame<'f> {
-    fn from(policy: &'f Policy) -> Self {
-        Self::Done {
-            policy_id: policy.id.as_deref(),
-            status: policy.status,
-            cost: policy.cost,
-            actions: Some(&policy.actions),
-        }
+impl<'f> From<&'f SessionPolicy> for ServerFrame<'f> {
+    fn from(policy: &'f SessionPolicy) -> Self {
+        let SessionPolicy { id, status, cost, actions } = policy;
+        Self::Done { policy_id: Some(id), status: *status, cost: *cost, actions: Some(actions) }
     }
 }
 

@@ -12,14 +12,10 @@ const CORE: &[&str] = &[];
 
 /// Circles of the service that are still to be opened.
 const SERVICE: &[&str] = &[
-    "store/alive, store/sessions",
     "store/arrivals, store/sessions",
     "store/arrivals, store/sessions/verbs",
     "store/models, store/writer",
     "store/policies, store/refinements",
-    "store/policies, store/sessions",
-    "store/refinements, store/sessions",
-    "store/sessions, store/trials",
     "stream/engine, stream/room",
 ];
 

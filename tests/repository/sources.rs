@@ -88,7 +88,10 @@ fn expand(tree: &str) -> Vec<Vec<String>> {
             '{' => depth += 1,
             '}' => depth -= 1,
             ',' if depth == 0 => {
-                paths.extend(expand(&inside[start..at]));
+                // Nothing stands behind a last comma.
+                if start < at {
+                    paths.extend(expand(&inside[start..at]));
+                }
                 start = at + 1;
             }
             _ => {}

@@ -19,7 +19,7 @@
 //! Mapper::map ---- search (layer by layer, best first) <---+
 //!    |                |  long: a sweep over all nodes; budget over: the incumbent, or completion (greedy)
 //!    v                v
-//! Mapping (moves, status, lower bound, counts) --> Policy (what a client gets), WrittenPolicy (the same, as it is answered and stored)
+//! Mapping (moves, status, lower bound, counts) --> WrittenPolicy (as it is stored and answered) --> Policy (read from the answer)
 //! ```
 //!
 //! [`OnlineMapping`] does the same while the demonstration is still running.
@@ -76,4 +76,4 @@ pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, Too
 pub use problem::Problem;
 pub use request::{ObservationDocument, ObservedDocument, Options, Request, RequestKind, StartReference};
 pub use search::{Move, MoveKind};
-pub use written::{ShortSteps, StoredPolicy, WriteError, WrittenPolicy};
+pub use written::{ShortSteps, WriteError, WrittenPolicy};

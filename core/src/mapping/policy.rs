@@ -5,7 +5,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::cost::{Cost, CostSum};
-use super::{Demonstration, Mapping, Move, MoveKind, Problem, Status, StoppedBy};
+use super::{Demonstration, Mapping, Move, MoveKind, Status, StoppedBy};
 use crate::attribute::{ByAttribute, Scalar};
 use crate::document::{Faults, Place};
 use crate::model::{Model, States};
@@ -108,29 +108,6 @@ pub struct PolicySummary<'p> {
     pub refined_by: Option<&'p str>,
 }
 
-impl<'p> PolicySummary<'p> {
-    /// The summary of `policy`.
-    #[must_use]
-    pub fn of(policy: &'p Policy) -> Self {
-        Self {
-            id: policy.id.as_deref(),
-            model: &policy.model,
-            model_hash: &policy.model_hash,
-            learner: policy.learner.as_deref(),
-            weights_version: policy.weights_version,
-            weights: &policy.weights,
-            lookahead: policy.lookahead,
-            status: policy.status,
-            cost: policy.cost,
-            lower_bound: policy.lower_bound,
-            coverage: policy.coverage,
-            search: policy.search,
-            refines: policy.refines.as_deref(),
-            refined_by: policy.refined_by.as_deref(),
-        }
-    }
-}
-
 /// A step of a policy. Executing it means keyed by `(observation, state)`, never by the state alone: a state may be passed
 /// again later.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -170,14 +147,6 @@ pub struct Coverage {
     pub observed: u32,
     /// How many of them some step meets at distance 0.
     pub exact: u32,
-}
-
-impl Coverage {
-    /// Of observations, of each of which is said whether some step meets it.
-    pub(super) fn of(is_exact: &[bool]) -> Self {
-        let count = |n: usize| u32::try_from(n).unwrap_or(u32::MAX);
-        Self { observed: count(is_exact.len()), exact: count(is_exact.iter().filter(|is_exact| **is_exact).count()) }
-    }
 }
 
 /// What a search took.
@@ -268,49 +237,6 @@ impl Policy {
     pub fn max_observations(model: &Model) -> usize {
         MAX_STATES_BYTES / model.state_bytes().max(1)
     }
-
-    /// The policy of `mapping`, which must be of `problem`.
-    #[must_use]
-    pub fn new(stamp: Stamp, problem: &Problem<'_>, mapping: &Mapping) -> Self {
-        let steps = steps(problem, mapping);
-        let mut is_exact = vec![false; problem.demonstration.len()];
-        for step in steps.iter().filter(|step| step.distance == 0.0) {
-            is_exact[step.observation as usize] = true;
-        }
-        Self {
-            id: stamp.id,
-            model: stamp.model,
-            model_hash: stamp.model_hash,
-            learner: stamp.learner,
-            weights_version: stamp.weights_version,
-            weights: problem.named_weights(),
-            lookahead: stamp.lookahead,
-            status: mapping.status,
-            cost: mapping.cost,
-            lower_bound: mapping.lower_bound,
-            actions: steps.iter().filter_map(|step| step.action.clone()).collect(),
-            steps,
-            coverage: Coverage::of(&is_exact),
-            search: SearchReport {
-                expanded: mapping.n_expanded,
-                generated: mapping.n_generated,
-                elapsed_us: stamp.elapsed_us,
-                stopped_by: mapping.stopped_by,
-            },
-            refines: stamp.refines,
-            refined_by: None,
-        }
-    }
-}
-
-fn steps(problem: &Problem<'_>, mapping: &Mapping) -> Vec<Step> {
-    let mut writer = StepWriter::default();
-    let states = mapping.states.as_ref().unwrap_or(problem.model.states());
-    let steps = mapping.moves.iter().map(|step| {
-        let terms = problem.distances.terms(step.observation as usize, states.row(step.state));
-        writer.write(problem.model, states, step, terms)
-    });
-    steps.collect()
 }
 
 /// Writes the steps of a policy, one after the other.

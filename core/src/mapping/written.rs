@@ -5,30 +5,52 @@
 //! answer is written from the same two, now and whenever it is asked for again.
 //!
 //! ```text
-//! Mapping --> summary, ShortSteps --> answer
-//!                |         |
-//!              store     store --> StoredPolicy: the same bytes
+//! Mapping --> summary, ShortSteps --> store
+//!                 |         |           |
+//!                 +--answer-+      read again: the same bytes
 //! ```
 
+use std::borrow::Cow;
 use std::ops::Range;
 
-use serde::de::{Error as _, IgnoredAny};
+use serde::de::Error as _;
 use serde::{Deserialize, Serialize};
 
 use super::cost::CostSum;
-use super::policy::{Coverage, PolicySummary, SearchReport, Stamp};
+use super::policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp};
 use super::{Mapping, MoveKind, Problem};
 use crate::attribute::ByAttribute;
 
-/// A policy, as it is answered and as it is stored.
+/// A policy as it is stored, from which its answer is written.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WrittenPolicy<'a> {
-    /// JSON: what a [`Policy`](super::Policy) is written as.
-    pub answer: String,
     /// JSON: what a [`PolicySummary`] is written as.
-    pub summary: String,
+    summary: Cow<'a, str>,
+    /// How many bytes of the summary an answer has before the actions and the steps.
+    n_before: usize,
+    /// Their names are those that the steps refer to, in this order.
+    weights: ByAttribute<f64>,
     /// The steps in short. In them, attributes are numbered as they stand in the summary's weights.
-    pub steps: ShortSteps<'a>,
+    short: ShortSteps<'a>,
+}
+
+/// The members that follow the steps, in their order.
+#[derive(Serialize)]
+struct End<'a> {
+    coverage: Coverage,
+    search: SearchReport,
+    refines: Option<&'a str>,
+    /// What is stored has no link yet.
+    refined_by: (),
+}
+
+impl End<'_> {
+    /// How many bytes of `summary` are before these members.
+    fn find(&self, summary: &str) -> Result<usize, WriteError> {
+        let end = serde_json::to_string(self)?;
+        let before = summary.strip_suffix(&end["{".len()..]).ok_or(WriteError::Summary)?;
+        Ok(before.len())
+    }
 }
 
 impl<'a> WrittenPolicy<'a> {
@@ -43,12 +65,13 @@ impl<'a> WrittenPolicy<'a> {
         const WEIGHT_BYTES: usize = 24;
         let weights = problem.named_weights();
         let short = ShortSteps::of(problem, mapping)?;
-        let mut is_exact = vec![false; problem.demonstration.len()];
-        let mut n_terms = 0;
-        for step in &short.steps {
-            n_terms = step.n_terms.unwrap_or(n_terms);
-            is_exact[step.observation as usize] |= n_terms == 0;
-        }
+        let coverage = short.coverage(problem.demonstration.len());
+        let search = SearchReport {
+            expanded: mapping.n_expanded,
+            generated: mapping.n_generated,
+            elapsed_us: stamp.elapsed_us,
+            stopped_by: mapping.stopped_by,
+        };
         let summary = PolicySummary {
             id: stamp.id.as_deref(),
             model: &stamp.model,
@@ -60,56 +83,40 @@ impl<'a> WrittenPolicy<'a> {
             status: mapping.status,
             cost: mapping.cost,
             lower_bound: mapping.lower_bound,
-            coverage: Coverage::of(&is_exact),
-            search: SearchReport {
-                expanded: mapping.n_expanded,
-                generated: mapping.n_generated,
-                elapsed_us: stamp.elapsed_us,
-                stopped_by: mapping.stopped_by,
-            },
+            coverage,
+            search,
             refines: stamp.refines.as_deref(),
             refined_by: None,
         };
         let mut text = Vec::with_capacity(SUMMARY_BYTES + weights.iter().count() * WEIGHT_BYTES);
         serde_json::to_writer(&mut text, &summary)?;
         let summary = String::from_utf8(text).map_err(serde_json::Error::custom)?;
-        let answer = answer(&summary, weights.iter().map(|(name, _)| name), &short, None)?;
-        Ok(Self { answer, steps: short, summary })
+        let n_before = End { coverage, search, refines: stamp.refines.as_deref(), refined_by: () }.find(&summary)?;
+        Ok(Self { summary: summary.into(), n_before, weights, short })
     }
-}
 
-/// Why a policy could not be written, or read again: a defect, or something stored that this program does not write.
-#[derive(Debug, thiserror::Error)]
-pub enum WriteError {
-    /// In its JSON.
-    #[error("a policy is not what JSON can hold")]
-    Json(#[from] serde_json::Error),
-    /// In its steps in short, something is referred to that is not there.
-    #[error("the steps of a policy refer to {0} that is not there")]
-    Missing(&'static str),
-}
-
-/// A policy as it is stored, about to be written as it was answered.
-#[derive(Debug)]
-pub struct StoredPolicy<'s> {
-    summary: &'s str,
-    weights: ByAttribute<IgnoredAny>,
-    short: ShortSteps<'s>,
-}
-
-impl<'s> StoredPolicy<'s> {
-    /// The policy with this summary and these steps in short.
+    /// The policy that was stored with this summary and these steps in short.
     ///
     /// # Errors
     ///
     /// If one of the two is not what this program writes.
-    pub fn read(summary: &'s str, steps: ShortSteps<'s>) -> Result<Self, WriteError> {
+    pub fn read(summary: &'a str, steps: ShortSteps<'a>) -> Result<Self, WriteError> {
         #[derive(Deserialize)]
-        struct Weights {
-            weights: ByAttribute<IgnoredAny>,
+        struct Summary {
+            weights: ByAttribute<f64>,
+            coverage: Coverage,
+            search: SearchReport,
+            refines: Option<String>,
         }
-        let Weights { weights } = serde_json::from_str(summary)?;
-        Ok(Self { summary, weights, short: steps })
+        let Summary { weights, coverage, search, refines } = serde_json::from_str(summary)?;
+        let n_before = End { coverage, search, refines: refines.as_deref(), refined_by: () }.find(summary)?;
+        Ok(Self { summary: summary.into(), n_before, weights, short: steps })
+    }
+
+    /// What is stored: the summary, JSON as that of a [`PolicySummary`], and the steps in short.
+    #[must_use]
+    pub fn into_stored(self) -> (String, ShortSteps<'a>) {
+        (self.summary.into_owned(), self.short)
     }
 
     fn names(&self) -> impl Iterator<Item = &str> {
@@ -152,19 +159,81 @@ impl<'s> StoredPolicy<'s> {
         Ok(n_bytes)
     }
 
-    /// The policy as it was answered (JSON), in room for so many bytes.
+    /// The policy as it is answered (JSON): what a [`Policy`] is written as. Begins with room for `n_bytes`, or for about
+    /// as many as it takes.
     ///
     /// # Errors
     ///
-    /// If what is stored is not what this program writes.
-    pub fn answer(&self, n_bytes: usize) -> Result<String, WriteError> {
-        answer(self.summary, self.names(), &self.short, Some(n_bytes))
+    /// If it was stored, and that is not what this program writes.
+    pub fn answer(&self, n_bytes: Option<usize>) -> Result<String, WriteError> {
+        let Self { summary, n_before, short, .. } = self;
+        let (before, end) = summary.split_at(*n_before);
+        let pieces = Pieces::of(self.names(), &short.actions)?;
+        let mut writer = AnswerWriter::new(&pieces, summary.len(), short.steps.len(), n_bytes)?;
+        writer.raw(before);
+        writer.raw(r#""actions":["#);
+        for (n, place) in short.steps.iter().filter_map(|step| step.action).enumerate() {
+            writer.raw(if n == 0 { "" } else { "," });
+            writer.raw(pieces.action(place)?.0);
+        }
+        writer.raw(r#"],"steps":["#);
+        let (mut changed, mut values) = (short.changed.iter(), short.values.as_str());
+        let mut terms = short.terms.as_slice();
+        let mut before = None;
+        for step in &short.steps {
+            for (position, n_bytes) in changed.by_ref().take(step.n_changed as usize) {
+                let (value, rest) = values.split_at_checked(*n_bytes as usize).ok_or(WriteError::Missing("a value"))?;
+                writer.set_value(*position, value)?;
+                values = rest;
+            }
+            if let Some(n_terms) = step.n_terms {
+                let (own, rest) = terms.split_at_checked(n_terms as usize).ok_or(WriteError::Missing("a term"))?;
+                writer.set_terms(own)?;
+                terms = rest;
+            }
+            writer.raw(if before.is_none() { "" } else { "," });
+            let kind = match (before.replace(step.observation), step.action) {
+                (None, _) => MoveKind::Start,
+                (Some(_), None) => MoveKind::Skip,
+                (Some(before), Some(_)) if before == step.observation => MoveKind::Extra,
+                (Some(_), Some(_)) => MoveKind::Match,
+            };
+            writer.step(step, kind)?;
+        }
+        writer.raw("],");
+        writer.raw(end);
+        Ok(String::from_utf8(writer.text).map_err(serde_json::Error::custom)?)
     }
+}
+
+impl Policy {
+    /// The policy of `mapping`, which must be of `problem`: what its answer tells.
+    ///
+    /// # Errors
+    ///
+    /// Only for costs beyond what JSON can hold.
+    pub fn new(stamp: &Stamp, problem: &Problem<'_>, mapping: &Mapping) -> Result<Self, WriteError> {
+        Ok(serde_json::from_str(&WrittenPolicy::new(stamp, problem, mapping)?.answer(None)?)?)
+    }
+}
+
+/// Why a policy could not be written, or read again: a defect, or something stored that this program does not write.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    /// In its JSON.
+    #[error("a policy is not what JSON can hold")]
+    Json(#[from] serde_json::Error),
+    /// In its steps in short, something is referred to that is not there.
+    #[error("the steps of a policy refer to {0} that is not there")]
+    Missing(&'static str),
+    /// Its summary has other members, or in another order.
+    #[error("the summary of a policy does not end with its coverage, its search and its links")]
+    Summary,
 }
 
 /// The steps of a policy, in short. What some steps have more of than others stands together, in the order of the steps.
 ///
-/// There to be serialized, in whatever format, and to be read as a [`StoredPolicy`].
+/// There to be serialized, in whatever format, and to be read as a [`WrittenPolicy`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ShortSteps<'a> {
     /// Names and costs of the actions that are taken.
@@ -253,6 +322,18 @@ impl<'a> ShortSteps<'a> {
         Ok(short)
     }
 
+    /// How many of so many observations they meet exactly.
+    fn coverage(&self, n_observations: usize) -> Coverage {
+        let mut is_exact = vec![false; n_observations];
+        let mut n_terms = 0;
+        for step in &self.steps {
+            n_terms = step.n_terms.unwrap_or(n_terms);
+            is_exact[step.observation as usize] |= n_terms == 0;
+        }
+        let n_exact = is_exact.iter().filter(|is_exact| **is_exact).count();
+        Coverage { observed: count(n_observations), exact: count(n_exact) }
+    }
+
     /// About how many bytes they take in a format in which small numbers take one.
     #[must_use]
     pub fn n_bytes(&self) -> usize {
@@ -286,54 +367,6 @@ fn distance(terms: &[(u32, f64)]) -> f64 {
 /// A number of things of which a policy has far fewer than 2^32.
 fn count(n: usize) -> u32 {
     u32::try_from(n).unwrap_or(u32::MAX)
-}
-
-/// Writes a policy as it is answered: its summary, with the actions and the steps before the coverage. `names` are those of the
-/// attributes. Begins with room for `n_bytes`, or for about as many as it takes.
-fn answer<'n>(
-    summary: &str,
-    names: impl Iterator<Item = &'n str>,
-    short: &ShortSteps<'_>,
-    n_bytes: Option<usize>,
-) -> Result<String, WriteError> {
-    /// What comes after the steps. No string in JSON has a quote that is not escaped, and no weight is an object.
-    const AFTER: &str = r#""coverage":{"#;
-    let (before, after) = summary.split_at(summary.rfind(AFTER).ok_or(WriteError::Missing("a coverage"))?);
-    let pieces = Pieces::of(names, &short.actions)?;
-    let mut writer = AnswerWriter::new(&pieces, summary.len(), short.steps.len(), n_bytes)?;
-    writer.raw(before);
-    writer.raw(r#""actions":["#);
-    for (n, place) in short.steps.iter().filter_map(|step| step.action).enumerate() {
-        writer.raw(if n == 0 { "" } else { "," });
-        writer.raw(pieces.action(place)?.0);
-    }
-    writer.raw(r#"],"steps":["#);
-    let (mut changed, mut values) = (short.changed.iter(), short.values.as_str());
-    let mut terms = short.terms.as_slice();
-    let mut before = None;
-    for step in &short.steps {
-        for (position, n_bytes) in changed.by_ref().take(step.n_changed as usize) {
-            let (value, rest) = values.split_at_checked(*n_bytes as usize).ok_or(WriteError::Missing("a value"))?;
-            writer.set_value(*position, value)?;
-            values = rest;
-        }
-        if let Some(n_terms) = step.n_terms {
-            let (own, rest) = terms.split_at_checked(n_terms as usize).ok_or(WriteError::Missing("a term"))?;
-            writer.set_terms(own)?;
-            terms = rest;
-        }
-        writer.raw(if before.is_none() { "" } else { "," });
-        let kind = match (before.replace(step.observation), step.action) {
-            (None, _) => MoveKind::Start,
-            (Some(_), None) => MoveKind::Skip,
-            (Some(before), Some(_)) if before == step.observation => MoveKind::Extra,
-            (Some(_), Some(_)) => MoveKind::Match,
-        };
-        writer.step(step, kind)?;
-    }
-    writer.raw("],");
-    writer.raw(after);
-    Ok(String::from_utf8(writer.text).map_err(serde_json::Error::custom)?)
 }
 
 /// About how many bytes a value of a state takes.

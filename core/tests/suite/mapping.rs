@@ -336,7 +336,7 @@ fn a_policy_that_is_not_optimal_says_what_ran_out_and_one_that_is_says_nothing()
         let map = |budget, signal: Signal| {
             let settings = Settings { budget, ..request.settings };
             let mapping = mapper.map(&request.problem, settings, &mut || signal).unwrap();
-            let policy = Policy::new(Stamp::default(), &request.problem, &mapping);
+            let policy = Policy::new(&Stamp::default(), &request.problem, &mapping).unwrap();
             let report = serde_json::to_value(policy.search).unwrap();
             assert_eq!(report.get("stopped_by"), mapping.stopped_by.map(|by| json!(by.name())).as_ref());
             (mapping.stopped_by, mapping.status == Status::Optimal)

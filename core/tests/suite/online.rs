@@ -182,7 +182,7 @@ fn where_time_or_expansions_are_up_what_a_lookahead_has_not_decided_is_followed_
         assert_eq!(mapping.moves[0], whole.moves[0]);
         assert_eq!(mapping.moves.last().unwrap().observation, 119);
         // As legal as any: it can be followed again.
-        let policy = Policy::new(Stamp::default(), &request.problem, mapping);
+        let policy = Policy::new(&Stamp::default(), &request.problem, mapping).unwrap();
         assert!(close(policy.steps.last().unwrap().cost, mapping.cost.total));
         let n_same = mapping.moves.iter().zip(&whole.moves).take_while(|(step, other)| step == other).count();
         mapping.moves[n_same.min(mapping.moves.len() - 1)].observation

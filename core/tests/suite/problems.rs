@@ -35,7 +35,7 @@ pub(crate) fn solve(mapper: &Mapper, request: &Value) -> Policy {
     let read = Request::read(mapper.model(), &object, &mut faults);
     let request = faults.check(read).unwrap();
     let mapping = mapper.map(&request.problem, request.settings, &mut Uninterrupted).unwrap();
-    Policy::new(Stamp::default(), &request.problem, &mapping)
+    Policy::new(&Stamp::default(), &request.problem, &mapping).unwrap()
 }
 
 pub(crate) fn close(a: f64, b: f64) -> bool {

@@ -17,14 +17,13 @@ use serde_json::Value;
 use tokio_util::sync::CancellationToken;
 
 use session::Source;
-pub use session::{CommittedSteps, Ended, Observation, Received, RewardState, Session};
+pub use session::{CommittedSteps, Ended, Observation, Received, RewardState, Session, SessionPolicy};
 
 use super::opening::{self, SessionOptions};
 use super::owners::{Ownership, TakenOver};
 use super::requests::Named;
-use super::search::MAX_INLINE_BYTES;
-use super::{Caller, Etude, PoolError, ServiceError};
-use crate::memory::Held;
+use super::{Caller, Etude, Kind, PoolError, ServiceError};
+use crate::memory::{Held, Memory};
 use crate::store::{
     MAX_EXPIRED_AT_ONCE, NewSession, Opened, Owner, Page, SessionRecord, SessionRefusal, SessionStatus, StoreError,
     Taken,
@@ -32,9 +31,7 @@ use crate::store::{
 use etude_core::attribute::{ByAttribute, Schema, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, time_until_finish};
-use etude_core::mapping::{
-    Budget, CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, RequestKind, TooManySteps,
-};
+use etude_core::mapping::{Budget, Demonstration, Mapper, OnlineMapping, RequestKind, TooManySteps};
 use etude_core::model::Model;
 
 /// Why a session could not do as told.
@@ -117,7 +114,7 @@ pub struct Resumed {
     /// Every step that was committed so far.
     pub steps: CommittedSteps,
     /// Its policy, if it has ended. Its memory is held with the steps.
-    pub policy: Option<Policy>,
+    pub policy: Option<SessionPolicy>,
 }
 
 impl Etude {
@@ -178,7 +175,7 @@ impl Etude {
             Opened::Yes => {}
             Opened::NoLearner => {
                 let name = source.learner.unwrap_or_default();
-                return Err(ServiceError::Unknown { kind: "learner", name, pointer: Some("/learner") }.into());
+                return Err(ServiceError::Unknown { kind: Kind::Learner, name, pointer: Some("/learner") }.into());
             }
             Opened::NumberTaken => return Err(PoolError::Busy.into()),
         }
@@ -236,7 +233,7 @@ impl Etude {
         // Registered anew, the same world may have become too large to be known in full.
         if hash != row.model_hash || mapper.model().is_lazy() {
             let name = format!("{} with hash {}", row.model, row.model_hash);
-            return Err(ServiceError::Unknown { kind: "model", name, pointer: None }.into());
+            return Err(ServiceError::Unknown { kind: Kind::Model, name, pointer: None }.into());
         }
         let weights = weights_in_order(&row.weights, mapper.model().schema(), id)?;
         let lookahead = row.lookahead.and_then(NonZeroU32::new);
@@ -277,35 +274,20 @@ impl Etude {
             };
             steps = session.advance(self, observations).await?;
         }
-        let policy = match row.policy_id {
-            None => None,
-            Some(policy_id) => {
+        let policy = match (row.policy_id, session.online.take()) {
+            (Some(policy_id), Some(online)) => {
                 // Whoever ended it may have been gone before there was something to refine.
                 self.refiner.wake();
-                if let Some(online) = session.online.take() {
-                    let (mapper, memory) = (Arc::clone(&session.mapper), self.memory.clone());
-                    let end = move |_: &mut dyn Interrupt| {
-                        let ended = steps.take_for(online.n_rest(), mapper.model(), &memory);
-                        Ok(ended.map(|()| {
-                            steps.extend(online.end().map(|(rest, _)| rest).unwrap_or_default());
-                            steps
-                        }))
-                    };
-                    steps = self.pool.run_patiently(caller.client, end).await?.map_err(ServiceError::from)?;
-                }
+                let (mapper, memory) = (Arc::clone(&session.mapper), self.memory.clone());
+                let end = move |_: &mut dyn Interrupt| Ok(end_again(online, steps, policy_id, mapper.model(), &memory));
+                let (ended, policy) = self.pool.run_patiently(caller.client, end).await??;
+                steps = ended;
                 session.n_steps = steps.len();
-                let (policy, _held) = self.policy(&policy_id).await?;
-                // It has the same steps, each of which names its attributes anew.
-                let n_bytes = steps.len() * CommittedStep::bytes_of(session.mapper.model()) + NAMES * policy.len();
-                steps.take_more(n_bytes, &self.memory).map_err(ServiceError::from)?;
-                let n_policy_bytes = policy.len();
-                let read = move || serde_json::from_str(&policy);
-                let read = if n_policy_bytes <= MAX_INLINE_BYTES {
-                    read()
-                } else {
-                    self.pool.read_patiently(caller.client, n_policy_bytes, read).await?
-                };
-                Some(read.map_err(|error| ServiceError::unreadable("policies", "policy", policy_id, error))?)
+                Some(policy)
+            }
+            (_, online) => {
+                session.online = online;
+                None
             }
         };
         Ok(Resumed { session, steps, policy })
@@ -404,7 +386,7 @@ impl Etude {
 const MIN_CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
 fn unknown(id: &str) -> ServiceError {
-    ServiceError::Unknown { kind: "session", name: id.to_owned(), pointer: None }
+    ServiceError::Unknown { kind: Kind::Session, name: id.to_owned(), pointer: None }
 }
 
 /// The weights of the session `id`, as they are stored, in the order of the model's attributes.
@@ -419,8 +401,23 @@ fn weights_in_order(weights: &ByAttribute<f64>, schema: &Schema, id: &str) -> Re
 /// Observations of up to so many values are read where they are needed, which takes less than a millisecond.
 const MAX_INLINE_VALUES: usize = 8192;
 
-/// What the names in a policy take once it is read, for each of its bytes: one of each for every attribute of a step.
-const NAMES: usize = 8;
+/// Commits the rest of a session that has ended to `steps`, and tells of its policy, which has this id.
+fn end_again(
+    online: OnlineMapping,
+    mut steps: CommittedSteps,
+    policy_id: String,
+    model: &Model,
+    memory: &Memory,
+) -> Result<(CommittedSteps, SessionPolicy), SessionError> {
+    let n_rest = online.n_rest();
+    let taken = steps.take_for(n_rest, model, memory);
+    taken
+        .and_then(|()| steps.take_more(SessionPolicy::most_bytes(steps.len() + n_rest), memory))
+        .map_err(ServiceError::from)?;
+    let (rest, mapping) = online.end().ok_or(SessionError::Empty)?;
+    steps.extend(rest);
+    Ok((steps, SessionPolicy::of(policy_id, model, &mapping)))
+}
 
 /// Reads observations of the session `id` that were stored, which were read without faults before.
 fn read_stored(
@@ -441,7 +438,6 @@ mod tests {
 
     use super::*;
     use crate::clock::{Clock, Ids};
-    use crate::memory::Memory;
     use crate::service::{Client, ModelText, Name, PoolSettings, Settings, TimeLimits};
     use etude_core::model::{Format, Limits};
 
@@ -511,13 +507,14 @@ mod tests {
         let mut resumed = etude.resume_session(&id, caller()).await.unwrap();
         assert!(resumed.steps.len() > 1000 && before - etude.memory.free() > 16 << 20, "{}", etude.memory.free());
         let ended = resumed.session.end(&etude, 1200, NOW).await.unwrap();
-        assert_eq!((resumed.steps.len() + ended.steps.len(), ended.policy.steps.len()), (1200, 1200));
+        assert_eq!(resumed.steps.len() + ended.steps.len(), 1200);
+        let ended_status = ended.policy.status;
         drop((resumed, ended));
         assert_eq!(etude.memory.free(), before);
 
         let again = etude.resume_session(&id, caller()).await.unwrap();
-        assert_eq!((again.steps.len(), again.policy.as_ref().unwrap().steps.len()), (1200, 1200));
-        assert!(before - etude.memory.free() > 32 << 20);
+        assert_eq!((again.steps.len(), again.policy.as_ref().unwrap().status), (1200, ended_status));
+        assert!(before - etude.memory.free() > 16 << 20);
         drop(again);
         assert_eq!(etude.memory.free(), before);
         let others = etude.memory.try_take(etude.memory.free_for_large()).unwrap();

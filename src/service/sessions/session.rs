@@ -14,14 +14,15 @@ use super::{SessionError, read_stored};
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::service::owners::Ownership;
 use crate::service::refined::RefinedRequest;
-use crate::service::search::{PolicyText, as_micros, report, take_beyond_small, write_policy};
+use crate::service::search::{PolicyText, as_micros, report, take_beyond_small};
 use crate::service::{Client, Etude, PoolError, ServiceError};
 use crate::store::{AcceptedReward, NewObservations, NewRefinement, Owner, SessionEnd, TrialRecord};
 use etude_core::attribute::{ByAttribute, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, Uninterrupted};
 use etude_core::mapping::{
-    CommittedStep, Demonstration, Mapper, OnlineMapping, Policy, Problem, Stamp, Status, Stopped,
+    CommittedStep, Cost, Demonstration, Mapper, Mapping, OnlineMapping, Policy, Problem, Stamp, Status, Stopped,
+    WrittenPolicy,
 };
 use etude_core::model::{Model, Origin};
 
@@ -122,7 +123,34 @@ pub struct Ended {
     /// The steps committed by the end.
     pub steps: CommittedSteps,
     /// The policy of the whole, stored. Its memory is held with the steps.
-    pub policy: Policy,
+    pub policy: SessionPolicy,
+}
+
+/// What a session tells of its policy.
+#[derive(Clone, Debug)]
+pub struct SessionPolicy {
+    /// Under which it is stored.
+    pub id: String,
+    /// What was proven of it.
+    pub status: Status,
+    /// What it costs.
+    pub cost: Cost,
+    /// Its actions, in order.
+    pub actions: Vec<Arc<str>>,
+}
+
+impl SessionPolicy {
+    /// The policy of `mapping`, which must be of `model`.
+    pub(super) fn of(id: String, model: &Model, mapping: &Mapping) -> Self {
+        let actions = mapping.moves.iter().filter_map(|step| step.action);
+        let actions = actions.map(|action| model.action_name(action)).collect();
+        Self { id, status: mapping.status, cost: mapping.cost, actions }
+    }
+
+    /// Most bytes that it takes if it has so many steps.
+    pub(super) fn most_bytes(n_steps: usize) -> usize {
+        n_steps.saturating_mul(size_of::<Arc<str>>())
+    }
 }
 
 /// What has become of the reward of a session.
@@ -374,8 +402,8 @@ impl Session {
         if is_refined {
             etude.refiner.wake();
         }
-        steps.give_back(written_bytes(policy.steps.len(), self.mapper.model()));
         self.n_steps += steps.len();
+        steps.give_back(written_bytes(self.n_steps, self.mapper.model()));
         Ok(Ended { steps, policy })
     }
 }
@@ -389,13 +417,13 @@ fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) 
 /// An observation as it was read. Shape `[n_attributes]`; `None` where an attribute was not observed.
 pub type Observation = Vec<Option<etude_core::attribute::Value>>;
 
-/// How many bytes so many steps take as they are written: as they are answered, and as they are stored.
+/// Most bytes that so many steps take as they are written to be stored.
 fn written_bytes(n_steps: usize, model: &Model) -> usize {
-    n_steps.saturating_mul(2 * Policy::step_bytes(model))
+    n_steps.saturating_mul(Policy::step_bytes(model))
 }
 
-/// Takes what the end of a session of `n_committed` steps needs: for the steps that are left, for its policy, and for that as it is
-/// written.
+/// Takes what the end of a session of `n_committed` steps needs: for the steps that are left, for what it tells of its policy, and for
+/// that as it is written.
 fn take_for_end(
     online: &OnlineMapping,
     n_committed: usize,
@@ -404,12 +432,12 @@ fn take_for_end(
 ) -> Result<CommittedSteps, NoRoom> {
     let (n_rest, mut steps) = (online.n_rest(), CommittedSteps::default());
     let n_steps = n_committed + n_rest;
-    steps.take_for(n_rest + n_steps, model, memory)?;
-    steps.take_more(written_bytes(n_steps, model), memory)?;
+    steps.take_for(n_rest, model, memory)?;
+    steps.take_more(SessionPolicy::most_bytes(n_steps) + written_bytes(n_steps, model), memory)?;
     Ok(steps)
 }
 
-type Concluded = (CommittedSteps, Policy, PolicyText, Option<NewRefinement>);
+type Concluded = (CommittedSteps, SessionPolicy, PolicyText, Option<NewRefinement>);
 
 /// Commits the rest to `steps`, and writes the policy of the whole session, which has this id and these observations.
 fn conclude(
@@ -429,11 +457,12 @@ fn conclude(
     let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
     let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
     report(&stamp, &mapping);
-    let policy = Policy::new(stamp.clone(), &problem, &mapping);
-    let (_, row) = write_policy(stamp.clone(), &problem, &mapping)?;
+    let policy = SessionPolicy::of(stamp.id.clone().unwrap_or_default(), mapper.model(), &mapping);
+    let written = WrittenPolicy::new(&stamp, &problem, &mapping).map_err(ServiceError::from)?;
     let refinement = (mapping.status == Status::Local)
         .then(|| RefinedRequest::of(&stamp.model, &problem, mapping.cost).waiting(&stamp, Some(id)));
     let refinement = refinement.transpose()?;
+    let row = PolicyText::of(stamp, written)?;
     Ok((steps, policy, row, refinement))
 }
 
