@@ -14,19 +14,19 @@
 use std::fmt;
 use std::iter::Enumerate;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use futures_util::future::try_join_all;
 use serde::de::{Deserializer, Error as _, SeqAccess, Visitor};
 use serde_json::Value;
 use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
-use uuid::Uuid;
 
 use super::learners::LearnerState;
 use super::requests::{Named, Names, SentRequest, base_weights, most_demonstration_bytes, n_observations};
-use super::search::{Extent, Searched, follow, take_for_demonstration};
+use super::search::{Extent, Means, Searched, follow, take_for_demonstration};
 use super::{Caller, Etude, MadePolicy, ServiceError};
+use crate::clock::{Clock, Ids};
 use crate::memory::{Held, Memory};
 use etude_core::attribute::Weights;
 use etude_core::document::{self, Faults, Members, Object, Path, Place};
@@ -78,8 +78,8 @@ impl Etude {
         let deadline = self.deadline(&names, caller.arrived);
         let place = place.waiting_until(deadline);
         let named = self.find(&names, faults, &place, deadline).await?;
-        let memory = self.memory.clone();
-        let read = move |_: &mut dyn Interrupt| Ok(Batch::read(sent, &names, named, memory));
+        let means = (self.memory.clone(), self.clock.clone(), self.ids.clone());
+        let read = move |_: &mut dyn Interrupt| Ok(Batch::read(sent, &names, named, means));
         let Some(batch) = place.run(None, read).await?? else { return Ok(None) };
         let batch = Arc::new(batch);
         let runners = (0..self.n_search_threads).map(|_| async {
@@ -206,6 +206,8 @@ struct Batch {
     /// What an item has unless it has its own.
     shared: Options,
     memory: Memory,
+    clock: Clock,
+    ids: Ids,
     /// For what waits.
     _sent_held: Option<Held>,
     /// What the answer takes.
@@ -220,7 +222,12 @@ type Outcome = (usize, Result<Searched, ServiceError>);
 impl Batch {
     /// Reads a batch against its model: what its items share, and their demonstrations. Nothing if something is wrong with the batch
     /// itself.
-    fn read(sent: SentRequest, names: &Names, named: Named, memory: Memory) -> Result<Option<Self>, ServiceError> {
+    fn read(
+        sent: SentRequest,
+        names: &Names,
+        named: Named,
+        (memory, clock, ids): (Memory, Clock, Ids),
+    ) -> Result<Option<Self>, ServiceError> {
         let model = named.mapper.model();
         let mut faults = Faults::default();
         let object = Place::root(&sent.rest).object(RequestKind::Batch.fields(), &mut faults);
@@ -257,14 +264,25 @@ impl Batch {
         let stamp = names.stamp(Stamp::default(), &named);
         let answer = Mutex::new(Answer { held: None, n_bytes: 0, n_other_bytes: 0, is_full: false });
         let waiting = Mutex::new(items.into_iter().enumerate());
-        Ok(Some(Self { _sent_held: held, mapper: named.mapper, stamp, weights, shared, memory, answer, waiting }))
+        Ok(Some(Self {
+            _sent_held: held,
+            mapper: named.mapper,
+            stamp,
+            weights,
+            shared,
+            memory,
+            clock,
+            ids,
+            answer,
+            waiting,
+        }))
     }
 
     /// Follows items that wait, one after the other, until a slice is over. Nothing if none waits any more.
     fn run_slice(&self, interrupt: &mut dyn Interrupt) -> Result<Vec<Outcome>, Cancelled> {
-        let started = Instant::now();
+        let started = self.clock.instant();
         let mut slice = Vec::new();
-        while slice.is_empty() || started.elapsed() < SLICE {
+        while slice.is_empty() || self.clock.elapsed(started) < SLICE {
             let next = self.waiting.lock().unwrap_or_else(PoisonError::into_inner).next();
             let Some((n, item)) = next else { break };
             let searched =
@@ -314,7 +332,7 @@ impl Batch {
             Ok(request) => request,
             Err(faults) => return Ok(Err(faults.into())),
         };
-        let stamp = Stamp { id: Some(Uuid::now_v7().to_string()), ..self.stamp.clone() };
+        let stamp = Stamp { id: Some(self.ids.next().to_string()), ..self.stamp.clone() };
         let observed = match observed {
             Some(observed) => observed,
             // To be refined, it is stored as text.
@@ -322,7 +340,8 @@ impl Batch {
             None => Bytes::new(),
         };
         let observed = (std::str::from_utf8(&observed).unwrap_or_default(), &demonstration_path);
-        follow(&self.mapper, request, observed, stamp, &self.memory, Extent::Any, interrupt)
+        let means = Means { clock: &self.clock, memory: &self.memory, extent: Extent::Any };
+        follow(&self.mapper, request, observed, stamp, means, interrupt)
     }
 }
 
@@ -437,7 +456,7 @@ mod tests {
         let model = sent.rest["model"].as_str().unwrap_or_default().to_owned();
         let names = Names { model, learner: None, deadline: None, over_limits: Faults::default() };
         let named = Named { learner: None, model_hash: "hash".to_owned(), mapper: Arc::clone(mapper) };
-        Batch::read(sent, &names, named, memory.clone())
+        Batch::read(sent, &names, named, (memory.clone(), Clock::system(), Ids::random()))
     }
 
     /// What comes of the items, but for ids and times.

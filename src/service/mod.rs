@@ -8,7 +8,6 @@
 //!
 //! Everything that is spawned is tracked, and ends with [`Etude::close`].
 
-#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod batch;
 mod cache;
 mod caller;
@@ -22,17 +21,13 @@ mod name;
 mod opening;
 mod owners;
 mod pipe;
-#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod policies;
 mod pool;
 mod refined;
-#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod refiner;
 mod requests;
-#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod search;
 mod sessions;
-#[expect(clippy::disallowed_methods, reason = "to be handed the clock and the ids")]
 mod trials;
 
 use std::path::PathBuf;
@@ -47,7 +42,7 @@ pub use definitions::{DefinitionReader, ModelText, OpenText};
 pub use hash::hash_of;
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, Registered};
-pub use name::{InvalidName, Name};
+pub use name::{InvalidName, Kind, Name};
 pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
 pub(crate) use pool::Places;
@@ -132,35 +127,6 @@ impl TimeLimits {
         max_deadline: Duration::from_mins(10),
         compile: Duration::from_secs(30),
     };
-}
-
-/// What has a name or an id.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Kind {
-    /// A model.
-    Model,
-    /// A policy.
-    Policy,
-    /// A learner.
-    Learner,
-    /// A session.
-    Session,
-    /// A trial.
-    Trial,
-}
-
-impl Kind {
-    /// What it is called in problems.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Model => "model",
-            Self::Policy => "policy",
-            Self::Learner => "learner",
-            Self::Session => "session",
-            Self::Trial => "trial",
-        }
-    }
 }
 
 /// Why the service could not do as asked.

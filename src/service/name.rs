@@ -41,6 +41,35 @@ impl fmt::Display for Name {
     }
 }
 
+/// What has a name or an id.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// A model.
+    Model,
+    /// A policy.
+    Policy,
+    /// A learner.
+    Learner,
+    /// A session.
+    Session,
+    /// A trial.
+    Trial,
+}
+
+impl Kind {
+    /// What it is called in problems.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Model => "model",
+            Self::Policy => "policy",
+            Self::Learner => "learner",
+            Self::Session => "session",
+            Self::Trial => "trial",
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

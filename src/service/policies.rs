@@ -2,13 +2,12 @@
 
 use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
-use uuid::Uuid;
 
 use super::learners::LearnerState;
 use super::requests::{Named, SentRequest, base_weights, check_request};
-use super::search::{Extent, MAX_INLINE_BYTES, Searched, follow, is_quick, max_quick_observations};
+use super::search::{Extent, MAX_INLINE_BYTES, Means, Searched, follow, is_quick, max_quick_observations};
 use super::{Caller, Etude, Kind, ServiceError};
-use crate::memory::{Held, Memory};
+use crate::memory::Held;
 use crate::store::Page;
 use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Object, Path};
@@ -35,7 +34,7 @@ impl Etude {
     /// If the body is no request, names no model, or the service cannot do it now.
     pub async fn make_policy(&self, body: impl Into<Bytes>, caller: Caller) -> Result<MadePolicy, ServiceError> {
         let body = body.into();
-        let id = Uuid::now_v7().to_string();
+        let id = self.ids.next().to_string();
         let stamp = Stamp { id: Some(id.clone()), ..Stamp::default() };
         let weights = |model: &Model, learner: Option<&LearnerState>, faults: &mut Faults| {
             base_weights(model, learner, faults).map(|weights| (weights, ()))
@@ -83,10 +82,11 @@ impl Etude {
         let is_small = body.len() <= MAX_INLINE_BYTES;
         let demonstration = is_small.then(|| sent.demonstration(model, max_quick_observations(model))).flatten();
         let is_quick = demonstration.as_ref().is_some_and(|read| is_quick(model, &sent.rest, read.len()));
-        let memory = self.memory.clone();
+        let (memory, clock) = (self.memory.clone(), self.clock.clone());
         let extent = if is_quick { Extent::Quick } else { Extent::Any };
         let job = move |interrupt: &mut dyn Interrupt| {
-            search_sent(kind, &sent, demonstration, &named, weights, stamp, (&memory, extent), interrupt)
+            let means = Means { clock: &clock, memory: &memory, extent };
+            search_sent(kind, &sent, demonstration, &named, weights, stamp, means, interrupt)
         };
         if is_quick { self.pool.run_here(deadline, job)? } else { place.run(deadline, job).await? }
     }
@@ -123,14 +123,14 @@ fn search_sent<T>(
     named: &Named,
     weights: impl FnOnce(&Model, Option<&LearnerState>, &mut Faults) -> Option<(Weights, T)>,
     stamp: Stamp,
-    (memory, extent): (&Memory, Extent),
+    means: Means<'_>,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Option<(Searched, T)>, ServiceError>, Cancelled> {
     const DEMONSTRATION: Path<'static> = Path::Member(&Path::Root, "demonstration");
     let Named { mapper, learner, .. } = named;
     let (demonstration, _held) = match demonstration {
         Some(demonstration) => (demonstration, None),
-        None => match sent.counted_demonstration(mapper.model(), memory) {
+        None => match sent.counted_demonstration(mapper.model(), means.memory) {
             Ok(Some(read)) => read,
             Ok(None) => return Ok(Ok(None)),
             Err(error) => return Ok(Err(error)),
@@ -144,14 +144,13 @@ fn search_sent<T>(
     };
     let request = sent.request(kind, demonstration, mapper.model(), weights);
     let Some((request, known)) = request.zip(known) else { return Ok(Ok(None)) };
-    let searched = follow(mapper, request, (sent.observed(), &DEMONSTRATION), stamp, memory, extent, interrupt)?;
+    let searched = follow(mapper, request, (sent.observed(), &DEMONSTRATION), stamp, means, interrupt)?;
     Ok(searched.map(|searched| Some((searched, known))))
 }
 
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
-    use std::time::Instant;
 
     use jiff::Timestamp;
     use serde_json::{Value, json};
@@ -159,14 +158,15 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::memory::SMALL_BYTES;
+    use crate::clock::Clock;
+    use crate::memory::{Memory, SMALL_BYTES};
     use crate::service::{Client, ModelText, Name, Settings};
     use etude_core::interrupt::Uninterrupted;
     use etude_core::mapping::Mapper;
     use etude_core::model::{Definition, Format, Limits};
 
     fn caller() -> Caller {
-        Caller { client: Client::LOCAL, arrived: Instant::now(), now: Timestamp::UNIX_EPOCH }
+        Caller { client: Client::LOCAL, arrived: Clock::system().instant(), now: Timestamp::UNIX_EPOCH }
     }
 
     /// A service that has `model`, called `m`.
@@ -230,9 +230,8 @@ mod tests {
         let weights = |model: &Model, learner: Option<&LearnerState>, faults: &mut Faults| {
             Some((base_weights(model, learner, faults)?, ()))
         };
-        let extent = (&memory, Extent::Any);
-        let searched =
-            search_sent(RequestKind::Policy, &sent, None, &named, weights, stamp, extent, &mut Uninterrupted);
+        let means = Means { clock: &Clock::system(), memory: &memory, extent: Extent::Any };
+        let searched = search_sent(RequestKind::Policy, &sent, None, &named, weights, stamp, means, &mut Uninterrupted);
         let (searched, ()) = searched.unwrap().unwrap().unwrap();
         let request = searched.refinement.unwrap().request;
         assert!(searched.policy.len() < 64 << 10 && searched.held.unwrap().n_bytes() > 100_000);

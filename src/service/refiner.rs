@@ -14,17 +14,16 @@
 //! This file is longer than 400 lines because its tests stand with it.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use jiff::Timestamp;
 use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
-use uuid::Uuid;
 
 use super::refined::RefinedRequest;
 use super::requests::most_demonstration_bytes;
 use super::search::{PolicyText, as_micros, report, take_for_search};
 use super::{Etude, Kind, PoolError, ServiceError};
+use crate::clock::Clock;
 use crate::memory::Memory;
 use crate::store::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError};
 use etude_core::attribute::Weights;
@@ -150,7 +149,7 @@ impl Etude {
                 None
             }
         };
-        let refined = refined.map(|refined| refined.at(Timestamp::now()));
+        let refined = refined.map(|refined| refined.at(self.clock.now()));
         let end = RefinementEnd { policy_id: policy_id.clone(), refined };
         if let Err(error) = self.store.end_refinement(end).await {
             self.return_refinement(&policy_id).await;
@@ -195,14 +194,14 @@ impl Etude {
         };
         let RefinedRequest { model, weights, start, cost, .. } = refined;
         let stamp = Stamp {
-            id: Some(Uuid::now_v7().to_string()),
+            id: Some(self.ids.next().to_string()),
             model: model.into_owned(),
             model_hash,
             refines: Some(policy_id.clone()),
             ..Stamp::default()
         };
         drop(request);
-        let (memory, limit) = (self.memory.clone(), self.time_limits.max_deadline);
+        let (memory, clock, limit) = (self.memory.clone(), self.clock.clone(), self.time_limits.max_deadline);
         let job = move |interrupt: &mut dyn Interrupt| {
             let _held = held;
             let corrupt = |error| ServiceError::unreadable("refinements", "request", policy_id, error);
@@ -218,9 +217,9 @@ impl Etude {
                 _ => return Ok(Err(corrupt("it does not fit its model".to_owned()))),
             };
             drop(texts);
-            let began = Instant::now();
-            let mut limited = || if began.elapsed() < limit { interrupt.poll() } else { Signal::Finish };
-            optimum(&mapper, problem, cost, stamp, &memory, &mut limited)
+            let began = clock.instant();
+            let mut limited = || if clock.elapsed(began) < limit { interrupt.poll() } else { Signal::Finish };
+            optimum(&mapper, problem, cost, stamp, (&memory, &clock), &mut limited)
         };
         self.pool.run_to_spare(job).await?
     }
@@ -248,15 +247,15 @@ fn optimum(
     problem: Problem<'_>,
     local_cost: f64,
     stamp: Stamp,
-    memory: &Memory,
+    (memory, clock): (&Memory, &Clock),
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Option<PolicyText>, ServiceError>, Cancelled> {
     let mut request = Request { problem, settings: Settings::default(), lookahead: None, deadline: None };
     let _held = take_for_search(mapper, &mut request, memory);
-    let started = Instant::now();
+    let started = clock.instant();
     let settings = Settings { upper_bound: Some(local_cost), ..request.settings };
     let mapping = mapper.map(&request.problem, settings, interrupt)?;
-    let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
+    let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), ..stamp };
     report(&stamp, &mapping);
     if mapping.status != Status::Optimal || Policy::check_steps(mapper.model(), &mapping).is_err() {
         return Ok(Ok(None));
@@ -267,6 +266,7 @@ fn optimum(
 
 #[cfg(test)]
 mod tests {
+    use jiff::Timestamp;
     use serde_json::{Value, json};
     use tokio_util::task::TaskTracker;
 
@@ -278,7 +278,7 @@ mod tests {
     const NOW: Timestamp = Timestamp::UNIX_EPOCH;
 
     fn caller() -> Caller {
-        Caller { client: Client::LOCAL, arrived: Instant::now(), now: NOW }
+        Caller { client: Client::LOCAL, arrived: Clock::system().instant(), now: NOW }
     }
 
     async fn etude(directory: &std::path::Path) -> Etude {
@@ -406,7 +406,8 @@ mod tests {
         let text = request["demonstration"].to_string();
         let demonstration = Demonstration::read_again(schema, &[text], 3).unwrap().unwrap();
         let problem = Problem::new(mapper.model(), demonstration, schema.weights(), None);
-        let refined = optimum(&mapper, problem, 1e9, Stamp::default(), &etude.memory, &mut || Signal::Finish);
+        let refined =
+            optimum(&mapper, problem, 1e9, Stamp::default(), (&etude.memory, &etude.clock), &mut || Signal::Finish);
         assert!(refined.unwrap().unwrap().is_none());
     }
 }

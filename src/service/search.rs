@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU32;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::Duration;
 
 use jiff::Timestamp;
 use serde::Serialize;
@@ -10,6 +10,7 @@ use serde_json::Value;
 
 use super::ServiceError;
 use super::refined::RefinedRequest;
+use crate::clock::Clock;
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::store::{NewPolicy, NewRefinement, pack_steps};
 use etude_core::document::{Faults, Path};
@@ -64,6 +65,14 @@ pub(super) enum Extent {
     Any,
 }
 
+/// What a search is handed.
+#[derive(Clone, Copy)]
+pub(super) struct Means<'e> {
+    pub(super) clock: &'e Clock,
+    pub(super) memory: &'e Memory,
+    pub(super) extent: Extent,
+}
+
 /// What a search gave.
 pub(super) struct Searched {
     /// The policy: JSON.
@@ -95,25 +104,28 @@ impl PolicyText {
     }
 }
 
-/// Follows what `request` asks for with what that needs of `memory`, and writes the policy, unless that is too large. `observed` is the text
+/// Follows what `request` asks for with what that needs of the memory, and writes the policy, unless that is too large. `observed` is the text
 /// of the demonstration, which is at `path` in what the client sent.
 pub(super) fn follow(
     mapper: &Arc<Mapper>,
     mut request: Request<'_>,
     (observed, path): (&str, &Path<'_>),
     stamp: Stamp,
-    memory: &Memory,
-    extent: Extent,
+    Means { clock, memory, extent }: Means<'_>,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Searched, ServiceError>, Cancelled> {
     /// As it will be answered, and as it will be stored.
     const N_COPIES: usize = 2;
-    let started = Instant::now();
+    let started = clock.instant();
     let is_counted = extent == Extent::Any;
     let searching = is_counted.then(|| take_for_search(mapper, &mut request, memory));
     let mapping = request.solve(mapper, interrupt)?;
     drop(searching);
-    let stamp = Stamp { lookahead: request.lookahead.map(NonZeroU32::get), elapsed_us: as_micros(started), ..stamp };
+    let stamp = Stamp {
+        lookahead: request.lookahead.map(NonZeroU32::get),
+        elapsed_us: as_micros(clock.elapsed(started)),
+        ..stamp
+    };
     report(&stamp, &mapping);
     if let Err(error) = Policy::check_steps(mapper.model(), &mapping) {
         let mut faults = Faults::default();
@@ -178,8 +190,9 @@ pub(super) fn report(stamp: &Stamp, mapping: &Mapping) {
     );
 }
 
-pub(super) fn as_micros(since: Instant) -> u64 {
-    u64::try_from(since.elapsed().as_micros()).unwrap_or(u64::MAX)
+/// A duration in microseconds.
+pub(super) fn as_micros(duration: Duration) -> u64 {
+    u64::try_from(duration.as_micros()).unwrap_or(u64::MAX)
 }
 
 pub(super) fn write(document: &impl Serialize) -> Result<String, ServiceError> {

@@ -6,7 +6,6 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
-use uuid::Uuid;
 
 use super::learners::{LearnerState, unknown};
 use super::requests::check_request;
@@ -64,8 +63,8 @@ impl Etude {
         let body = body.into();
         let LearnerState { sequence, name, learner, weights } = self.learner_state(name.as_str(), None).await?;
         let numbers = self.store.trial_numbers(sequence).await?;
-        let id = Uuid::now_v7().to_string();
-        let (policy_id, weights_version) = (Uuid::now_v7().to_string(), weights.version);
+        let id = self.ids.next().to_string();
+        let (policy_id, weights_version) = (self.ids.next().to_string(), weights.version);
         let stamp = Stamp {
             id: Some(policy_id.clone()),
             learner: Some(name.clone()),
@@ -158,12 +157,12 @@ impl Etude {
         let all = learner.weights_for(schema, &drawn).map_err(missing)?;
         let now = as_stored(now);
         let trial = NewTrial {
-            id: Uuid::now_v7().to_string(),
+            id: self.ids.next().to_string(),
             learner: *sequence,
             number,
             weights: write(&learner.by_attribute(drawn))?,
             weights_version: weights.version,
-            policy_id: Uuid::now_v7().to_string(),
+            policy_id: self.ids.next().to_string(),
             policy: None,
             refinement: None,
             created_at: now,

@@ -5,7 +5,6 @@
 //!
 //! This file is longer than 400 lines because opening, resuming and expiring follow the same rules, and its tests stand with it.
 
-#[expect(clippy::disallowed_methods, reason = "to be handed the clock")]
 mod session;
 
 use std::num::NonZeroU32;

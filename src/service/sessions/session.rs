@@ -5,12 +5,12 @@
 use std::num::NonZeroU32;
 use std::ops::Deref;
 use std::sync::Arc;
-use std::time::Instant;
 
 use jiff::Timestamp;
 use tokio_util::sync::CancellationToken;
 
 use super::{SessionError, read_stored};
+use crate::clock::Clock;
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::service::owners::Ownership;
 use crate::service::refined::RefinedRequest;
@@ -373,7 +373,8 @@ impl Session {
         let (texts, texts_held) = etude.stored_observations(&self.id, self.n_received, self.mapper.model()).await?;
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let (mapper, weights, start) = (Arc::clone(&self.mapper), self.weights.clone(), self.start);
-        let (id, n_committed, memory) = (self.id.clone(), self.n_steps, etude.memory.clone());
+        let (id, n_committed) = (self.id.clone(), self.n_steps);
+        let (memory, clock) = (etude.memory.clone(), etude.clock.clone());
         let policy_id = match &self.source.trial_id {
             Some(trial) => etude.store.trial(trial).await?.map(|trial| trial.policy_id),
             None => None,
@@ -389,9 +390,9 @@ impl Session {
         };
         let job = move |_: &mut dyn Interrupt| {
             let steps = take_for_end(&online, n_committed, mapper.model(), &memory);
-            let concluded = steps
-                .map_err(|no_room| ServiceError::from(no_room).into())
-                .and_then(|steps| conclude(online, steps, &mapper, (&id, seq, &texts), weights, start, stamp));
+            let concluded = steps.map_err(|no_room| ServiceError::from(no_room).into()).and_then(|steps| {
+                conclude(online, steps, (&mapper, &clock), (&id, seq, &texts), weights, start, stamp)
+            });
             drop(texts_held);
             Ok(concluded)
         };
@@ -443,19 +444,19 @@ type Concluded = (CommittedSteps, SessionPolicy, PolicyText, Option<NewRefinemen
 fn conclude(
     online: OnlineMapping,
     mut steps: CommittedSteps,
-    mapper: &Mapper,
+    (mapper, clock): (&Mapper, &Clock),
     (id, n_observations, texts): (&str, u32, &[String]),
     weights: Weights,
     start: Option<u32>,
     stamp: Stamp,
 ) -> Result<Concluded, SessionError> {
-    let started = Instant::now();
+    let started = clock.instant();
     let (rest, mapping) = online.end().ok_or(SessionError::Empty)?;
     steps.extend(rest);
     Policy::check_steps(mapper.model(), &mapping)?;
     let demonstration = read_stored(mapper, texts, (id, n_observations))?;
     let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
-    let stamp = Stamp { elapsed_us: as_micros(started), ..stamp };
+    let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), ..stamp };
     report(&stamp, &mapping);
     let policy = SessionPolicy::of(stamp.id.clone().unwrap_or_default(), mapper.model(), &mapping);
     let written = WrittenPolicy::new(&stamp, &problem, &mapping).map_err(ServiceError::from)?;
