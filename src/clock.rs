@@ -1,7 +1,7 @@
 //! What time it is, and new ids: arguments of everything else, so that tests decide both.
 //!
 //! `main`, `server` and the commands make the [`Clock`] and the [`Ids`] of a process, and hand them on; `clippy.toml` keeps all others
-//! from asking the operating system. Timers are tokio's, which tests pause: what is compared with these asks [`timer_now`].
+//! from asking the operating system. Timers are tokio's, which tests pause: what is compared with these asks `timer_now`.
 
 #![expect(clippy::disallowed_methods, reason = "the one place where the system's clock and random ids are asked for")]
 

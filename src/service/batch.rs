@@ -79,7 +79,7 @@ impl Etude {
         let place = place.waiting_until(deadline);
         let named = self.find(&names, faults, &place, deadline).await?;
         let means = (self.memory.clone(), self.clock.clone(), self.ids.clone());
-        let read = move |_: &mut dyn Interrupt| Ok(Batch::read(sent, &names, named, means));
+        let read = move |_: &mut dyn Interrupt| Ok(Batch::read(&sent, &names, named, means));
         let Some(batch) = place.run(None, read).await?? else { return Ok(None) };
         let batch = Arc::new(batch);
         let runners = (0..self.n_search_threads).map(|_| async {
@@ -223,7 +223,7 @@ impl Batch {
     /// Reads a batch against its model: what its items share, and their demonstrations. Nothing if something is wrong with the batch
     /// itself.
     fn read(
-        sent: SentRequest,
+        sent: &SentRequest,
         names: &Names,
         named: Named,
         (memory, clock, ids): (Memory, Clock, Ids),
@@ -244,7 +244,7 @@ impl Batch {
         let (mut n_left, mut n_values) = (Policy::max_observations(model), 0);
         for text in texts {
             let item = if have_room {
-                Item::read(&sent, text, model, n_left.min(Demonstration::MAX_OBSERVATIONS), n_values)
+                Item::read(sent, text, model, n_left.min(Demonstration::MAX_OBSERVATIONS), n_values)
             } else {
                 Item::parse(text)
             };
@@ -317,15 +317,14 @@ impl Batch {
         let (model, place) = (self.mapper.model(), Place { value: &document, path });
         let Some(object) = place.object(RequestKind::Item.fields(), &mut faults) else { return Ok(Err(faults.into())) };
         let weights = |_: &mut Faults| Some(self.weights.clone());
-        let (demonstration, observed, _held) = match read {
-            Some(ReadItem { demonstration, observed }) => (Some(demonstration), Some(observed), None),
-            None => {
-                let held = match take_for_demonstration(model, n_observations(&document), &self.memory) {
-                    Ok(held) => held,
-                    Err(no_room) => return Ok(Err(no_room.into())),
-                };
-                (Request::read_demonstration(model, &object, &mut faults), None, held)
-            }
+        let (demonstration, observed, _held) = if let Some(ReadItem { demonstration, observed }) = read {
+            (Some(demonstration), Some(observed), None)
+        } else {
+            let held = match take_for_demonstration(model, n_observations(&document), &self.memory) {
+                Ok(held) => held,
+                Err(no_room) => return Ok(Err(no_room.into())),
+            };
+            (Request::read_demonstration(model, &object, &mut faults), None, held)
         };
         let request = Request::of(demonstration, model, &object, &self.shared, weights, &mut faults);
         let request = match faults.check(request) {
@@ -456,7 +455,7 @@ mod tests {
         let model = sent.rest["model"].as_str().unwrap_or_default().to_owned();
         let names = Names { model, learner: None, deadline: None, over_limits: Faults::default() };
         let named = Named { learner: None, model_hash: "hash".to_owned(), mapper: Arc::clone(mapper) };
-        Batch::read(sent, &names, named, (memory.clone(), Clock::system(), Ids::random()))
+        Batch::read(&sent, &names, named, (memory.clone(), Clock::system(), Ids::random()))
     }
 
     /// What comes of the items, but for ids and times.
@@ -564,7 +563,7 @@ mod tests {
         assert!((100..Demonstration::MAX_OBSERVATIONS).contains(&most));
         assert!(is_read(&[most]) && is_read(&[most - 100, 99, 1]));
         assert!(!is_read(&[most + 1]) && !is_read(&[most - 100, 99, 1, 1]));
-        assert!(is_read(&[0; MAX_BATCH_ITEMS]) && !is_read(&[0; MAX_BATCH_ITEMS + 1]));
+        assert!(is_read(&vec![0; MAX_BATCH_ITEMS]) && !is_read(&vec![0; MAX_BATCH_ITEMS + 1]));
     }
 
     #[test]

@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::model::Space;
 
-/// What a search may spend. Its time is bounded by its caller's [`Interrupt`].
+/// What a search may spend. Its time is bounded by its caller's [`Interrupt`](crate::interrupt::Interrupt).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
     /// Most nodes expanded.

@@ -23,7 +23,6 @@ pub(in crate::cli) enum Frame {
 
 /// A committed step.
 #[derive(Debug, Deserialize)]
-#[expect(clippy::struct_field_names, reason = "one word for one thing, as in the frame")]
 pub(in crate::cli) struct StepFrame {
     pub(in crate::cli) step: u32,
     pub(in crate::cli) observation: u32,
