@@ -15,12 +15,11 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fmt::Write;
 
-use jiff::Timestamp;
 use serde::Deserialize;
 use serde_json::value::RawValue;
 use sqlx::SqliteConnection;
 
-use super::sessions::{self, NewObservations, OpenSession, Owner, SessionRefusal};
+use super::observations::{self, Arrived, NewObservations, OpenSession, Owner, SessionRefusal};
 use super::{StoreError, corrupt};
 
 /// Once `arrivals` has more bytes than this, they are settled with the next commit. A larger table would save little, and settling it would
@@ -87,7 +86,7 @@ impl Arrivals {
         let unknown: Vec<_> = unknown.into_iter().filter(|id| !self.open.contains_key(*id)).collect();
         if !unknown.is_empty() {
             let ids = serde_json::to_string(&unknown).map_err(corrupt("sessions", "id"))?;
-            self.open.extend(sessions::find_open(connection, &ids).await?);
+            self.open.extend(observations::find_open(connection, &ids).await?);
         }
         let mut row = String::new();
         let mut answers = Vec::with_capacity(group.len());
@@ -161,7 +160,7 @@ impl Arrivals {
         if !rows.is_empty() {
             let settled = together(&rows)?;
             let settled: Vec<&Arrived> = settled.values().collect();
-            let was_next = sessions::add(connection, &settled).await?;
+            let was_next = observations::add(connection, &settled).await?;
             for (new, _) in settled.iter().zip(was_next).filter(|(_, was_next)| !was_next) {
                 refused(&new.session_id, new.seq);
             }
@@ -206,17 +205,6 @@ pub(super) async fn read(reader: &mut SqliteConnection) -> Result<BTreeMap<Strin
 /// Changes when another connection has written.
 async fn data_version(connection: &mut SqliteConnection) -> Result<i64, StoreError> {
     Ok(sqlx::query_scalar("SELECT data_version FROM pragma_data_version").fetch_one(connection).await?)
-}
-
-/// Observations of a session that have arrived.
-#[derive(Debug)]
-pub(super) struct Arrived {
-    pub(super) session_id: String,
-    pub(super) seq: u32,
-    pub(super) n_states: u32,
-    /// JSON: an array of states.
-    pub(super) states: String,
-    pub(super) at: Timestamp,
 }
 
 /// An item of a row of `arrivals`.

@@ -18,6 +18,7 @@ mod definitions;
 mod error;
 mod learners;
 mod models;
+mod observations;
 mod page;
 mod policies;
 mod refinements;
@@ -40,13 +41,11 @@ pub use error::{StoreError, Unavailable};
 use jiff::Timestamp;
 pub use learners::{Fold, LearnerRecord, NewLearner, RewardRecord, WeightsRecord};
 pub use models::{ModelKey, ModelRecord, ModelSize, ModelSummary, NewDefinition, NewModel, StoredDefinition};
+pub use observations::{NewObservations, Owner, SessionRefusal};
 pub use page::Page;
-pub use policies::{NewPolicy, PolicyRecord, pack_steps};
-pub use refinements::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd};
-pub use sessions::{
-    ExpiredSession, MAX_EXPIRED_AT_ONCE, NewObservations, NewSession, Owner, SessionEnd, SessionRecord, SessionRefusal,
-    SessionStatus, Taken,
-};
+pub use policies::{NewPolicy, NewRefinement, PolicyRecord, pack_steps};
+pub use refinements::{Attempt, MAX_ATTEMPTS, RefinementEnd};
+pub use sessions::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, SessionRecord, SessionStatus, Taken};
 
 use sqlx::Sqlite;
 use sqlx::pool::PoolConnection;

@@ -261,12 +261,6 @@ async fn note_change(writing: &mut Writing<'_>) -> Result<(), StoreError> {
     Ok(())
 }
 
-/// Changes with every registration and deletion of a model.
-pub(super) async fn generation(connection: &mut SqliteConnection) -> Result<u64, StoreError> {
-    let row = sqlx::query("SELECT models_generation FROM service").fetch_one(connection).await?;
-    count(&row, "service", "models_generation")
-}
-
 async fn register(
     connection: &mut SqliteConnection,
     model: &NewModel,

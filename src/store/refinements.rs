@@ -2,32 +2,12 @@
 
 use sqlx::{Row, SqliteConnection};
 
-use super::policies::{self, NewPolicy};
+use super::policies::{self, NewPolicy, NewRefinement};
 use super::writer::{Verb, Writing};
 use super::{Store, StoreError};
 
 /// Most attempts at a refinement. One during which the process ended so many times may be what ends it, and is given up.
 pub const MAX_ATTEMPTS: u32 = 3;
-
-/// A policy that is to be refined.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct NewRefinement {
-    /// The policy.
-    pub policy_id: String,
-    /// Hash of its model's content.
-    pub model_hash: String,
-    /// The session whose observations are the demonstration; `None` if the request has that.
-    pub session_id: Option<String>,
-    /// JSON: the request for the refined policy.
-    pub request: String,
-}
-
-impl NewRefinement {
-    /// How many bytes there are to be written.
-    pub(super) fn n_bytes(&self) -> usize {
-        self.request.len()
-    }
-}
 
 /// The end of a refinement.
 #[derive(Clone, Debug)]

@@ -11,6 +11,7 @@ use tokio_util::bytes::Bytes;
 use tokio_util::sync::CancellationToken;
 
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem, WriteError};
+use super::limits::Limits;
 use super::queue::{Gone, Receiver, Sender, Weighed};
 use super::room::{Crowded, SMALL_FRAME_BYTES, Taken};
 use crate::service::{AcceptedReward, StoreError, Unavailable};
@@ -18,7 +19,7 @@ use crate::service::{
     Caller, Client, Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
 use etude_core::document::{self, ParseError, Place};
-use etude_core::mapping::{CommittedStep, Demonstration};
+use etude_core::mapping::CommittedStep;
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
@@ -29,46 +30,6 @@ const BYTES_IN_A_ROW: usize = 16 << 10;
 
 /// What a frame counts for at least, however short it is.
 const MIN_FRAME_BYTES: usize = 512;
-
-/// What a connection may use.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Limits {
-    /// Largest frame, in bytes.
-    pub frame_bytes: usize,
-    /// How many streams may run at the same time.
-    pub streams: usize,
-    /// How long a client may take to read what waits for it.
-    pub slow_after: Duration,
-    /// How long a connection may stay silent.
-    pub idle_after: Duration,
-    /// How often a client of which nothing comes is asked for a sign of life, where the transport can. Above 0.
-    pub ping_every: Duration,
-}
-
-impl Limits {
-    /// Longest message that is sent, in bytes.
-    #[must_use]
-    pub fn message_bytes(&self) -> usize {
-        self.frame_bytes
-    }
-}
-
-impl From<Limits> for HelloLimits {
-    fn from(limits: Limits) -> Self {
-        let message_bytes = limits.message_bytes();
-        let Limits { frame_bytes, streams, slow_after, idle_after, ping_every } = limits;
-        let ms = |time: Duration| u64::try_from(time.as_millis()).unwrap_or(u64::MAX);
-        Self {
-            frame_bytes,
-            message_bytes,
-            observations: Demonstration::MAX_OBSERVATIONS,
-            streams,
-            idle_timeout_ms: ms(idle_after),
-            slow_reader_timeout_ms: ms(slow_after),
-            ping_interval_ms: ms(ping_every),
-        }
-    }
-}
 
 /// What came from the client.
 #[derive(Debug)]

@@ -13,9 +13,11 @@
 
 mod engine;
 pub mod frames;
+mod limits;
 mod queue;
 mod room;
 
-pub use engine::{Closed, Incoming, Limits, Outgoing, PROTOCOL, run};
+pub use engine::{Closed, Incoming, Outgoing, PROTOCOL, run};
+pub use limits::Limits;
 pub use queue::{Gone, QUEUE_BYTES, Queued, Receiver, Reserved, Sender, Weighed, queue};
 pub use room::{Crowded, NotAdmitted, READ_BUFFER_BYTES, Room, Rooms, SMALL_FRAME_BYTES, Taken, WRITE_BUFFER_BYTES};

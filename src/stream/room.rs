@@ -5,7 +5,7 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use super::engine::Limits;
+use super::limits::Limits;
 use super::queue::QUEUE_BYTES;
 use crate::memory::{Held, Memory, NoRoom};
 use crate::service::{Client, Places};

@@ -4,6 +4,8 @@
 //! is the summary, which has all names already, and beside it the steps in short, which take less than a tenth of the space. The
 //! answer is written from the same two, now and whenever it is asked for again.
 //!
+//! This file is longer than 400 lines because what writes the stored form and what reads it again are kept side by side.
+//!
 //! ```text
 //! Mapping --> summary, ShortSteps --> store
 //!                 |         |           |

@@ -10,15 +10,15 @@ use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
 
 use super::alive::NoteAlive;
-use super::arrivals::{self, Arrived};
+use super::arrivals;
+use super::observations::{Arrived, NewObservations, Owner, SessionRefusal};
 use super::page::{Rest, Rows};
-use super::policies::NewPolicy;
-use super::refinements::NewRefinement;
+use super::policies::{NewPolicy, NewRefinement};
 use super::trials::{NewTrial, Opened};
 use super::{Page, Store, StoreError, corrupt, timestamp};
 use etude_core::attribute::ByAttribute;
+pub(super) use verbs::SettleObservations;
 use verbs::{ExpireSessions, TakeSession, TouchSession};
-pub(super) use verbs::{OpenSession, SettleObservations, add, find_open};
 
 /// How far a session has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -45,29 +45,6 @@ impl SessionStatus {
     fn named(name: &str) -> Option<Self> {
         [Self::Open, Self::Done, Self::Expired].into_iter().find(|status| status.name() == name)
     }
-}
-
-/// Who drives a session: whoever opened it, or has resumed it since. Only the newest one may add to it or end it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Owner(u32);
-
-impl Owner {
-    /// Whoever opens a session.
-    pub const FIRST: Self = Self(1);
-}
-
-/// Why nothing was done to a session.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum SessionRefusal {
-    /// There is none that is open.
-    #[error("the session is not open")]
-    NotOpen,
-    /// Another one has resumed it since.
-    #[error("the session has a newer owner")]
-    Superseded,
-    /// The observations do not come next.
-    #[error("the observations do not come next")]
-    NotNext,
 }
 
 /// What there is to resume.
@@ -141,23 +118,6 @@ pub struct NewSession {
     pub trial: Option<NewTrial>,
     /// When it is opened.
     pub created_at: Timestamp,
-}
-
-/// Observations to be added to a session.
-#[derive(Clone, Debug)]
-pub struct NewObservations {
-    /// The session.
-    pub session_id: String,
-    /// Who adds them.
-    pub owner: Owner,
-    /// Index of the first of them.
-    pub seq: u32,
-    /// How many there are.
-    pub n_states: u32,
-    /// JSON: an array of states.
-    pub states: String,
-    /// When they came.
-    pub at: Timestamp,
 }
 
 /// The end of a session.

@@ -1,17 +1,13 @@
 //! How the tables of sessions and their observations are written.
 
-use std::collections::HashSet;
-
 use jiff::Timestamp;
-use serde_json::{Value, json};
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, Owner, SessionEnd, SessionRefusal, Taken, read_session};
+use super::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, Taken, read_session};
 use crate::store::alive::{self, NoteAlive};
-use crate::store::arrivals::Arrived;
-use crate::store::policies::NewPolicy;
-use crate::store::refinements::NewRefinement;
+use crate::store::observations::{Owner, SessionRefusal};
+use crate::store::policies::{NewPolicy, NewRefinement};
 use crate::store::trials::{self, Opened};
 use crate::store::writer::{Verb, Writing};
 use crate::store::{StoreError, as_integer, corrupt, count, policies, refinements, timestamp};
@@ -182,68 +178,6 @@ async fn insert(connection: &mut SqliteConnection, session: &NewSession) -> Resu
     .execute(connection)
     .await?;
     Ok(())
-}
-
-/// What is known of an open session.
-#[derive(Clone, Copy, Debug)]
-pub(in crate::store) struct OpenSession {
-    pub(in crate::store) owner: Owner,
-    pub(in crate::store) n_observations: u32,
-}
-
-/// The open ones among the sessions with these ids (JSON: an array), with how many observations their table has of each.
-pub(in crate::store) async fn find_open(
-    connection: &mut SqliteConnection,
-    ids: &str,
-) -> Result<Vec<(String, OpenSession)>, StoreError> {
-    let query = sqlx::query_as::<_, (String, u32, u32)>(
-        "SELECT id, owner, n_observations FROM sessions
-         WHERE status = 'open' AND id IN (SELECT value FROM json_each($1))",
-    );
-    let open = query.bind(ids).fetch_all(connection).await?.into_iter();
-    Ok(open.map(|(id, owner, n_observations)| (id, OpenSession { owner: Owner(owner), n_observations })).collect())
-}
-
-/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. Two
-/// statements, however many there are: each one costs the driver a change of threads.
-pub(in crate::store) async fn add(
-    connection: &mut SqliteConnection,
-    group: &[&Arrived],
-) -> Result<Vec<bool>, StoreError> {
-    let rows =
-        group.iter().map(|new| json!([new.session_id, new.seq, new.n_states, new.states, new.at.as_millisecond()]));
-    let rows = Value::Array(rows.collect()).to_string();
-    // Only what comes next, and only once, whatever is retried or raced.
-    let updated = sqlx::query_scalar::<_, String>(
-        "UPDATE sessions
-         SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 4)
-         FROM json_each($1) AS new
-         WHERE sessions.id = new.value ->> 0 AND status = 'open' AND n_observations = new.value ->> 1
-         RETURNING sessions.id",
-    )
-    .bind(&rows)
-    .fetch_all(&mut *connection)
-    .await?;
-    let updated: HashSet<String> = updated.into_iter().collect();
-    let is_updated: Vec<bool> = group.iter().map(|new| updated.contains(&new.session_id)).collect();
-    if updated.is_empty() {
-        return Ok(is_updated);
-    }
-    let rows = if updated.len() == group.len() {
-        rows
-    } else {
-        let rows = group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated);
-        let rows = rows.map(|(new, _)| json!([new.session_id, new.seq, new.n_states, new.states]));
-        Value::Array(rows.collect()).to_string()
-    };
-    sqlx::query(
-        "INSERT INTO observations (session_id, seq, n_states, states)
-         SELECT value ->> 0, value ->> 1, value ->> 2, value ->> 3 FROM json_each($1)",
-    )
-    .bind(rows)
-    .execute(connection)
-    .await?;
-    Ok(is_updated)
 }
 
 async fn expire(connection: &mut SqliteConnection, before: Timestamp) -> Result<Vec<ExpiredSession>, StoreError> {

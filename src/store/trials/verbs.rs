@@ -9,8 +9,7 @@ use super::{
     AcceptedReward, FROM, Failure, FailureAnswer, NewReward, NewTrial, Opened, RewardAnswer, SELECT, TrialRecord,
     read_trial,
 };
-use crate::store::policies::NewPolicy;
-use crate::store::refinements::NewRefinement;
+use crate::store::policies::{NewPolicy, NewRefinement};
 use crate::store::writer::{Verb, Writing};
 use crate::store::{StoreError, as_integer, corrupt, count, learners, policies, refinements};
 

@@ -5,7 +5,7 @@ use sqlx::{Connection, SqliteConnection};
 use super::Known;
 use super::verb::{Effects, Job, Writing};
 use crate::store::arrivals::Arrivals;
-use crate::store::sessions::SessionRefusal;
+use crate::store::observations::SessionRefusal;
 use crate::store::{NewObservations, NewPolicy, StoreError, policies, refinements, trials};
 
 /// Applies `group`: durable when this returns.

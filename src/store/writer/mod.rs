@@ -30,10 +30,11 @@ use tokio_util::task::TaskTracker;
 
 use super::arrivals::Arrivals;
 use super::database::{Database, Readers};
+use super::observations::NewObservations;
+use super::observations::SessionRefusal;
 use super::policies::AddPolicies;
-use super::sessions::SessionRefusal;
 use super::trials::{NewReward, RewardAnswer};
-use super::{NewObservations, StoreError, Unavailable, database, models};
+use super::{StoreError, Unavailable, count, database};
 pub(super) use lines::MAX_LARGE_BYTES;
 use lines::{Lines, MAX_SMALL_BYTES};
 use verb::{Asked, Job};
@@ -275,7 +276,7 @@ impl Open {
             none => none.insert(self.database.connect().await?),
         };
         if self.models_generation.get().is_none() {
-            self.models_generation.set(Some(models::generation(connection).await?));
+            self.models_generation.set(Some(models_generation(connection).await?));
         }
         let effects = group::write(connection, &mut self.known, group, self.was_interrupted).await?;
         self.database.check_written()?;
@@ -354,4 +355,10 @@ async fn settle(connection: &mut SqliteConnection, arrivals: &mut Arrivals) -> R
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     arrivals.settle(&mut transaction).await?;
     Ok(transaction.commit().await?)
+}
+
+/// Changes with every registration and deletion of a model.
+async fn models_generation(connection: &mut SqliteConnection) -> Result<u64, StoreError> {
+    let row = sqlx::query("SELECT models_generation FROM service").fetch_one(connection).await?;
+    count(&row, "service", "models_generation")
 }

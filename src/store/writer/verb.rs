@@ -8,8 +8,8 @@ use sqlx::SqliteConnection;
 use tokio::sync::oneshot;
 
 use super::Known;
+use crate::store::observations::SessionRefusal;
 use crate::store::policies::AddPolicies;
-use crate::store::sessions::SessionRefusal;
 use crate::store::trials::{NewReward, RewardAnswer};
 use crate::store::{NewObservations, StoreError};
 
