@@ -11,12 +11,13 @@
 //! used without the rest. This one is the service and the program around it. Each module uses only those to its left, which a test holds:
 //!
 //! ```text
-//! etude_core <- memory, telemetry, experiment <- store <- service <- stream <- http <- config <- server <- cli
+//! etude_core <- clock, memory, telemetry, experiment <- store <- service <- stream <- http <- config <- server <- cli
 //! ```
 //!
 //! | module | is |
 //! |---|---|
 //! | [`etude_core`] | the core, with an architecture of its own |
+//! | [`clock`] | what time it is, and new ids, as the server hands them in |
 //! | [`memory`] | the one budget of memory |
 //! | [`experiment`] | the paper's figures |
 //! | [`store`] | all SQL: one writer that groups commits, a pool of readers |
@@ -39,8 +40,6 @@
 //! A model passes `http::body` (decompressed, and read as it comes if it is large), [`etude_core::model::Definition::parse_from`] (into
 //! compact arrays, with all faults), [`etude_core::model::Model::compile`], and `store::definitions` (its canonical text, in pieces if it
 //! is long) before `store::writer` makes it visible.
-//!
-//! What time it is, and new ids, come from a [`clock`] that the server hands in.
 //!
 //! What is large takes its memory from [`memory`] before it begins, and whose turn it is to use a thread is told by `service::pool`. A
 //! model that is not at hand is made ready by `service::compiler`, once, however many ask for it.
