@@ -90,18 +90,7 @@ mod tests {
     }
 
     async fn open(store: &Store, id: &str, minute: i64) {
-        let session = NewSession {
-            id: id.to_owned(),
-            model: "m".to_owned(),
-            model_hash: "0".to_owned(),
-            weights: [("x".into(), 1.0)].into_iter().collect(),
-            lookahead: None,
-            start: None,
-            learner: None,
-            weights_version: None,
-            trial: None,
-            created_at: at(minute),
-        };
+        let session = NewSession::plain(id, at(minute));
         assert_eq!(store.open_session(session).await.unwrap(), Opened::Yes);
     }
 

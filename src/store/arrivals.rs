@@ -256,18 +256,7 @@ mod tests {
     use crate::store::{NewObservations, NewSession, Opened, Owner, Store};
 
     fn session(id: &str) -> NewSession {
-        NewSession {
-            id: id.to_owned(),
-            model: "m".to_owned(),
-            model_hash: "0".to_owned(),
-            weights: [("x".into(), 1.0)].into_iter().collect(),
-            lookahead: Some(8),
-            start: None,
-            learner: None,
-            weights_version: None,
-            trial: None,
-            created_at: Timestamp::UNIX_EPOCH,
-        }
+        NewSession { lookahead: Some(8), ..NewSession::plain(id, Timestamp::UNIX_EPOCH) }
     }
 
     fn observations(id: &str, seq: u32, states: &[u32]) -> NewObservations {

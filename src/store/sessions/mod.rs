@@ -120,6 +120,25 @@ pub struct NewSession {
     pub created_at: Timestamp,
 }
 
+#[cfg(test)]
+impl NewSession {
+    /// A session of the model "m" that neither learns nor explores.
+    pub(super) fn plain(id: &str, created_at: Timestamp) -> Self {
+        Self {
+            id: id.to_owned(),
+            model: "m".to_owned(),
+            model_hash: "0".to_owned(),
+            weights: [("x".into(), 1.0)].into_iter().collect(),
+            lookahead: None,
+            start: None,
+            learner: None,
+            weights_version: None,
+            trial: None,
+            created_at,
+        }
+    }
+}
+
 /// The end of a session.
 #[derive(Clone, Debug)]
 pub struct SessionEnd {

@@ -102,18 +102,7 @@ async fn who_has_waited_behind_a_locked_database_does_not_wait_as_long_once_more
 async fn what_an_owner_still_has_in_line_is_refused_once_another_has_resumed_the_session() {
     let directory = tempfile::tempdir().unwrap();
     let store = open(directory.path()).await;
-    let session = NewSession {
-        id: "s".to_owned(),
-        model: "m".to_owned(),
-        model_hash: "0".to_owned(),
-        weights: [("x".into(), 1.0)].into_iter().collect(),
-        lookahead: None,
-        start: None,
-        learner: None,
-        weights_version: None,
-        trial: None,
-        created_at: Timestamp::UNIX_EPOCH,
-    };
+    let session = NewSession::plain("s", Timestamp::UNIX_EPOCH);
     assert_eq!(store.open_session(session).await.unwrap(), Opened::Yes);
     let mut others: Vec<_> = ["a", "b", "c"].map(|id| Box::pin(store.writer.add_policies(policy(id, 1 << 20)))).into();
     for other in &mut others {
@@ -141,18 +130,7 @@ async fn what_an_owner_still_has_in_line_is_refused_once_another_has_resumed_the
 async fn an_owner_that_another_process_has_superseded_adds_and_ends_nothing() {
     let directory = tempfile::tempdir().unwrap();
     let stores = [open(directory.path()).await, open(directory.path()).await];
-    let session = NewSession {
-        id: "s".to_owned(),
-        model: "m".to_owned(),
-        model_hash: "0".to_owned(),
-        weights: [("x".into(), 1.0)].into_iter().collect(),
-        lookahead: None,
-        start: None,
-        learner: None,
-        weights_version: None,
-        trial: None,
-        created_at: Timestamp::UNIX_EPOCH,
-    };
+    let session = NewSession::plain("s", Timestamp::UNIX_EPOCH);
     assert_eq!(stores[0].open_session(session).await.unwrap(), Opened::Yes);
     let at = Timestamp::UNIX_EPOCH;
     let new = |owner, seq| {
