@@ -1,30 +1,23 @@
 //! An open session: observations in, committed steps out.
-//!
-//! This file is longer than 400 lines because all that changes a session stands here, beside its tests.
 
 use std::num::NonZeroU32;
-use std::ops::Deref;
 use std::sync::Arc;
 
 use jiff::Timestamp;
 use tokio_util::sync::CancellationToken;
 
-use super::{SessionError, read_stored};
-use crate::clock::Clock;
-use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
+use super::SessionError;
+use super::committed::CommittedSteps;
+use super::ending::{Ended, conclude, take_for_end, written_bytes};
+use crate::memory::{Held, NoRoom, SMALL_BYTES};
 use crate::service::owners::Ownership;
-use crate::service::refined::RefinedRequest;
-use crate::service::search::{PolicyText, as_micros, report, take_beyond_small};
+use crate::service::search::take_beyond_small;
 use crate::service::{Client, Etude, PoolError, ServiceError};
-use crate::store::{AcceptedReward, NewObservations, NewRefinement, Owner, SessionEnd, TrialRecord};
+use crate::store::{AcceptedReward, NewObservations, Owner, SessionEnd, TrialRecord};
 use etude_core::attribute::{ByAttribute, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, Uninterrupted};
-use etude_core::mapping::{
-    CommittedStep, Cost, Demonstration, Mapper, Mapping, OnlineMapping, Policy, Problem, Stamp, Status, Stopped,
-    WrittenPolicy,
-};
-use etude_core::model::{Model, Origin};
+use etude_core::mapping::{Demonstration, Mapper, OnlineMapping, Policy, Stamp, Stopped};
 
 /// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
 /// in the pool.
@@ -70,87 +63,6 @@ pub enum Received {
     Mapped(CommittedSteps),
     /// They take longer to be mapped: see [`Session::advance`].
     Waiting(Vec<Observation>),
-}
-
-/// Steps that were committed, and the memory that they take, if it is much.
-#[derive(Debug, Default)]
-pub struct CommittedSteps {
-    steps: Vec<CommittedStep>,
-    held: Option<Held>,
-    /// How much is counted.
-    n_bytes: usize,
-}
-
-impl CommittedSteps {
-    /// Takes what `n_steps` more of `model` need.
-    pub(super) fn take_for(&mut self, n_steps: usize, model: &Model, memory: &Memory) -> Result<(), NoRoom> {
-        self.take_more(n_steps.saturating_mul(CommittedStep::bytes_of(model)), memory)
-    }
-
-    /// Takes `n_bytes` more, for what comes with the steps.
-    pub(super) fn take_more(&mut self, n_bytes: usize, memory: &Memory) -> Result<(), NoRoom> {
-        let n_bytes = self.n_bytes.saturating_add(n_bytes);
-        memory.hold(&mut self.held, n_bytes)?;
-        self.n_bytes = n_bytes;
-        Ok(())
-    }
-
-    /// Gives back `n_bytes` of what was taken more.
-    fn give_back(&mut self, n_bytes: usize) {
-        self.n_bytes -= n_bytes;
-        if let Some(held) = &mut self.held {
-            held.shrink_to(self.n_bytes as u64);
-        }
-    }
-
-    /// Appends steps, whose memory was taken.
-    pub(super) fn extend(&mut self, steps: Vec<CommittedStep>) {
-        self.steps.extend(steps);
-    }
-}
-
-impl Deref for CommittedSteps {
-    type Target = [CommittedStep];
-
-    fn deref(&self) -> &[CommittedStep] {
-        &self.steps
-    }
-}
-
-/// The end of a session.
-#[derive(Debug)]
-pub struct Ended {
-    /// The steps committed by the end.
-    pub steps: CommittedSteps,
-    /// The policy of the whole, stored. Its memory is held with the steps.
-    pub policy: SessionPolicy,
-}
-
-/// What a session tells of its policy.
-#[derive(Clone, Debug)]
-pub struct SessionPolicy {
-    /// Under which it is stored.
-    pub id: String,
-    /// What was proven of it.
-    pub status: Status,
-    /// What it costs.
-    pub cost: Cost,
-    /// Its actions, in order.
-    pub actions: Vec<Arc<str>>,
-}
-
-impl SessionPolicy {
-    /// The policy of `mapping`, which must be of `model`.
-    pub(super) fn of(id: String, model: &Model, mapping: &Mapping) -> Self {
-        let actions = mapping.moves.iter().filter_map(|step| step.action);
-        let actions = actions.map(|action| model.action_name(action)).collect();
-        Self { id, status: mapping.status, cost: mapping.cost, actions }
-    }
-
-    /// Most bytes that it takes if it has so many steps.
-    pub(super) fn most_bytes(n_steps: usize) -> usize {
-        n_steps.saturating_mul(size_of::<Arc<str>>())
-    }
 }
 
 /// What has become of the reward of a session.
@@ -418,83 +330,5 @@ fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) 
 /// An observation as it was read. Shape `[n_attributes]`; `None` where an attribute was not observed.
 pub type Observation = Vec<Option<etude_core::attribute::Value>>;
 
-/// Most bytes that so many steps take as they are written to be stored.
-fn written_bytes(n_steps: usize, model: &Model) -> usize {
-    n_steps.saturating_mul(Policy::step_bytes(model))
-}
-
-/// Takes what the end of a session of `n_committed` steps needs: for the steps that are left, for what it tells of its policy, and for
-/// that as it is written.
-fn take_for_end(
-    online: &OnlineMapping,
-    n_committed: usize,
-    model: &Model,
-    memory: &Memory,
-) -> Result<CommittedSteps, NoRoom> {
-    let (n_rest, mut steps) = (online.n_rest(), CommittedSteps::default());
-    let n_steps = n_committed + n_rest;
-    steps.take_for(n_rest, model, memory)?;
-    steps.take_more(SessionPolicy::most_bytes(n_steps) + written_bytes(n_steps, model), memory)?;
-    Ok(steps)
-}
-
-type Concluded = (CommittedSteps, SessionPolicy, PolicyText, Option<NewRefinement>);
-
-/// Commits the rest to `steps`, and writes the policy of the whole session, which has this id and these observations.
-fn conclude(
-    online: OnlineMapping,
-    mut steps: CommittedSteps,
-    (mapper, clock): (&Mapper, &Clock),
-    (id, n_observations, texts): (&str, u32, &[String]),
-    weights: Weights,
-    start: Option<u32>,
-    stamp: Stamp,
-) -> Result<Concluded, SessionError> {
-    let started = clock.instant();
-    let (rest, mapping) = online.end().ok_or(SessionError::Empty)?;
-    steps.extend(rest);
-    Policy::check_steps(mapper.model(), &mapping)?;
-    let demonstration = read_stored(mapper, texts, (id, n_observations))?;
-    let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
-    let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), ..stamp };
-    report(&stamp, &mapping);
-    let policy = SessionPolicy::of(stamp.id.clone().unwrap_or_default(), mapper.model(), &mapping);
-    let written = WrittenPolicy::new(&stamp, &problem, &mapping).map_err(ServiceError::from)?;
-    let refinement = (mapping.status == Status::Local)
-        .then(|| RefinedRequest::of(&stamp.model, &problem, mapping.cost).waiting(&stamp, Some(id)));
-    let refinement = refinement.transpose()?;
-    let row = PolicyText::of(stamp, written)?;
-    Ok((steps, policy, row, refinement))
-}
-
 #[cfg(test)]
-mod tests {
-    use serde_json::{Value, json};
-
-    use super::*;
-    use etude_core::model::{Definition, Limits};
-
-    #[test]
-    fn what_is_mapped_where_it_arrives_is_measured_by_transitions_too() {
-        let size = |definition: &Value| {
-            let definition = Definition::read(definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-            let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).unwrap();
-            model.graph().n_states() + model.graph().n_transitions()
-        };
-        let lookahead = NonZeroU32::new(8);
-        let cave = size(&json!({"dynamics": {"kind": "wumpus", "width": 7, "height": 4, "gold": [[5, 0]]}}));
-        assert!(is_inline(cave, lookahead, 1) && !is_inline(cave, lookahead, 1000), "{cave}");
-        // Few states, between any two of which an action leads.
-        let n_states = 100;
-        let action = |n: usize| json!({"name": format!("to {n}")});
-        let transitions = (0..n_states).flat_map(|from| (0..n_states).map(move |to| json!([from, to, to])));
-        let complete = json!({
-            "attributes": [{"name": "x", "kind": "number"}], "actions": (0..n_states).map(action).collect::<Vec<_>>(),
-            "dynamics": {
-                "kind": "table", "states": (0..n_states).map(|x| json!([x])).collect::<Vec<_>>(),
-                "transitions": transitions.collect::<Vec<_>>(),
-            },
-        });
-        assert!(!is_inline(size(&complete), lookahead, 1));
-    }
-}
+mod tests;
