@@ -1,8 +1,5 @@
 //! The protocol, one connection at a time.
-//!
-//! This file is longer than 400 lines because it is the whole state machine of a connection: each frame, in each state.
 
-use std::error::Error;
 use std::time::Duration;
 
 use serde_json::Value;
@@ -10,13 +7,13 @@ use tokio::sync::SetOnce;
 use tokio_util::bytes::Bytes;
 use tokio_util::sync::CancellationToken;
 
+use super::closing::{Closed, Over, ends, not_allowed};
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem, WriteError};
 use super::limits::Limits;
 use super::queue::{Gone, Receiver, Sender, Weighed};
 use super::room::{Crowded, SMALL_FRAME_BYTES, Taken};
-use crate::service::{AcceptedReward, StoreError, Unavailable};
 use crate::service::{
-    Caller, Client, Ended, Etude, PoolError, Received, Resumed, RewardState, ServiceError, Session, SessionError,
+    AcceptedReward, Caller, Client, Ended, Etude, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
 use etude_core::document::{self, ParseError, Place};
 use etude_core::mapping::CommittedStep;
@@ -74,55 +71,6 @@ impl Weighed for Outgoing {
     }
 }
 
-/// Why a connection ended: a websocket close code.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Closed {
-    /// The policy is done.
-    Done,
-    /// The client said nothing more.
-    ByClient,
-    /// The client gave no sign of life; the session is to be resumed.
-    Silent,
-    /// The server shuts down; the session is to be resumed.
-    GoingAway,
-    /// Something that a websocket does not allow.
-    Protocol,
-    /// Not JSON, or not UTF-8.
-    NotText,
-    /// Not allowed now.
-    NotAllowed,
-    /// A frame over the limit, whoever was to send it, or a policy.
-    TooLarge,
-    /// The server failed; the session is to be resumed.
-    Failed,
-    /// The server has too much to do, or the client is too slow; the session is to be resumed.
-    Overloaded,
-    /// A frame that cannot be understood.
-    BadFrame,
-    /// A model, learner or session that is unknown.
-    Unknown,
-}
-
-impl Closed {
-    /// The close code and reason of a websocket.
-    #[must_use]
-    pub fn code(self) -> (u16, &'static str) {
-        match self {
-            Self::Done | Self::ByClient => (1000, "done"),
-            Self::GoingAway => (1001, "the server shuts down; resume"),
-            Self::Protocol => (1002, "against the protocol of websockets"),
-            Self::NotText => (1007, "not JSON"),
-            Self::NotAllowed => (1008, "not allowed"),
-            Self::Silent => (1008, "no sign of life; resume"),
-            Self::TooLarge => (1009, "too large"),
-            Self::Failed => (1011, "the server failed; resume"),
-            Self::Overloaded => (1013, "overloaded or too slow a reader; resume"),
-            Self::BadFrame => (4400, "bad frame"),
-            Self::Unknown => (4404, "unknown model, learner or session"),
-        }
-    }
-}
-
 /// How long the last words may wait for a client that does not read.
 const GOODBYE_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -171,18 +119,6 @@ pub async fn run(
         let _ = tokio::time::timeout(limits.slow_after.min(GOODBYE_TIMEOUT), goodbye).await;
     }
     closed
-}
-
-/// Why the connection is over.
-struct Over {
-    closed: Closed,
-    problem: Option<StreamProblem>,
-}
-
-impl Over {
-    fn because(closed: Closed, problem: StreamProblem) -> Self {
-        Self { closed, problem: Some(problem) }
-    }
 }
 
 struct Connection<'c> {
@@ -398,10 +334,6 @@ async fn send(outgoing: &Sender<Outgoing>, limits: Limits, frame: &ServerFrame<'
     }
 }
 
-fn not_allowed(detail: &str) -> Over {
-    Over::because(Closed::NotAllowed, StreamProblem::new("not-allowed", detail))
-}
-
 /// The text of what came, and its memory.
 fn text_of(came: Incoming, limits: Limits) -> Result<(Bytes, Option<Taken>), Over> {
     let bad = |problem| Over::because(Closed::BadFrame, problem);
@@ -437,43 +369,4 @@ fn read_frame(text: &[u8]) -> Result<ClientFrame, Over> {
         ParseError::Faults(faults) => bad(StreamProblem::of("bad-frame", &faults)),
     })?;
     ClientFrame::read(frame).map_err(|faults| bad(StreamProblem::of("bad-frame", &faults)))
-}
-
-/// How an error ends the connection.
-fn ends(error: &SessionError) -> Over {
-    let detail = error.to_string();
-    match error {
-        SessionError::Faults(faults) => Over::because(Closed::BadFrame, StreamProblem::of("invalid", faults)),
-        SessionError::NotOpen => Over::because(Closed::Unknown, StreamProblem::new("expired", detail)),
-        SessionError::TakenOver => Over::because(Closed::NotAllowed, StreamProblem::new("taken-over", detail)),
-        SessionError::TooManySteps(_) => {
-            Over::because(Closed::TooLarge, StreamProblem::new("policy-too-large", detail))
-        }
-        SessionError::Gap { .. } | SessionError::TooMany | SessionError::Empty | SessionError::Ended => {
-            not_allowed(&detail)
-        }
-        SessionError::Service(ServiceError::Unknown { kind, .. }) => {
-            Over::because(Closed::Unknown, StreamProblem::new(&format!("unknown-{}", kind.name()), detail))
-        }
-        SessionError::Service(ServiceError::Pool(PoolError::Stopped) | ServiceError::Store(StoreError::Closed)) => {
-            Over::because(Closed::GoingAway, StreamProblem::new("stopping", detail))
-        }
-        SessionError::Service(
-            ServiceError::Pool(PoolError::Busy)
-            | ServiceError::NoRoom(_)
-            | ServiceError::Compiling { .. }
-            | ServiceError::Store(StoreError::Unavailable(Unavailable::Locked | Unavailable::Slow)),
-        ) => Over::because(Closed::Overloaded, StreamProblem::new("overloaded", detail)),
-        SessionError::Service(ServiceError::Store(StoreError::Unavailable(Unavailable::Full))) => {
-            Over::because(Closed::Failed, StreamProblem::new("storage-full", detail))
-        }
-        SessionError::Service(ServiceError::Store(StoreError::Unavailable(_))) => {
-            Over::because(Closed::Failed, StreamProblem::new("not-ready", detail))
-        }
-        SessionError::Service(_) => {
-            tracing::error!(error = error as &dyn Error, "a stream failed");
-            let problem = StreamProblem::new("internal", "an internal error was logged; resume the session");
-            Over::because(Closed::Failed, problem)
-        }
-    }
 }

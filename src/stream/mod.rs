@@ -11,13 +11,15 @@
 //!
 #![doc = include_str!("protocol.md")]
 
+mod closing;
 mod engine;
 pub mod frames;
 mod limits;
 mod queue;
 mod room;
 
-pub use engine::{Closed, Incoming, Outgoing, PROTOCOL, run};
+pub use closing::Closed;
+pub use engine::{Incoming, Outgoing, PROTOCOL, run};
 pub use limits::Limits;
 pub use queue::{Gone, QUEUE_BYTES, Queued, Receiver, Reserved, Sender, Weighed, queue};
 pub use room::{Crowded, NotAdmitted, READ_BUFFER_BYTES, Room, Rooms, SMALL_FRAME_BYTES, Taken, WRITE_BUFFER_BYTES};

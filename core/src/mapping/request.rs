@@ -3,8 +3,6 @@
 //! [`Options`] is the one description of what requests of all kinds may say: its fields are documented as clients see them (OpenAPI is
 //! derived from it), [`Options::read`] reads each of them and notes what is wrong with it, and [`RequestKind::fields`] says which request
 //! may have which. A new option needs a line in each.
-//!
-//! This file is longer than 400 lines because all that is said of an option stands together.
 
 use std::collections::BTreeMap;
 use std::num::NonZeroU32;
