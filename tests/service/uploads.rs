@@ -240,7 +240,8 @@ async fn faults_of_a_model_that_is_read_as_it_comes_keep_their_pointers() {
                 "expected a number, found \"far\"",
                 "expected one of the actions \"on\", \"back\", found \"fly\"",
                 "there is no state 25000: there are 25000, counted from 0",
-                "state 1 has a transition by this action already: transition 2",
+                "state 1 has a transition by this action already: transition 2; an action with several outcomes needs their \
+                 probabilities: [from, action, to, probability]",
             ]
         );
     }

@@ -66,6 +66,16 @@ pub enum BuildError {
         /// The action's name.
         action: String,
     },
+    /// The probabilities of an action's outcomes do not sum to 1.
+    #[error("the probabilities of state {state} and action {action:?} sum to {sum}, not to 1")]
+    Probabilities {
+        /// The state.
+        state: u32,
+        /// The action's name.
+        action: String,
+        /// What they sum to.
+        sum: f64,
+    },
     /// The imitator cannot start in a state that must never be entered.
     #[error("state {0} is unsafe, so nothing starts there")]
     UnsafeStart(u32),

@@ -176,6 +176,18 @@ impl Options {
         }
     }
 
+    /// Notes that searches do not know what to do with `model`, if that is so.
+    pub fn check_model(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
+        if model.n_stochastic() > 0 {
+            let detail = format!(
+                "this model is stochastic (for {} pairs of a state and an action there are several outcomes), and there are no policies \
+                 for such models yet",
+                model.n_stochastic()
+            );
+            faults.note_at(&Path::Member(&object.path, "model"), detail);
+        }
+    }
+
     /// Notes a lookahead at all in a world that is searched lazily.
     pub fn check_lookahead_is_possible(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
         if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {
@@ -256,6 +268,7 @@ impl<'m> Request<'m> {
         faults: &mut Faults,
     ) -> Option<Self> {
         let options = Options::read(object, model, shared, faults);
+        Options::check_model(model, object, faults);
         Options::check_lookahead_is_possible(model, object, faults);
         if let Some(options) = &options {
             let n_observations = demonstration.as_ref().map_or(0, Demonstration::len);

@@ -100,6 +100,11 @@ impl<'v> ReadActions<'v> {
         position
     }
 
+    /// What the action at `index` costs; 0 if it is faulty.
+    pub(super) fn cost(&self, index: ActionIdx) -> f64 {
+        self.actions.get(usize::from(index)).and_then(Option::as_ref).map_or(0.0, |action| action.cost)
+    }
+
     /// The actions, if none is faulty.
     pub(super) fn complete(self) -> Option<Vec<Action>> {
         self.actions.into_iter().collect()

@@ -2,10 +2,10 @@
 
 use std::collections::{HashMap, HashSet};
 
-use super::table::{Edges, Table};
-use super::{Action, ActionIdx, Definition, Limits, Model, Start, StateIdx, States};
+use super::table::{Edges, Table, Uneven};
+use super::{Action, ActionIdx, Definition, Limits, Model, Outcome, Start, StateIdx, States};
 use crate::attribute::{BuildError, MAX_COST, Scalar, Schema, Value, check_cost, check_count, check_name};
-use crate::interrupt::Uninterrupted;
+use crate::interrupt::{Meter, Uninterrupted};
 
 /// A model that is being made. States and actions are numbered in the order in which they are added.
 ///
@@ -106,21 +106,57 @@ impl ModelBuilder {
         Ok(self.n_states() - 1)
     }
 
-    /// Adds the transition by which `action` leads from one state to another.
+    /// Adds the transition by which `action` leads from one state to another, at the action's cost.
     ///
     /// # Errors
     ///
     /// [`BuildError::Unknown`] if there is no such state or action, [`BuildError::Ambiguous`] if the action leads somewhere already.
     pub fn transition(&mut self, from: StateIdx, action: ActionIdx, to: StateIdx) -> Result<(), BuildError> {
+        self.outcome(from, action, Outcome::certain(to))
+    }
+
+    /// Adds an outcome of `action` in the state `from`: a transition with a cost of its own, or one of several, each with its probability. Outcomes
+    /// that lead to the same state add up.
+    ///
+    /// ```
+    /// use etude_core::attribute::{Attribute, Schema};
+    /// use etude_core::model::{ModelBuilder, Outcome};
+    ///
+    /// let mut body = ModelBuilder::new(Schema::new([Attribute::number("x")])?);
+    /// let (walk, jump) = (body.action("walk", 1.0)?, body.action("jump", 1.5)?);
+    /// let (here, there) = (body.state([0.into()])?, body.state([1.into()])?);
+    /// body.outcome(there, walk, Outcome::certain(here).at_cost(0.2))?;
+    /// body.outcome(here, jump, Outcome::certain(there).with_probability(0.9))?;
+    /// body.outcome(here, jump, Outcome::certain(here).with_probability(0.1).at_cost(3.0))?;
+    /// let model = body.build()?;
+    /// assert_eq!((model.n_transitions(), model.n_stochastic()), (3, 1));
+    /// assert_eq!(model.outcomes(there).next(), Some((walk, Outcome::certain(here).at_cost(0.2))));
+    /// # Ok::<(), etude_core::attribute::BuildError>(())
+    /// ```
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::transition`], where `outcome` is certain; [`BuildError::Number`] if its probability is not above 0 and at most 1, or its cost
+    /// is not from 0 to 1e150.
+    pub fn outcome(&mut self, from: StateIdx, action: ActionIdx, outcome: Outcome<StateIdx>) -> Result<(), BuildError> {
         self.check_state(from)?;
-        self.check_state(to)?;
+        self.check_state(outcome.to)?;
         let Some(known) = self.actions.get(usize::from(action)) else {
             return Err(BuildError::Unknown { what: "action", index: action.into() });
         };
-        if !self.taken.insert((from, action)) {
+        let what = |what: &str| format!("{what} of action {:?} in state {from}", known.name);
+        let is_probability = outcome.probability > 0.0 && outcome.probability <= 1.0;
+        if !is_probability {
+            let expected = "a number above 0 and at most 1";
+            return Err(BuildError::Number { what: what("probability"), expected, found: outcome.probability });
+        }
+        if let Some(cost) = outcome.cost {
+            check_cost(|| what("cost"), cost, MAX_COST)?;
+        }
+        if !self.taken.insert((from, action)) && outcome.is_certain() {
             return Err(BuildError::Ambiguous { state: from, action: known.name.to_string() });
         }
-        self.edges.push(from, action, to);
+        self.edges.push(from, action, outcome);
         Ok(())
     }
 
@@ -153,8 +189,12 @@ impl ModelBuilder {
     ///
     /// # Errors
     ///
-    /// [`BuildError::Count`] if there is no state that may be entered, [`BuildError::UnsafeStart`].
-    pub fn definition(self) -> Result<Definition, BuildError> {
+    /// [`BuildError::Count`] if there is no state that may be entered, [`BuildError::UnsafeStart`], [`BuildError::Probabilities`].
+    ///
+    /// # Panics
+    ///
+    /// Never: nothing interrupts it.
+    pub fn definition(mut self) -> Result<Definition, BuildError> {
         let n_states = self.n_states() as usize;
         check_count("states that may be entered", 1, n_states.max(1), n_states - self.unsafe_states.len())?;
         if let Some(state) = self.start.iter().find(|state| self.unsafe_states.contains(state)) {
@@ -165,6 +205,18 @@ impl ModelBuilder {
             [state] => Start::State(*state),
             _ => Start::Candidates(self.start),
         };
+        let mut uninterrupted = Uninterrupted;
+        let mut meter = Meter::new(&mut uninterrupted, u64::MAX);
+        let uneven = self.edges.settle(&self.actions, &mut meter).expect("nothing interrupts it");
+        if let Some(uneven) = uneven.first() {
+            let (Uneven::Twice { number, .. } | Uneven::Sum { number, .. }) = *uneven;
+            let (state, action) = self.edges.pair(number);
+            let action = self.actions[usize::from(action)].name.to_string();
+            return Err(match uneven {
+                Uneven::Twice { .. } => BuildError::Ambiguous { state, action },
+                Uneven::Sum { sum, .. } => BuildError::Probabilities { state, action, sum: *sum },
+            });
+        }
         let mut unsafe_states: Vec<StateIdx> = self.unsafe_states.into_iter().collect();
         unsafe_states.sort_unstable();
         let states = States::new(self.domains, self.rows);
@@ -239,6 +291,13 @@ mod tests {
         builder.transition(first, on, second).unwrap();
         assert!(matches!(builder.transition(first, on, first), Err(BuildError::Ambiguous { state: 0, .. })));
         assert_eq!(builder.transition(first, 7, first), Err(BuildError::Unknown { what: "action", index: 7 }));
+        let half = Outcome::certain(first).with_probability(0.5);
+        assert!(matches!(builder.outcome(first, on, Outcome::certain(first)), Err(BuildError::Ambiguous { .. })));
+        assert!(matches!(builder.outcome(second, on, half.with_probability(0.0)), Err(BuildError::Number { .. })));
+        assert!(matches!(builder.outcome(second, on, half.at_cost(-1.0)), Err(BuildError::Number { .. })));
+        let mut uneven = builder.clone();
+        uneven.outcome(second, on, half).unwrap();
+        assert!(matches!(uneven.build(), Err(BuildError::Probabilities { state: 1, sum: 0.5, .. })));
         assert_eq!(builder.forbid(2), Err(BuildError::Unknown { what: "state", index: 2 }));
         builder.start_at([second]).unwrap();
         builder.forbid(second).unwrap();

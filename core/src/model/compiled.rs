@@ -24,6 +24,8 @@ pub struct Model {
     pub(super) start: Start,
     /// See [`Self::n_transitions`].
     pub(super) n_transitions: usize,
+    /// See [`Self::n_stochastic`].
+    pub(super) n_stochastic: usize,
     /// Shape `[n_states]`; empty if no state is unsafe, or none of those is listed.
     pub(super) is_unsafe: Vec<bool>,
     /// How many states are unsafe.
@@ -50,6 +52,7 @@ impl Model {
             n_transitions: graph.n_transitions(),
             graph,
             start,
+            n_stochastic: 0,
             is_unsafe: Vec::new(),
             n_unsafe: 0,
             unexplored: None,
@@ -152,15 +155,20 @@ impl Model {
         &self.states
     }
 
-    /// The transitions that a body may make: those that have an effect and do not lead into an unsafe state.
+    /// The transitions that a body may make: those that have an effect and do not lead into an unsafe state, and all outcomes of an action
+    /// that has several.
     #[must_use]
     pub fn graph(&self) -> &Graph {
         &self.graph
     }
 
-    /// Where each action that has an effect leads from `state`, in the order of the actions.
+    /// Where each action that has an effect may lead from `state`, in the order of the actions.
     pub fn outcomes(&self, state: StateIdx) -> impl Iterator<Item = (ActionIdx, Outcome<StateIdx>)> {
-        self.graph.successors(state).iter().map(|transition| (transition.action, Outcome::certain(transition.to)))
+        let (costs, probabilities) = (self.graph.own_costs(state), self.graph.probabilities(state));
+        self.graph.successors(state).iter().enumerate().map(move |(n, Transition { action, to })| {
+            let probability = probabilities.get(n).copied().unwrap_or(1.0);
+            (*action, Outcome { to: *to, probability, cost: costs.get(n).and_then(|cost| cost.get()) })
+        })
     }
 
     /// Where the imitator may start if a request does not say.
@@ -179,6 +187,12 @@ impl Model {
     #[must_use]
     pub fn n_transitions(&self) -> usize {
         self.n_transitions
+    }
+
+    /// Of how many states and actions there are several outcomes, with a probability each. Searches need there to be none.
+    #[must_use]
+    pub fn n_stochastic(&self) -> usize {
+        self.n_stochastic
     }
 
     /// How many of the listed states must never be entered.

@@ -13,7 +13,7 @@ use std::fmt::Debug;
 
 use rustc_hash::FxHashMap;
 
-use super::{Graph, Implicit, Operator, Space, StateIdx, States, Transition, make_room};
+use super::{Graph, Implicit, Operator, OwnCost, Space, StateIdx, States, Transition, make_room};
 use crate::interrupt::{Interrupted, Meter};
 
 /// The states that were found, numbered in the order in which they were, and the transitions from those that were explored.
@@ -32,6 +32,18 @@ struct Found {
     /// Where the transitions from each state are; [`UNEXPLORED`] where they are not known yet. Shape `[n_states]`.
     bounds: Vec<(u32, u32)>,
     transitions: Vec<Transition>,
+    /// One for each of the first transitions, as far as one has a cost of its own; the others have none.
+    own_costs: Vec<OwnCost>,
+}
+
+impl Found {
+    fn push(&mut self, transition: Transition, own_cost: Option<f64>) {
+        if own_cost.is_some() {
+            self.own_costs.resize(self.transitions.len(), OwnCost::NONE);
+            self.own_costs.push(OwnCost::of(own_cost));
+        }
+        self.transitions.push(transition);
+    }
 }
 
 const UNEXPLORED: (u32, u32) = (u32::MAX, u32::MAX);
@@ -76,10 +88,10 @@ impl<D: Implicit> Frontier for NumberedStates<'_, D> {
         let dynamics = self.dynamics;
         let state = self.states[from as usize].clone();
         for (action, outcome) in dynamics.successors(&state) {
-            debug_assert!(outcome.is_certain() && outcome.cost.is_none(), "searches know no others");
+            debug_assert!(outcome.is_certain(), "searches know no others");
             if outcome.to != state && !dynamics.is_unsafe(&outcome.to) {
                 let to = self.number_of(outcome.to, found);
-                found.transitions.push(Transition { action, to });
+                found.push(Transition { action, to }, outcome.cost);
             }
         }
     }
@@ -97,8 +109,8 @@ impl<D: Implicit> Frontier for NumberedStates<'_, D> {
 impl<'d> Explored<'d> {
     /// Only the states `first`, numbered from 0, none of them explored.
     fn new<D: Implicit>(dynamics: &'d D, first: impl IntoIterator<Item = D::State>) -> Self {
-        let mut found =
-            Found { states: States::new(dynamics.domains(), Vec::new()), bounds: Vec::new(), transitions: Vec::new() };
+        let states = States::new(dynamics.domains(), Vec::new());
+        let mut found = Found { states, bounds: Vec::new(), transitions: Vec::new(), own_costs: Vec::new() };
         let mut numbered = NumberedStates { dynamics, states: Vec::new(), numbers: FxHashMap::default() };
         for state in first {
             numbered.number_of(state, &mut found);
@@ -132,13 +144,18 @@ impl<'d> Explored<'d> {
     ///
     /// What the interrupt of `meter` said, if that was not to continue.
     pub(super) fn into_parts(self, meter: &mut Meter<'_>) -> Result<(States, Graph), Interrupted> {
-        let Self { found: Found { states, bounds, transitions }, .. } = self;
+        let Self { found: Found { states, bounds, transitions, own_costs }, .. } = self;
         let explored = (0..).zip(&bounds).filter(|(_, bounds)| **bounds != UNEXPLORED);
-        let edges = explored.flat_map(|(from, (begin, end))| {
-            let out = &transitions[*begin as usize..*end as usize];
-            out.iter().map(move |transition| (from, *transition))
-        });
-        let graph = Graph::new(states.len() as usize, edges, meter)?;
+        let numbers =
+            explored.flat_map(|(from, (begin, end))| (*begin as usize..*end as usize).map(move |n| (from, n)));
+        let n_states = states.len() as usize;
+        let graph = if own_costs.is_empty() {
+            Graph::new(n_states, numbers.map(|(from, n)| (from, transitions[n])), meter)?
+        } else {
+            let own_cost = |n: usize| own_costs.get(n).copied().unwrap_or(OwnCost::NONE);
+            let edges = numbers.map(|(from, n)| (from, (transitions[n], own_cost(n), 1.0)));
+            Graph::of_outcomes(n_states, edges, meter)?
+        };
         Ok((states, graph))
     }
 }
@@ -164,6 +181,13 @@ impl Space for Explored<'_> {
     }
 
     #[inline]
+    fn own_costs(&self, state: StateIdx) -> &[OwnCost] {
+        let (begin, end) = self.found.bounds[state as usize];
+        let n_costs = self.found.own_costs.len();
+        &self.found.own_costs[n_costs.min(begin as usize)..n_costs.min(end as usize)]
+    }
+
+    #[inline]
     fn row(&self, state: StateIdx) -> &[u32] {
         self.found.states.row(state)
     }
@@ -179,6 +203,7 @@ impl Space for Explored<'_> {
     fn make_room(&mut self, growth: f64) {
         make_room(&mut self.found.bounds, growth);
         make_room(&mut self.found.transitions, growth);
+        make_room(&mut self.found.own_costs, growth);
         self.found.states.make_room(growth);
         self.frontier.make_room(growth);
     }
@@ -187,7 +212,9 @@ impl Space for Explored<'_> {
     fn found_bytes(&self) -> usize {
         let row_bytes = size_of_val(self.found.states.row(0));
         let state_bytes = self.frontier.state_bytes() + size_of::<(u32, u32)>() + row_bytes;
-        self.n_found() * state_bytes + self.found.transitions.len() * size_of::<Transition>()
+        let transition_bytes =
+            size_of_val(self.found.transitions.as_slice()) + size_of_val(self.found.own_costs.as_slice());
+        self.n_found() * state_bytes + transition_bytes
     }
 }
 

@@ -25,6 +25,18 @@ impl<S> Outcome<S> {
         Self { to, probability: 1.0, cost: None }
     }
 
+    /// The same outcome, at this cost: finite, at least 0.
+    #[must_use]
+    pub fn at_cost(self, cost: f64) -> Self {
+        Self { cost: Some(cost), ..self }
+    }
+
+    /// The same outcome, with this probability: above 0, at most 1.
+    #[must_use]
+    pub fn with_probability(self, probability: f64) -> Self {
+        Self { probability, ..self }
+    }
+
     /// Whether it is the only outcome of its action.
     #[must_use]
     pub fn is_certain(&self) -> bool {

@@ -50,7 +50,7 @@ pub use action::{Action, ActionDocument, ActionIdx};
 pub use builder::ModelBuilder;
 pub use compiled::Model;
 pub use definition::{Definition, DefinitionDocument};
-pub use graph::{Graph, Transition};
+pub use graph::{Graph, OwnCost, Transition};
 pub use implicit::{Implicit, Outcome};
 pub use kinds::DynamicsDocument;
 pub use limits::{CompileError, Limits};

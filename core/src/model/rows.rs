@@ -100,8 +100,9 @@ impl<T: Copy> Rows<T> {
 }
 
 impl<T> Rows<T> {
+    /// Where the items of a row stand among all items.
     #[inline]
-    fn range(&self, row: usize) -> std::ops::Range<usize> {
+    pub(crate) fn range(&self, row: usize) -> std::ops::Range<usize> {
         self.offsets[row] as usize..self.offsets[row + 1] as usize
     }
 

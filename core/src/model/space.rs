@@ -1,6 +1,6 @@
 //! What a search sees of a model: numbered states, and the transitions from them.
 
-use super::{Graph, StateIdx, States, Transition};
+use super::{Graph, OwnCost, StateIdx, States, Transition};
 
 /// The states of a model, as a search walks from one to another. A search of unlisted states adds those that it comes to.
 pub(crate) trait Space {
@@ -9,6 +9,11 @@ pub(crate) trait Space {
 
     /// The transitions from `state`, which was explored, in the order of their actions.
     fn successors(&self, state: StateIdx) -> &[Transition];
+
+    /// What the body pays itself for each of the [`successors`](Self::successors) of `state`, in their order. May be empty if none of them
+    /// has a cost of its own.
+    #[expect(dead_code, reason = "searches will ask for it")]
+    fn own_costs(&self, state: StateIdx) -> &[OwnCost];
 
     /// The row of `state`: per attribute, the index of its value in the domain. Shape `[n_attributes]`.
     fn row(&self, state: StateIdx) -> &[u32];
@@ -46,6 +51,11 @@ impl Space for Whole<'_> {
     #[inline]
     fn successors(&self, state: StateIdx) -> &[Transition] {
         self.graph.successors(state)
+    }
+
+    #[inline]
+    fn own_costs(&self, state: StateIdx) -> &[OwnCost] {
+        self.graph.own_costs(state)
     }
 
     #[inline]

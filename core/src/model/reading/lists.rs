@@ -1,9 +1,9 @@
 //! The long lists of a table in compact form, valid or not.
 
 use super::raw::{Distinct, Raw};
-use crate::attribute::Schema;
+use crate::attribute::{MAX_COST, Schema};
 use crate::document::{Faults, Path};
-use crate::model::Transition;
+use crate::model::{OwnCost, Transition};
 
 /// Most states that can be told apart by an index, with one index to spare.
 pub(super) const MAX_STATES: usize = u32::MAX as usize - 1;
@@ -55,6 +55,20 @@ impl ItemPaths {
         follow(&Path::Item(&Path::Member(parent, list), within % run.n_each))
     }
 }
+
+/// Adds an item to a column that begins once one says something.
+pub(in crate::model) fn add_to_column<T: Copy>(column: &mut Vec<T>, n_before: usize, item: T, usual: T, is_new: bool) {
+    if is_new {
+        // Those before it said nothing.
+        column.resize(n_before, usual);
+    }
+    if is_new || !column.is_empty() {
+        column.push(item);
+    }
+}
+
+/// What the cost and the probability of a transition take: where they are listed, in the graph, and while that is sorted.
+pub(in crate::model) const COLUMNS_BYTES: usize = 4 * size_of::<f64>() + size_of::<(Transition, OwnCost, f64)>();
 
 /// Listed states: one row each, of any length and content.
 #[derive(Debug, Default)]
@@ -125,13 +139,41 @@ pub(in crate::model) type RawIndex = Result<u32, Raw>;
 pub(in crate::model) enum NoTransition {
     /// A value that is not an array.
     Other(Raw),
-    /// An array of this many items, other than three.
+    /// An array of this many items, other than three to five.
     Array(usize),
-    /// One of the three is not of the right kind, or there are more distinct actions than names and indices.
-    Parts(RawIndex, Raw, RawIndex),
+    /// One of the parts is not of the right kind, or there are more distinct actions than names and indices.
+    Parts(RawIndex, Raw, RawIndex, RawTerms),
 }
 
-/// Listed transitions. Shape `[n_transitions]` by column: 10 bytes each.
+/// The probability and the cost of a transition; null if left out.
+#[derive(Debug)]
+pub(in crate::model) struct RawTerms {
+    pub(in crate::model) probability: Raw,
+    pub(in crate::model) cost: Raw,
+}
+
+impl RawTerms {
+    pub(super) const NONE: Self = Self { probability: Raw::Null, cost: Raw::Null };
+
+    /// The probability, 1 if it is left out; `None` if it is none.
+    pub(in crate::model) fn probability(&self) -> Option<f64> {
+        if self.probability == Raw::Null {
+            return Some(1.0);
+        }
+        self.probability.number().filter(|probability| *probability > 0.0 && *probability <= 1.0)
+    }
+
+    /// The transition's own cost; `None` if what is there is no cost.
+    pub(in crate::model) fn own_cost(&self) -> Option<OwnCost> {
+        if self.cost == Raw::Null {
+            return Some(OwnCost::NONE);
+        }
+        self.cost.number().filter(|cost| (0.0..=MAX_COST).contains(cost)).map(|cost| OwnCost::of(Some(cost + 0.0)))
+    }
+}
+
+/// Listed transitions. Shape `[n_transitions]` by column: 10 bytes each, and eight more for each of the costs and probabilities, once one is
+/// given.
 #[derive(Debug, Default)]
 pub(in crate::model) struct RawTransitions {
     /// How many there are. Those beyond the limit are only counted.
@@ -142,6 +184,10 @@ pub(in crate::model) struct RawTransitions {
     pub(in crate::model) action: Vec<u16>,
     /// The state that each leads to.
     pub(in crate::model) to: Vec<u32>,
+    /// Empty if all are 1.
+    pub(in crate::model) probabilities: Vec<f64>,
+    /// Empty if no transition has a cost of its own.
+    pub(in crate::model) own_costs: Vec<OwnCost>,
     /// Distinct ways to refer to an action.
     pub(in crate::model) references: Distinct,
     /// The first values that cannot be transitions.
@@ -159,25 +205,33 @@ impl RawTransitions {
     pub(super) fn size_bytes(&self) -> usize {
         /// A transition is listed, and in the graph.
         const TRANSITION_BYTES: usize = 10 + size_of::<Transition>();
-        self.from.len() * TRANSITION_BYTES
+        let has_columns = !(self.probabilities.is_empty() && self.own_costs.is_empty());
+        let columns_bytes = if has_columns { COLUMNS_BYTES } else { 0 };
+        self.from.len() * (TRANSITION_BYTES + columns_bytes)
     }
 
-    pub(super) fn add(&mut self, from: RawIndex, reference: u32, to: RawIndex) {
-        match (from, u16::try_from(reference), to) {
-            (Ok(from), Ok(reference), Ok(to)) if from != Self::NOWHERE => {
+    pub(super) fn add(&mut self, from: RawIndex, reference: u32, to: RawIndex, terms: RawTerms) {
+        match (from, u16::try_from(reference), to, terms.probability().zip(terms.own_cost())) {
+            (Ok(from), Ok(reference), Ok(to), Some((probability, own_cost))) if from != Self::NOWHERE => {
+                let n_before = self.from.len();
+                add_to_column(&mut self.probabilities, n_before, probability, 1.0, probability < 1.0);
+                add_to_column(&mut self.own_costs, n_before, own_cost, OwnCost::NONE, own_cost.get().is_some());
                 self.from.push(from);
                 self.action.push(reference);
                 self.to.push(to);
                 self.n_transitions += 1;
             }
-            (from, _, to) => {
+            (from, _, to, _) => {
                 let reference = self.references.values()[reference as usize].clone();
-                self.add_faulty(NoTransition::Parts(from, reference, to));
+                self.add_faulty(NoTransition::Parts(from, reference, to, terms));
             }
         }
     }
 
     pub(super) fn add_faulty(&mut self, faulty: NoTransition) {
+        let n_before = self.from.len();
+        add_to_column(&mut self.probabilities, n_before, 1.0, 1.0, false);
+        add_to_column(&mut self.own_costs, n_before, OwnCost::NONE, OwnCost::NONE, false);
         self.from.push(Self::NOWHERE);
         self.action.push(0);
         self.to.push(0);

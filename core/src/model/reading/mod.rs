@@ -16,7 +16,9 @@ mod seeds;
 use std::io::{self, BufRead};
 
 pub(super) use interruptible::Interruptible;
-pub(super) use lists::{NoTransition, RawIndex, RawStates, RawTransitions};
+pub(super) use lists::{
+    COLUMNS_BYTES, ItemPaths, NoTransition, RawIndex, RawStates, RawTerms, RawTransitions, add_to_column,
+};
 pub(super) use raw::{Distinct, Raw};
 use seeds::{Position, Seed};
 use serde::de::DeserializeSeed;

@@ -42,6 +42,17 @@ impl<T: AsRef<str>> Raw<T> {
         }
     }
 
+    /// The number that it is, if it is one.
+    pub(in crate::model) fn number(&self) -> Option<f64> {
+        #[expect(clippy::cast_precision_loss, reason = "numbers are floats")]
+        match self {
+            Self::Whole(number) => Some(*number as f64),
+            Self::Negative(number) => Some(*number as f64),
+            Self::Float(bits) => Some(f64::from_bits(*bits)),
+            _ => None,
+        }
+    }
+
     /// The value; `None` if it is an array or an object.
     pub(in crate::model) fn scalar(&self) -> Option<serde_json::Value> {
         Some(match self {

@@ -5,7 +5,7 @@ use std::fmt;
 use serde::de::{DeserializeSeed, Deserializer, Error, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Value};
 
-use super::lists::{NoTransition, RawIndex, RawStates, RawTransitions};
+use super::lists::{NoTransition, RawIndex, RawStates, RawTerms, RawTransitions};
 use super::raw::{Distinct, Raw};
 use super::{Limits, PathStep, Reader, Stop};
 use crate::attribute::Schema;
@@ -316,6 +316,9 @@ impl<'de> Take<'de> for Row<'_> {
     }
 }
 
+/// How many parts a transition has at most.
+const MAX_PARTS: usize = 5;
+
 /// Takes a transition.
 struct Entry<'r> {
     transitions: &'r mut RawTransitions,
@@ -346,16 +349,35 @@ impl<'de> Take<'de> for Entry<'_> {
             transitions.add_faulty(NoTransition::Array(2));
             return Ok(());
         };
+        let mut terms = RawTerms::NONE;
         let mut len = 3;
-        while traced(trace, parts.next_element::<IgnoredAny>(), || PathStep::Item(len))?.is_some() {
+        loop {
+            let found = parts.next_element_seed(Taking(AsIs));
+            match (traced(trace, found, || PathStep::Item(len))?, len) {
+                (None, _) => break,
+                (Some(found), 3) => terms.probability = found,
+                (Some(found), 4) => terms.cost = found,
+                (Some(_), _) => {}
+            }
             len += 1;
         }
-        if len == 3 {
-            transitions.add(from, reference, to);
+        if len <= MAX_PARTS {
+            transitions.add(from, reference, to, terms);
         } else {
             transitions.add_faulty(NoTransition::Array(len));
         }
         Ok(())
+    }
+}
+
+/// Takes a value as it is.
+struct AsIs;
+
+impl Take<'_> for AsIs {
+    type Taken = Raw;
+
+    fn scalar(self, found: Raw<&str>) -> Raw {
+        found.owned()
     }
 }
 

@@ -259,7 +259,6 @@ fn what_is_wrong_is_said_as_it_always_was() {
             "/dynamics/states/5/0: expected a number, found \"1\"",
             "/dynamics/states/5/1: expected a string, an integer or a boolean, found 1.5",
             "/dynamics/states/6/1: expected a string, an integer or a boolean, found null",
-            "/dynamics/transitions/1: state 0 has a transition by this action already: transition 0",
             "/dynamics/transitions/2/0: there is no state 8: there are 8, counted from 0",
             "/dynamics/transitions/2/1: expected one of the actions \"on\", \"back\", found \"up\"",
             "/dynamics/transitions/2/2: expected the index of a state, found 4294967296",
@@ -267,8 +266,11 @@ fn what_is_wrong_is_said_as_it_always_was() {
             "/dynamics/transitions/4/0: expected the index of a state, found 1.0",
             "/dynamics/transitions/4/1: expected the index of an action, found an array of 1",
             "/dynamics/transitions/4/2: expected the index of a state, found -1",
-            "/dynamics/transitions/5: expected [from, action, to], found an array of 2",
+            "/dynamics/transitions/5: expected [from, action, to, probability, cost], of which the last two may be left out, \
+             found an array of 2",
             "/dynamics/transitions/6: expected an array, found 3",
+            "/dynamics/transitions/1: state 0 has a transition by this action already: transition 0; an action with several \
+             outcomes needs their probabilities: [from, action, to, probability]",
         ]
     );
 }

@@ -54,7 +54,28 @@ struct WrittenTransitions<'t>(&'t Table);
 impl Serialize for WrittenTransitions<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let name = |action: ActionIdx| &*self.0.actions[usize::from(action)].name;
-        serializer.collect_seq(self.0.edges.iter().map(|(from, Transition { action, to })| (from, name(action), to)))
+        let edges = self.0.edges.outcomes();
+        serializer.collect_seq(edges.map(|(from, (Transition { action, to }, own_cost, probability))| {
+            WrittenTransition { parts: (from, name(action), to), probability, own_cost: own_cost.get() }
+        }))
+    }
+}
+
+/// A transition without what says nothing new.
+struct WrittenTransition<'t> {
+    parts: (StateIdx, &'t str, StateIdx),
+    probability: f64,
+    own_cost: Option<f64>,
+}
+
+impl Serialize for WrittenTransition<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Self { parts: (from, action, to), probability, own_cost } = *self;
+        match own_cost {
+            Some(cost) => (from, action, to, probability, cost).serialize(serializer),
+            None if probability < 1.0 => (from, action, to, probability).serialize(serializer),
+            None => (from, action, to).serialize(serializer),
+        }
     }
 }
 
@@ -65,8 +86,9 @@ pub struct TableDocument {
     /// Each state's attribute values, in attribute order.
     #[cfg_attr(feature = "openapi", schema(example = json!([[0, "east", "open"], [1, "east", "open"]])))]
     pub states: Vec<Vec<Scalar>>,
-    /// `[from, action, to]`: states by index, the action by name or index. At most one per state and action. In another order
-    /// they are other content, though they mean the same.
+    /// `[from, action, to, probability, cost]`: states by index, the action by name or index; the last two may be left out or `null`: 1,
+    /// and what the action costs. Those of the same state, action and state to which they lead add up, and the probabilities of a state and an
+    /// action sum to 1. In another order they are other content, though they mean the same.
     pub transitions: Vec<TransitionDocument>,
     /// Where the imitator starts: a state's index, or a list of candidates, of which the one closest to the first
     /// observation is taken; in another order they are other content, though they mean the same. Left out: every safe state is
@@ -78,11 +100,24 @@ pub struct TableDocument {
     pub unsafe_states: Vec<StateIdx>,
 }
 
-/// `[from, action, to]`.
+/// `[from, action, to, probability, cost]`, of which the last two may be left out or `null`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[cfg_attr(feature = "openapi", schema(as = TransitionEntry, example = json!([0, "forward", 1])))]
-pub struct TransitionDocument(pub StateIdx, pub ActionReference, pub StateIdx);
+pub struct TransitionDocument(
+    /// The state that it leaves.
+    pub StateIdx,
+    /// The action that leads along it.
+    pub ActionReference,
+    /// The state that it leads to.
+    pub StateIdx,
+    /// How probable that is: above 0, at most 1; `None`: 1.
+    #[serde(default)]
+    pub Option<f64>,
+    /// What the body pays for it: 0 to 1e150; `None`: what the action costs.
+    #[serde(default)]
+    pub Option<f64>,
+);
 
 /// An action, by name or index.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

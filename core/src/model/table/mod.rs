@@ -1,23 +1,25 @@
 //! Dynamics that list every state and transition.
 
 mod document;
+mod edges;
 mod reading;
 
 use std::io;
 use std::sync::Arc;
 
 pub use document::{ActionReference, StartDocument, TableDocument, TransitionDocument};
+pub(super) use edges::{Edges, Uneven};
 pub(super) use reading::read;
 
 use super::dynamics::{Dynamics, write_definition};
-use super::{Action, ActionIdx, Graph, Limits, Model, Start, StateIdx, States, Transition};
+use super::{Action, Graph, Limits, Model, Start, StateIdx, States};
 use crate::attribute::Schema;
 use crate::interrupt::{Interrupt, Interrupted, Meter};
 
 /// Cost of an action that names none.
 const DEFAULT_ACTION_COST: f64 = 1.0;
 
-/// A model whose states and transitions are listed. At most one transition leaves a state by an action.
+/// A model whose states and transitions are listed. Of those that leave a state by an action, the probabilities sum to 1.
 #[derive(Clone, Debug)]
 pub struct Table {
     schema: Schema,
@@ -28,31 +30,6 @@ pub struct Table {
     start: Start,
     /// Ascending, all different.
     unsafe_states: Vec<StateIdx>,
-}
-
-/// Transitions in the order of the document, by column: 10 bytes each.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Edges {
-    from: Vec<StateIdx>,
-    action: Vec<ActionIdx>,
-    to: Vec<StateIdx>,
-}
-
-impl Edges {
-    pub(super) fn push(&mut self, from: StateIdx, action: ActionIdx, to: StateIdx) {
-        self.from.push(from);
-        self.action.push(action);
-        self.to.push(to);
-    }
-
-    fn len(&self) -> usize {
-        self.from.len()
-    }
-
-    fn iter(&self) -> impl Iterator<Item = (StateIdx, Transition)> + Clone {
-        let transitions = self.action.iter().zip(&self.to).map(|(action, to)| Transition { action: *action, to: *to });
-        self.from.iter().copied().zip(transitions)
-    }
 }
 
 impl Table {
@@ -76,10 +53,12 @@ impl Dynamics for Table {
 
     fn compiling_bytes(&self, _: Limits) -> u64 {
         let n_states = u64::from(self.states.len());
-        Model::compiled_bytes(n_states, self.edges.len() as u64, self.schema.len() as u64)
+        let n_bytes = Model::compiled_bytes(n_states, self.edges.len() as u64, self.schema.len() as u64);
+        n_bytes.saturating_add(self.edges.columns_bytes())
     }
 
-    /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, as a `skip` costs no action.
+    /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, as a `skip` costs no action. Of an
+    /// action with several outcomes, all of them stay.
     fn compile(self: Arc<Self>, _: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted> {
         /// How many transitions are looked at between two looks at the interrupt: less than a millisecond.
         const POLL_EVERY: u64 = 1 << 14;
@@ -91,13 +70,19 @@ impl Dynamics for Table {
         for state in &self.unsafe_states {
             is_unsafe[*state as usize] = true;
         }
-        let is_useful = |(from, transition): &(StateIdx, Transition)| {
-            *from != transition.to && is_unsafe.get(transition.to as usize) != Some(&true)
+        let is_useful = |from: StateIdx, to: StateIdx| from != to && is_unsafe.get(to as usize) != Some(&true);
+        let graph = if self.edges.has_columns() {
+            let outcomes = self.edges.outcomes();
+            let outcomes =
+                outcomes.filter(|(from, (way, _, probability))| *probability < 1.0 || is_useful(*from, way.to));
+            Graph::of_outcomes(n_states, outcomes, &mut meter)?
+        } else {
+            Graph::new(n_states, self.edges.iter().filter(|(from, way)| is_useful(*from, way.to)), &mut meter)?
         };
-        let graph = Graph::new(n_states, self.edges.iter().filter(is_useful), &mut meter)?;
         let (states, start) = (Arc::clone(&self.states), self.start.clone());
         Ok(Model {
             n_transitions: self.edges.len(),
+            n_stochastic: self.edges.n_stochastic,
             n_unsafe: self.unsafe_states.len(),
             is_unsafe,
             ..Model::listed(self.schema.clone(), self.actions.clone(), states, graph, start)
@@ -108,3 +93,6 @@ impl Dynamics for Table {
         write_definition(writer, Some(&self.schema), &self.actions, self)
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -5,13 +5,14 @@ use std::sync::Arc;
 
 use hashbrown::HashTable;
 
-use super::{DEFAULT_ACTION_COST, Edges, Table};
-use crate::attribute::{Attribute, Schema, Value};
-use crate::document::{Faults, Object, Path, Place, index_of};
+use super::edges::{find_uneven, keys_by_pair};
+use super::{DEFAULT_ACTION_COST, Edges, Table, Uneven};
+use crate::attribute::{Attribute, MAX_COST, Schema, Value};
+use crate::document::{Faults, Object, Path, Place, Range, index_of};
 use crate::interrupt::{Interrupted, Meter};
 use crate::model::action::ReadActions;
 use crate::model::dynamics::{Description, Dynamics};
-use crate::model::reading::{Distinct, NoTransition, Raw, RawIndex, RawStates, RawTransitions};
+use crate::model::reading::{Distinct, ItemPaths, NoTransition, Raw, RawIndex, RawStates, RawTerms, RawTransitions};
 use crate::model::{ActionIdx, Limits, Start, StateIdx, States};
 
 /// Reads a model with listed states and transitions. If attributes or actions have faults, what does not depend on them is still checked.
@@ -217,7 +218,8 @@ fn read_transitions(
     meter: &mut Meter<'_>,
     faults: &mut Faults,
 ) -> Result<Option<Edges>, Interrupted> {
-    let RawTransitions { n_transitions, from, mut action, to, references, faulty, n_faulty, item_paths } = items;
+    let RawTransitions { n_transitions, from, mut action, to, probabilities, own_costs, references, .. } = items;
+    let RawTransitions { faulty, n_faulty, item_paths, .. } = items;
     let read_reference = |found: &Raw, path: &Path<'_>, faults: &mut Faults| {
         let actions = actions?;
         if let Some(value) = found.scalar() {
@@ -233,16 +235,8 @@ fn read_transitions(
     // Of any length, so that the chunks are looked at in between.
     let are_states = |states: &[StateIdx]| states.iter().all(|state| (*state as usize) < n_states);
     let is_faultless = n_faulty == 0 && known.iter().all(Option::is_some) && are_states(&from) && are_states(&to);
-    // The state and the action of each value that is a transition.
-    let key = |n: usize| {
-        let action = known.get(usize::from(action[n])).copied().flatten()?;
-        ((from[n] as usize) < n_states && (to[n] as usize) < n_states && from[n] != RawTransitions::NOWHERE)
-            .then_some((from[n], action))
-    };
-    let again = find_repeated(n_transitions, key, meter)?;
-    if !is_faultless || !again.is_empty() {
+    if !is_faultless {
         let mut faulty = faulty.into_iter();
-        let mut again = again.into_iter().peekable();
         let read_index = |found: RawIndex, path: &Path<'_>, faults: &mut Faults| match found {
             Err(found) => faults.note_mismatch(path, &index_of("state"), found),
             Ok(index) if index as usize >= n_states => faults.note_no_index(path, "state", index, n_states),
@@ -263,22 +257,37 @@ fn read_transitions(
                 item_paths.with_path("transitions", n, |path| match faulty {
                     NoTransition::Other(found) => faults.note_mismatch(path, "an array", found),
                     NoTransition::Array(len) => {
-                        faults.note_at(path, format!("expected [from, action, to], found an array of {len}"));
+                        let parts = "[from, action, to, probability, cost], of which the last two may be left out";
+                        faults.note_at(path, format!("expected {parts}, found an array of {len}"));
                     }
-                    NoTransition::Parts(from, reference, to) => read_parts(path, from, &reference, to, faults),
+                    NoTransition::Parts(from, reference, to, terms) => {
+                        read_parts(path, from, &reference, to, faults);
+                        note_no_terms(path, &terms, faults);
+                    }
                 });
                 continue;
             }
-            let repeated = again.next_if(|(again, _)| *again as usize == n);
             let (reference, is_action) = (&references.values()[usize::from(action[n])], known[usize::from(action[n])]);
             if is_action.is_none() || from[n] as usize >= n_states || to[n] as usize >= n_states {
                 item_paths
                     .with_path("transitions", n, |path| read_parts(path, Ok(from[n]), reference, Ok(to[n]), faults));
-            } else if let Some((_, other)) = repeated {
-                let detail = format!("state {} has a transition by this action already: transition {other}", from[n]);
-                item_paths.with_path("transitions", n, |path| faults.note_at(path, detail));
             }
         }
+    }
+    // The state and the action of each value that is a transition.
+    let key = |n: usize| {
+        let action = known.get(usize::from(action[n])).copied().flatten()?;
+        ((from[n] as usize) < n_states && (to[n] as usize) < n_states && from[n] != RawTransitions::NOWHERE)
+            .then_some((from[n], action))
+    };
+    let keys = keys_by_pair(n_transitions, !probabilities.is_empty(), key, meter)?;
+    let mut uneven = keys.as_ref().map(|keys| find_uneven(keys, &probabilities)).unwrap_or_default();
+    if !is_faultless {
+        // What is missing from a sum may be in a transition that is faulty.
+        uneven.retain(|uneven| matches!(uneven, Uneven::Twice { .. }));
+    }
+    note_uneven(&uneven, &from, &item_paths, faults);
+    if !is_faultless || !uneven.is_empty() {
         debug_assert!(faults.count() > n_before || known.contains(&None), "there was a reason");
         return Ok(None);
     }
@@ -286,34 +295,56 @@ fn read_transitions(
         // All actions are known here.
         *action = known[usize::from(*action)].unwrap_or_default();
     }
-    Ok(Some(Edges { from, action, to }))
+    let mut edges = Edges { from, action, to, probabilities, own_costs, n_stochastic: 0 };
+    if let Some(keys) = keys {
+        edges.merge(keys, |action| actions.map_or(0.0, |actions| actions.cost(action)), meter)?;
+    }
+    Ok(Some(edges))
 }
 
-/// The transitions whose key an earlier transition has, each with the last such transition, in order.
-fn find_repeated(
-    n_transitions: usize,
-    key: impl Fn(usize) -> Option<(StateIdx, ActionIdx)>,
-    meter: &mut Meter<'_>,
-) -> Result<Vec<(u32, u32)>, Interrupted> {
-    // Most documents list transitions in ascending order, without repetitions.
-    let mut last = None;
-    let is_ascending = (0..n_transitions).all(|n| {
-        let before = std::mem::replace(&mut last, key(n));
-        last.is_some() && before < last
-    });
-    if is_ascending {
-        return Ok(Vec::new());
+/// Notes what is wrong with the probability and the cost of a transition.
+fn note_no_terms(path: &Path<'_>, terms: &RawTerms, faults: &mut Faults) {
+    if terms.probability().is_none() {
+        faults.note_mismatch(&Path::Item(path, 3), "a number above 0 and at most 1", &terms.probability);
     }
-    let mut keys: Vec<(StateIdx, ActionIdx, u32)> = Vec::with_capacity(n_transitions);
-    for (n, number) in (0..n_transitions).zip(0..) {
-        meter.spend_or_stop(1)?;
-        keys.extend(key(n).map(|(from, action)| (from, action, number)));
+    if terms.own_cost().is_none() {
+        faults.note_mismatch(&Path::Item(path, 4), &Range::UpTo(MAX_COST).describe(), &terms.cost);
     }
-    keys.sort_unstable();
-    let pairs = keys.windows(2).filter(|pair| (pair[0].0, pair[0].1) == (pair[1].0, pair[1].1));
-    let mut again: Vec<(u32, u32)> = pairs.map(|pair| (pair[1].2, pair[0].2)).collect();
-    again.sort_unstable();
-    Ok(again)
+}
+
+/// Notes where the transitions of a state and an action do not come together. That they are several without probabilities is told once: whoever
+/// does not know of probabilities has left them all out.
+fn note_uneven(uneven: &[Uneven], from: &[StateIdx], paths: &ItemPaths, faults: &mut Faults) {
+    /// How many places are shown.
+    const N_SHOWN: usize = 3;
+    let state = |number: u32| from[number as usize];
+    let twice = || uneven.iter().filter(|uneven| matches!(uneven, Uneven::Twice { .. }));
+    for found in twice().take(1).chain(uneven.iter().filter(|uneven| matches!(uneven, Uneven::Sum { .. }))) {
+        let (number, detail) = match *found {
+            Uneven::Sum { number, sum } => {
+                let state = state(number);
+                (number, format!("the probabilities of state {state} and this action sum to {sum}, not to 1"))
+            }
+            Uneven::Twice { number, before } => {
+                let state = state(number);
+                let first = format!("state {state} has a transition by this action already: transition {before}");
+                let shown = twice().take(N_SHOWN).filter_map(|uneven| match uneven {
+                    Uneven::Twice { number, .. } => Some(number.to_string()),
+                    Uneven::Sum { .. } => None,
+                });
+                let shown = shown.collect::<Vec<_>>().join(", ");
+                let others = match twice().count() {
+                    1 => String::new(),
+                    n if n <= N_SHOWN => format!("; there are {n} like this: transitions {shown}"),
+                    n => format!("; there are {n} like this: transitions {shown}, .."),
+                };
+                let right =
+                    "an action with several outcomes needs their probabilities: [from, action, to, probability]";
+                (number, format!("{first}{others}; {right}"))
+            }
+        };
+        paths.with_path("transitions", number as usize, |path| faults.note_at(path, detail));
+    }
 }
 
 fn read_state_list(place: &Place<'_, '_>, n_states: usize, faults: &mut Faults) -> Option<Vec<StateIdx>> {
