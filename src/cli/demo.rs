@@ -39,7 +39,7 @@ pub(super) fn run(out: &mut impl Write) -> Result<(), CliError> {
 
 /// The defaults of the service, but for a free port and a temporary database.
 fn config(database: &Path) -> Result<ServeConfig, CliError> {
-    let option = |error: clap::Error| CliError::Option(error.to_string());
+    let option = |error: clap::Error| CliError::Faulty(error.to_string());
     let command = ServeConfig::augment_args(clap::Command::new("demo"));
     let matches = command.try_get_matches_from(["demo"]).map_err(option)?;
     let config = ServeConfig::from_arg_matches(&matches).map_err(option)?;
@@ -89,7 +89,7 @@ async fn learn(address: SocketAddr, out: &mut impl Write) -> Result<(), CliError
     const ENOUGH: usize = 10;
     /// A line of rewards.
     const SHOWN: usize = 20;
-    let client = super::client::Client::new(&format!("http://{address}"))?;
+    let client = super::client::Client::new(&format!("http://{address}").parse().map_err(CliError::Faulty)?)?;
     let scene = Scene::figure_6();
     let plan = CurvePlan::documented();
     writeln!(

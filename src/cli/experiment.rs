@@ -10,7 +10,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Value, json};
 use tokio::runtime::Runtime;
 
-use super::client::Client;
+use super::client::{Client, ServerUrl};
 use super::{CliError, runtime};
 use crate::clock::Ids;
 use crate::experiment::{self, Attempt, CurvePlan, Followed, Laboratory, LearnerId, Local, LocalError, Scene, plot};
@@ -26,7 +26,7 @@ pub(super) struct Experiment {
     out: PathBuf,
     /// A running service to do it on, such as `http://127.0.0.1:8080`; in this process if left out. The numbers are the same.
     #[arg(long, value_name = "URL")]
-    server: Option<String>,
+    server: Option<ServerUrl>,
     /// Seed of the first learner; further runs take the next ones.
     #[arg(long, default_value_t = 1, value_name = "N")]
     seed: u64,
@@ -125,7 +125,7 @@ struct Remote {
 }
 
 impl Remote {
-    fn new(url: &str) -> Result<Self, CliError> {
+    fn new(url: &ServerUrl) -> Result<Self, CliError> {
         Ok(Self { runtime: runtime()?, client: Client::new(url)?, known: Vec::new() })
     }
 

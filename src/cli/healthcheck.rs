@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use clap::Args;
 
-use super::{CliError, runtime};
+use super::{CliError, client, runtime};
 
 /// How long the service may take to say that it is ready.
 const TIMEOUT: Duration = Duration::from_secs(3);
@@ -21,15 +21,10 @@ impl Healthcheck {
     pub(super) fn run(&self) -> Result<(), CliError> {
         let url = format!("http://{}/readyz", reachable(self.listen));
         runtime()?.block_on(async {
-            let http = |source| CliError::Http { url: url.clone(), source };
+            let http = |source| client::failed(&url, source);
             let client = reqwest::Client::builder().timeout(TIMEOUT).no_proxy().build().map_err(http)?;
             let answer = client.get(&url).send().await.map_err(http)?;
-            let status = answer.status();
-            if status.is_success() {
-                return Ok(());
-            }
-            let body = answer.text().await.unwrap_or_default();
-            Err(CliError::Answer { url: url.clone(), status: status.as_u16(), body })
+            if answer.status().is_success() { Ok(()) } else { Err(client::refused(&url, answer).await) }
         })
     }
 }

@@ -11,7 +11,7 @@ use serde_json::Value;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::client::Client;
+use super::client::{Client, ServerUrl};
 use super::map::read_json;
 use super::{CliError, runtime};
 use crate::clock::{Clock, Ids};
@@ -70,7 +70,7 @@ struct Location {
     database: PathBuf,
     /// A running service, such as `http://127.0.0.1:8080`, instead of a database.
     #[arg(long, value_name = "URL")]
-    server: Option<String>,
+    server: Option<ServerUrl>,
 }
 
 /// An exported learner.
@@ -190,7 +190,7 @@ fn read_definition(definition: &LearnerDocument, what: &str) -> Result<Learner, 
 }
 
 fn checked(name: &str) -> Result<Name, CliError> {
-    Name::new(name).map_err(|error| CliError::Option(format!("{name:?}: {error}")))
+    Name::new(name).map_err(|error| CliError::Faulty(format!("{name:?}: {error}")))
 }
 
 /// What a database is used for.
@@ -209,8 +209,11 @@ async fn with_database<T>(
     work: impl AsyncFnOnce(&Etude) -> Result<T, CliError>,
 ) -> Result<T, CliError> {
     if !database.exists() {
-        let source = io::ErrorKind::NotFound.into();
-        return Err(CliError::Read { path: database.to_owned(), source });
+        let detail = format!(
+            "there is no database {}: name another one by --database, or a service by --server",
+            database.display()
+        );
+        return Err(CliError::Faulty(detail));
     }
     let settings = Settings {
         database: database.to_owned(),

@@ -8,8 +8,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use serde_json::{Map as Members, Value, json};
+use serde_json::Value;
 
+use super::input::{Cells, Observations, Spot};
+use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags};
 use super::{CliError, render};
 use crate::clock::Clock;
 use crate::service::hash_of;
@@ -23,18 +25,17 @@ pub(super) struct Map {
     /// The imitator's model: JSON, as for PUT /v1/models; - for standard input.
     #[arg(long, value_name = "FILE")]
     model: PathBuf,
-    /// The demonstration: a JSON array of observed states, or a whole request as for POST /v1/policies; - for standard input.
+    /// The demonstration: CSV with a header, a JSON array of observed states, JSON lines, or a whole request as for POST /v1/policies;
+    /// - for standard input.
     #[arg(long, value_name = "FILE")]
     demonstration: PathBuf,
-    /// Weight of an attribute; may be given for several.
-    #[arg(long = "weight", value_name = "ATTRIBUTE=WEIGHT", value_parser = parse_weight)]
-    weights: Vec<(String, f64)>,
-    /// Where the imitator starts: a state's index, or a JSON object of attribute values.
-    #[arg(long, value_name = "STATE", value_parser = parse_json)]
-    start: Option<Value>,
-    /// Map as a stream with this lookahead would; left out: the global optimum.
-    #[arg(long, value_name = "OBSERVATIONS")]
-    lookahead: Option<u32>,
+    #[command(flatten)]
+    reading: ReadingFlags,
+    #[command(flatten)]
+    options: OptionFlags,
+    /// Map as a stream with this lookahead would; none, as if left out: the global optimum.
+    #[arg(long, value_name = "OBSERVATIONS|none")]
+    lookahead: Option<Lookahead>,
     /// What guides the search.
     #[arg(long, value_enum)]
     heuristic: Option<HeuristicArg>,
@@ -58,17 +59,25 @@ enum HeuristicArg {
 
 impl Map {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
-        // A lookahead needs all states.
-        let limits = if self.lookahead.is_some() { Limits::NONE } else { Limits::DEFAULT };
-        let (definition, model) = read_model(&self.model, limits)?;
+        if self.model == Path::new("-") && self.demonstration == self.model {
+            let detail = "--model and --demonstration: only one of them can be standard input";
+            return Err(CliError::Faulty(detail.to_owned()));
+        }
+        let (definition, model) = read_model(&self.model)?;
         let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
+        let cells = Cells::of(mapper.model());
+        let mut observations = Observations::open(&self.demonstration, &self.reading.columns, &cells)?;
+        let (request, spots) = self.request(&mut observations)?;
 
-        let request = self.request()?;
+        let document = request.document();
         let mut faults = Faults::default();
-        let object = Place::root(&request).object(Request::FIELDS, &mut faults);
+        let object = Place::root(&document).object(Request::FIELDS, &mut faults);
+        if let Some(place) = object.as_ref().and_then(|object| object.optional("learner")) {
+            faults.note(&place, "a learner is known to a service alone: ask that, or give its weights by --weight");
+        }
         let read = object.and_then(|object| Request::read(mapper.model(), &object, &mut faults));
-        let what = format!("the request made of {}", self.demonstration.display());
-        let asked = faults.check(read).map_err(|faults| CliError::Faults { what, faults })?;
+        let told = |faults: Faults| request.told_of(&faults, observations.source(), &spots);
+        let asked = faults.check(read).map_err(told)?;
 
         let clock = Clock::system();
         let started = clock.instant();
@@ -79,7 +88,7 @@ impl Map {
         let mapping = asked.solve(&mapper, &mut interrupt)?;
         let stamp = Stamp {
             id: None,
-            model: request["model"].as_str().unwrap_or_default().to_owned(),
+            model: document["model"].as_str().unwrap_or_default().to_owned(),
             model_hash: hash_of(&definition.text()),
             lookahead: asked.lookahead.map(NonZeroU32::get),
             elapsed_us: as_micros(clock.elapsed(started)),
@@ -96,35 +105,33 @@ impl Map {
         Ok(())
     }
 
-    /// The request that the files and options amount to.
-    fn request(&self) -> Result<Value, CliError> {
-        let mut request = match read_json(&self.demonstration)? {
-            Value::Object(request) => request,
-            demonstration => Members::from_iter([("demonstration".to_owned(), demonstration)]),
-        };
-        let stem = || self.model.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-        request.entry("model").or_insert_with(|| stem().into());
-        if !self.weights.is_empty() {
-            let weights = request.entry("weights").or_insert(Value::Null);
-            if weights.is_null() {
-                *weights = json!({});
-            }
-            let Value::Object(weights) = weights else {
-                let path = self.demonstration.display();
-                return Err(CliError::Option(format!("--weight: the `weights` of {path} are no object")));
-            };
-            weights.extend(self.weights.iter().map(|(attribute, weight)| (attribute.clone(), json!(weight))));
+    /// The request that the files and flags amount to, and where its observations stood.
+    fn request(&self, observations: &mut Observations) -> Result<(FlaggedRequest, Vec<Spot>), CliError> {
+        let mut request = FlaggedRequest::new(observations.take_request());
+        let (mut states, mut spots) = (Vec::new(), Vec::new());
+        while let Some(observation) = observations.next()? {
+            states.push(observation.state);
+            spots.push(observation.spot);
         }
+        if states.is_empty() {
+            return Err(CliError::Faulty(observations.source().tell("", "nothing was observed")));
+        }
+        request.insert("demonstration", states.into());
+        if request.members().get("model").is_none_or(Value::is_null) {
+            let stem = self.model.file_stem().map(|stem| stem.to_string_lossy().into_owned());
+            request.insert("model", stem.unwrap_or_default().into());
+        }
+        self.options.add_to(&mut request)?;
         let heuristic = self.heuristic.and_then(|heuristic| heuristic.to_possible_value());
-        let options = [
-            ("start", self.start.clone()),
-            ("lookahead", self.lookahead.map(Value::from)),
-            ("heuristic", heuristic.map(|heuristic| heuristic.get_name().into())),
-            ("max_expansions", self.max_expansions.map(Value::from)),
-            ("deadline_ms", self.deadline_ms.map(Value::from)),
-        ];
-        request.extend(options.into_iter().filter_map(|(name, value)| Some((name.to_owned(), value?))));
-        Ok(request.into())
+        for (flag, name, value) in [
+            ("--lookahead", "lookahead", self.lookahead.map(Lookahead::document)),
+            ("--heuristic", "heuristic", heuristic.map(|heuristic| heuristic.get_name().into())),
+            ("--max-expansions", "max_expansions", self.max_expansions.map(Value::from)),
+            ("--deadline-ms", "deadline_ms", self.deadline_ms.map(Value::from)),
+        ] {
+            request.set_some(flag, name, value)?;
+        }
+        Ok((request, spots))
     }
 }
 
@@ -133,14 +140,14 @@ fn as_micros(duration: Duration) -> u64 {
 }
 
 /// Reads and compiles a model. There is no limit to tables but memory: nobody else is served.
-pub(super) fn read_model(path: &Path, limits: Limits) -> Result<(Definition, Model), CliError> {
+pub(super) fn read_model(path: &Path) -> Result<(Definition, Model), CliError> {
     let model_error = |error| match error {
         CompileError::Faults(faults) => CliError::Faults { what: path.display().to_string(), faults },
         CompileError::Cancelled(cancelled) => cancelled.into(),
         CompileError::OutOfTime => Interrupted::OutOfTime.into(),
     };
     let definition = Definition::read(&read_json(path)?, Limits::NONE, &mut Uninterrupted).map_err(model_error)?;
-    let model = Model::compile(&definition, limits, &mut Uninterrupted)?;
+    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted)?;
     Ok((definition, model))
 }
 
@@ -152,15 +159,5 @@ pub(super) fn read_json(path: &Path) -> Result<Value, CliError> {
         fs::read(path)
     };
     let text = read.map_err(|source| CliError::Read { path: path.to_owned(), source })?;
-    document::parse(&text).map_err(|source| CliError::Parse { path: path.to_owned(), source })
-}
-
-pub(super) fn parse_weight(text: &str) -> Result<(String, f64), String> {
-    let (attribute, weight) = text.rsplit_once('=').ok_or("expected ATTRIBUTE=WEIGHT")?;
-    let weight: f64 = weight.parse().map_err(|_| format!("expected a number, found {weight:?}"))?;
-    if weight.is_finite() { Ok((attribute.to_owned(), weight)) } else { Err("expected a finite number".to_owned()) }
-}
-
-pub(super) fn parse_json(text: &str) -> Result<Value, String> {
-    document::parse(text.as_bytes()).map_err(|error| error.to_string())
+    document::parse(&text).map_err(|source| CliError::Faulty(format!("{}: {source}", path.display())))
 }

@@ -4,9 +4,11 @@ mod client;
 mod demo;
 mod experiment;
 mod healthcheck;
+mod input;
 mod learner;
 mod map;
 mod openapi;
+mod options;
 mod render;
 mod serve;
 mod side_by_side;
@@ -21,7 +23,7 @@ use clap::{Parser, Subcommand};
 
 use crate::server::ServerError;
 use crate::telemetry::{LogConfig, start_logging};
-use etude_core::document::{Faults, ParseError};
+use etude_core::document::Faults;
 
 /// Learns a task by watching it done: finds the policy, in an agent's own actions, whose effects follow a demonstration
 /// most closely.
@@ -65,15 +67,12 @@ enum CliError {
         #[source]
         source: io::Error,
     },
-    /// A file is not JSON.
-    #[error("{}: {source}", path.display())]
-    Parse { path: PathBuf, source: ParseError },
     /// A file is JSON, but not what was asked for.
     #[error("{what} has faults:\n{faults}")]
     Faults { what: String, faults: Faults },
-    /// An option is not what it should be.
+    /// A flag, or something in a file, is not what it should be: what, where, and what is wrong with it.
     #[error("{0}")]
-    Option(String),
+    Faulty(String),
     /// The search has no answer.
     #[error(transparent)]
     Cancelled(#[from] etude_core::interrupt::Cancelled),
@@ -89,6 +88,11 @@ enum CliError {
     /// The service did not start or run.
     #[error(transparent)]
     Server(#[from] ServerError),
+    /// There is no service to be asked.
+    #[error(
+        "no service answers at {url}: {why}. Start one with `etude serve`, or name another by --server, such as http://127.0.0.1:8080"
+    )]
+    NoService { url: String, why: String },
     /// A service could not be asked.
     #[error("cannot ask {url}")]
     Http {
@@ -97,8 +101,8 @@ enum CliError {
         source: reqwest::Error,
     },
     /// A service answered something else than expected.
-    #[error("{url} answered {status}: {body}")]
-    Answer { url: String, status: u16, body: String },
+    #[error("{url} answered {status}: {told}")]
+    Answer { url: String, status: u16, told: String },
     /// A database did not do as asked.
     #[error(transparent)]
     Service(#[from] crate::service::ServiceError),
@@ -111,9 +115,6 @@ enum CliError {
     /// A figure could not be drawn.
     #[error(transparent)]
     Plot(#[from] crate::experiment::plot::PlotError),
-    /// A line of the input is not an observation.
-    #[error("line {line} of the input: {problem}")]
-    Line { line: u64, problem: String },
     /// A stream ended without a policy.
     #[error("the stream ended without a policy: {0}")]
     Stream(String),
@@ -158,12 +159,13 @@ pub fn run() -> ExitCode {
     }
 }
 
-/// Writes an error and its causes to standard error.
+/// Writes an error and its causes to standard error, without the numbers that the system has for them.
 fn report(error: &CliError) {
     let mut text = error.to_string();
     let mut cause = error.source();
     while let Some(error) = cause {
         let message = error.to_string();
+        let message = message.split(" (os error ").next().unwrap_or_default().to_owned();
         // Some messages include their cause already.
         if !text.contains(&message) {
             text.push_str(": ");
@@ -171,7 +173,12 @@ fn report(error: &CliError) {
         }
         cause = error.source();
     }
-    #[expect(clippy::print_stderr, reason = "this is where a command's error goes")]
+    note(&text);
+}
+
+/// Tells whoever watches of something, beside the output.
+fn note(text: &str) {
+    #[expect(clippy::print_stderr, reason = "this is where what is no output goes")]
     {
         eprintln!("etude: {text}");
     }

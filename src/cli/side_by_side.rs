@@ -5,10 +5,12 @@ use std::io::Write;
 use reqwest::Client;
 use serde_json::{Value, json};
 
+use super::options::faulty;
 use super::stream::client;
-use super::stream::frames::{Frame, StepFrame, refused};
+use super::stream::frames::{Frame, StepFrame};
 use super::{CliError, render};
 use etude_core::attribute::{ByAttribute, Scalar};
+use etude_core::document::Fault;
 
 /// Streams `demonstration` to `model` at the service, an observation at a time, and shows what comes back as it comes.
 pub(super) async fn stream(
@@ -54,7 +56,12 @@ pub(super) async fn stream(
                 writeln!(out, "{}status    {}", render::cost(&cost), status.name())?;
                 return Ok(());
             }
-            Frame::Error { problem } => return Err(refused(problem, None)),
+            Frame::Error { problem } => {
+                let tell = |faults: &[Fault]| {
+                    faulty(faults.iter().map(|fault| format!("{}: {}", fault.pointer, fault.detail)).collect(), 0)
+                };
+                return Err(problem.told(None, tell));
+            }
         }
     }
     Err(CliError::Stream("the service ended it".to_owned()))

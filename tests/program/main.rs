@@ -7,6 +7,7 @@ mod harness;
 
 mod commands;
 mod disk;
+mod inputs;
 mod kill_rewards;
 mod kill_streams;
 mod signals;

@@ -7,7 +7,7 @@ use serde_json::Value;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 
-use crate::cli::CliError;
+use crate::cli::{CliError, client as http};
 
 /// Frames that wait to be sent. The server takes no more than it can handle, so more would only wait longer.
 const MAX_WAITING: usize = 16;
@@ -40,7 +40,7 @@ impl Answers {
                 return Ok(Some(String::from_utf8_lossy(line.trim_ascii()).into_owned()));
             }
             let chunk = self.response.chunk().await;
-            let Some(chunk) = chunk.map_err(|source| CliError::Http { url: self.url.clone(), source })? else {
+            let Some(chunk) = chunk.map_err(|source| http::failed(&self.url, source))? else {
                 return Ok(None);
             };
             self.buffer.extend_from_slice(&chunk);
@@ -50,15 +50,13 @@ impl Answers {
 
 /// Opens a stream to the service at `server`. The first answer is its `hello`.
 pub(in crate::cli) async fn connect(client: &Client, server: &str) -> Result<(Frames, Answers), CliError> {
-    let url = format!("{}/v1/stream", server.trim_end_matches('/'));
+    let url = format!("{server}/v1/stream");
     let (lines, body) = mpsc::channel(MAX_WAITING);
     let request = client.post(&url).header("content-type", "application/x-ndjson");
     let sent = request.body(Body::wrap_stream(ReceiverStream::new(body))).send().await;
-    let response = sent.map_err(|source| CliError::Http { url: url.clone(), source })?;
+    let response = sent.map_err(|source| http::failed(&url, source))?;
     if !response.status().is_success() {
-        let status = response.status().as_u16();
-        let body = response.text().await.map_err(|source| CliError::Http { url: url.clone(), source })?;
-        return Err(CliError::Answer { url, status, body });
+        return Err(http::refused(&url, response).await);
     }
     Ok((Frames { lines }, Answers { url, response, buffer: Vec::new() }))
 }

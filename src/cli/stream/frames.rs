@@ -6,7 +6,10 @@
 use serde::Deserialize;
 
 use crate::cli::CliError;
+use crate::cli::input::Spot;
+use crate::cli::options::faulty;
 use etude_core::attribute::{ByAttribute, Scalar};
+use etude_core::document::Fault;
 use etude_core::mapping::{Cost, MoveKind, Status};
 
 /// A frame of the server.
@@ -53,32 +56,25 @@ impl Problem {
     }
 }
 
-/// What is wrong at one place of a frame.
-#[derive(Debug, Deserialize)]
-struct Fault {
-    pointer: String,
-    detail: String,
-}
-
 pub(super) fn nothing_observed() -> CliError {
     CliError::Stream("nothing was observed".to_owned())
 }
 
-/// What the service found wrong, with the line of the input where it is that.
-pub(in crate::cli) fn refused(problem: Problem, line: Option<u64>) -> CliError {
-    let Problem { kind, detail, errors } = problem;
-    match (kind.as_str(), line) {
-        ("/problems/invalid", Some(line)) => {
-            let places = errors.iter().map(|Fault { pointer, detail }| {
-                // Each frame has one state, which is the line.
-                format!("{}: {detail}", pointer.strip_prefix("/states/0").unwrap_or(pointer))
-            });
-            CliError::Line { line, problem: places.collect::<Vec<_>>().join("\n") }
-        }
-        ("/problems/empty", _) => nothing_observed(),
-        _ => {
-            let places = errors.iter().map(|Fault { pointer, detail }| format!("\n{pointer}: {detail}"));
-            CliError::Stream(detail + &places.collect::<String>())
+impl Problem {
+    /// What was wrong, where that was the observation at `spot`, or what `tell` says of the frame that opened the stream.
+    pub(in crate::cli) fn told(self, spot: Option<&Spot>, tell: impl FnOnce(&[Fault]) -> CliError) -> CliError {
+        let Self { kind, detail, errors } = self;
+        match (kind.as_str(), spot) {
+            ("/problems/invalid", Some(spot)) => {
+                let told = errors.iter().map(|Fault { pointer, detail, .. }| {
+                    // Each frame has one state.
+                    spot.tell(pointer.strip_prefix("/states/0").unwrap_or(pointer), detail)
+                });
+                faulty(told.collect(), 0)
+            }
+            ("/problems/invalid", None) if !errors.is_empty() => tell(&errors),
+            ("/problems/empty", _) => nothing_observed(),
+            _ => CliError::Stream(detail),
         }
     }
 }

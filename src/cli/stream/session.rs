@@ -1,26 +1,28 @@
 //! A stream through a service, over as many connections as it takes.
 //!
 //! ```text
-//! connect -> open -> lines out, steps in -> done
+//! connect -> open -> observations out, steps in -> done
 //!    ^                      |
 //!    +--- resume <- wait <--+ the connection is lost
 //! ```
 //!
-//! Lines are kept until the service has said that they are durable. A new connection asks for the steps after the last one
-//! printed, and is sent the lines from the first one on that the service does not have: nothing is lost, nothing comes twice.
+//! Observations are kept until the service has said that they are durable. A new connection asks for the steps after the last one
+//! printed, and is sent the observations from the first one on that the service does not have: nothing is lost, nothing comes twice.
 
 use std::collections::VecDeque;
 use std::io::Write;
+use std::sync::Arc;
 use std::time::Duration;
 
-use serde_json::{Value, json};
+use serde_json::json;
 use tokio::sync::mpsc;
 
 use super::client::{self, Answers, Frames};
-use super::frames::{Problem, refused};
-use super::lines::{Line, MAX_READ_AHEAD};
+use super::frames::Problem;
 use super::printer::{Answer, Printer};
 use crate::cli::CliError;
+use crate::cli::input::{MAX_READ_AHEAD, Observation, Observations, Source};
+use crate::cli::options::FlaggedRequest;
 
 /// How long to wait before the first attempt to take up a lost stream; twice as long before each further one.
 const FIRST_DELAY: Duration = Duration::from_millis(100);
@@ -33,12 +35,13 @@ pub(super) struct StreamSession {
     client: reqwest::Client,
     server: String,
     /// The frame that opens it.
-    open: Value,
+    open: FlaggedRequest,
     /// Its id, once it is open.
     id: Option<String>,
-    lines: mpsc::Receiver<Result<Option<Line>, CliError>>,
-    /// Lines that are not durable as far as is known, in order. The first is the observation `n_received`.
-    waiting: VecDeque<Line>,
+    source: Arc<Source>,
+    observations: mpsc::Receiver<Result<Option<Observation>, CliError>>,
+    /// Observations that are not durable as far as is known, in order. The first is the observation `n_received`.
+    waiting: VecDeque<Observation>,
     n_received: u32,
     /// Whether the input is at its end.
     is_complete: bool,
@@ -62,14 +65,18 @@ impl From<CliError> for Broken {
 }
 
 impl StreamSession {
-    pub(super) fn new(
-        client: reqwest::Client,
-        server: &str,
-        open: Value,
-        lines: mpsc::Receiver<Result<Option<Line>, CliError>>,
-    ) -> Self {
-        let waiting = VecDeque::with_capacity(MAX_READ_AHEAD);
-        Self { client, server: server.to_owned(), open, id: None, lines, waiting, n_received: 0, is_complete: false }
+    pub(super) fn new(client: reqwest::Client, server: &str, open: FlaggedRequest, observations: Observations) -> Self {
+        Self {
+            client,
+            server: server.to_owned(),
+            open,
+            id: None,
+            source: Arc::clone(observations.source()),
+            observations: observations.read_ahead(),
+            waiting: VecDeque::with_capacity(MAX_READ_AHEAD),
+            n_received: 0,
+            is_complete: false,
+        }
     }
 
     /// Streams until the policy is done. A connection that is lost once the session is open is replaced, unless that fails
@@ -109,12 +116,12 @@ impl StreamSession {
     async fn speak(&mut self, printer: &mut Printer<'_, impl Write>) -> Result<(), Broken> {
         let (frames, mut answers) = client::connect(&self.client, &self.server).await?;
         match &self.id {
-            None => frames.send(&self.open).await,
+            None => frames.send(&self.open.document()).await,
             Some(id) => frames.send(&json!({"type": "resume", "session": id, "step": printer.n_steps()})).await,
         };
         self.opened(printer, &mut answers).await?;
 
-        // How many of the waiting lines were sent here. The request ends with the frames.
+        // How many of the waiting observations were sent here. The request ends with the frames.
         let (mut n_sent, mut frames) = (0, Some(frames));
         loop {
             if let Some(sending) = &frames {
@@ -125,8 +132,8 @@ impl StreamSession {
             }
             let may_read = !self.is_complete && self.waiting.len() < MAX_READ_AHEAD;
             tokio::select! {
-                line = self.lines.recv(), if may_read => match line.transpose()?.flatten() {
-                    Some(line) => self.waiting.push_back(line),
+                next = self.observations.recv(), if may_read => match next.transpose()?.flatten() {
+                    Some(observation) => self.waiting.push_back(observation),
                     None => self.is_complete = true,
                 },
                 answer = Self::receive(printer, &mut answers) => match answer? {
@@ -157,12 +164,12 @@ impl StreamSession {
         }
     }
 
-    /// Sends the lines that were not sent yet, and the end if it is reached.
+    /// Sends the observations that were not sent yet, and the end if it is reached.
     async fn send(&self, frames: &Frames, n_sent: &mut usize) {
         // Whether anybody listens is told by the answers.
-        for line in self.waiting.iter().skip(*n_sent) {
+        for observation in self.waiting.iter().skip(*n_sent) {
             let seq = self.n_received as usize + *n_sent;
-            frames.send(&json!({"type": "observe", "seq": seq, "states": [&line.observation]})).await;
+            frames.send(&json!({"type": "observe", "seq": seq, "states": [&observation.state]})).await;
             *n_sent += 1;
         }
         if self.is_complete {
@@ -177,7 +184,7 @@ impl StreamSession {
         Ok(printer.frame(&text)?)
     }
 
-    /// Forgets the lines before the observation `seq`, which are durable. Gives how many.
+    /// Forgets what comes before the observation `seq`, which is durable. Gives how many observations that were.
     fn received(&mut self, printer: &Printer<'_, impl Write>, seq: u32) -> Result<usize, Broken> {
         let n_acknowledged = seq.checked_sub(self.n_received).map(|n| n as usize);
         let Some(n_acknowledged) = n_acknowledged.filter(|n| *n <= self.waiting.len()) else {
@@ -190,10 +197,11 @@ impl StreamSession {
         Ok(n_acknowledged)
     }
 
-    /// Errors are about the first line that is not acknowledged, but for those that are about the connection.
+    /// Errors are about the first observation that is not acknowledged, but for those that are about the connection.
     fn refused(&self, problem: Problem) -> Broken {
         let is_passing = problem.is_passing();
-        let error = refused(problem, self.waiting.front().map(|line| line.number));
+        let spot = self.waiting.front().filter(|_| self.id.is_some()).map(|observation| &observation.spot);
+        let error = problem.told(spot, |faults| self.open.told(faults, 0, &self.source, &[]));
         if is_passing { Broken::Lost(error) } else { Broken::Failed(error) }
     }
 }

@@ -1,0 +1,178 @@
+//! What flags say of a request, in `map` and `stream` alike, and what is told of it if it is wrong.
+
+use std::num::NonZeroU32;
+use std::str::FromStr;
+
+use clap::Args;
+use serde_json::{Map as Members, Value, json};
+
+use super::CliError;
+use super::input::{Column, Source, Spot, parse_json};
+use etude_core::document::{Fault, Faults};
+use etude_core::mapping::Demonstration;
+
+/// Flags that are options of a request.
+#[derive(Args, Debug)]
+pub(super) struct OptionFlags {
+    /// Weight of an attribute; may be given for several.
+    #[arg(long = "weight", value_name = "ATTRIBUTE=WEIGHT", value_parser = parse_weight)]
+    weights: Vec<(String, f64)>,
+    /// Where the imitator starts: a state's index, or a JSON object of attribute values.
+    #[arg(long, value_name = "STATE", value_parser = parse_json)]
+    start: Option<Value>,
+}
+
+impl OptionFlags {
+    /// Adds what they say to `request`, over what it says itself.
+    pub(super) fn add_to(&self, request: &mut FlaggedRequest) -> Result<(), CliError> {
+        for (attribute, weight) in &self.weights {
+            request.set(&format!("--weight {attribute}={weight}"), &["weights", attribute], json!(weight))?;
+        }
+        request.set_some("--start", "start", self.start.clone())
+    }
+}
+
+/// Flags that say how observations are read.
+#[derive(Args, Debug)]
+pub(super) struct ReadingFlags {
+    /// An attribute's column (in CSV) or member (in JSON) that is called otherwise, in other units if need be, such as x=lon or
+    /// x=lon*1000-5; may be given for several.
+    #[arg(long = "column", value_name = "ATTRIBUTE=COLUMN[*FACTOR][+OFFSET]")]
+    pub(super) columns: Vec<Column>,
+}
+
+/// A request that was read from a file, with what flags say over it.
+pub(super) struct FlaggedRequest {
+    members: Members<String, Value>,
+    /// What was said by flags: pointers, and the flags.
+    flags: Vec<(String, String)>,
+}
+
+impl FlaggedRequest {
+    /// What was read from a file.
+    pub(super) fn new(members: Members<String, Value>) -> Self {
+        Self { members, flags: Vec::new() }
+    }
+
+    pub(super) fn members(&self) -> &Members<String, Value> {
+        &self.members
+    }
+
+    /// Adds a member that no flag stands for.
+    pub(super) fn insert(&mut self, name: &str, value: Value) {
+        self.members.insert(name.to_owned(), value);
+    }
+
+    /// Sets the option at `path`, members within members, to what `flag` says.
+    pub(super) fn set(&mut self, flag: &str, path: &[&str], value: Value) -> Result<(), CliError> {
+        let Some((last, parents)) = path.split_last() else { return Ok(()) };
+        let mut members = &mut self.members;
+        for name in parents {
+            let parent = members.entry(*name).or_insert(Value::Null);
+            if parent.is_null() {
+                *parent = json!({});
+            }
+            let Value::Object(object) = parent else {
+                return Err(CliError::Faulty(format!("{flag}: the request has {name:?} already, and it is no object")));
+            };
+            members = object;
+        }
+        members.insert((*last).to_owned(), value);
+        let escaped = path.iter().map(|name| name.replace('~', "~0").replace('/', "~1"));
+        let pointer = escaped.fold(String::new(), |pointer, name| pointer + "/" + &name);
+        self.flags.push((pointer, flag.to_owned()));
+        Ok(())
+    }
+
+    /// Sets the option `name` to what `flag` says, if it says anything.
+    pub(super) fn set_some(&mut self, flag: &str, name: &str, value: Option<Value>) -> Result<(), CliError> {
+        match value {
+            Some(value) => self.set(&format!("{flag} {value}"), &[name], value.clone()),
+            None => Ok(()),
+        }
+    }
+
+    /// The request as one document.
+    pub(super) fn document(&self) -> Value {
+        self.members.clone().into()
+    }
+
+    /// All that is wrong with the request, each fault with the flag, or the place in `source`, that it is about. Of its demonstration, the
+    /// observations stood at `spots`.
+    pub(super) fn told(&self, faults: &[Fault], n_more: usize, source: &Source, spots: &[Spot]) -> CliError {
+        let tell = |Fault { pointer, detail, .. }: &Fault| {
+            if let Some((index, rest)) = pointer.strip_prefix("/demonstration/").map(split_pointer)
+                && let Some(spot) = index.parse().ok().and_then(|index: usize| spots.get(index))
+            {
+                return spot.tell(rest, detail);
+            }
+            let within = |(place, flag): &(String, String)| {
+                let rest = pointer.strip_prefix(place.as_str())?;
+                (rest.is_empty() || rest.starts_with('/')).then(|| (flag.clone(), rest))
+            };
+            match self.flags.iter().find_map(within) {
+                Some((flag, "")) => format!("{flag}: {detail}"),
+                Some((flag, rest)) => format!("{flag}: {rest}: {detail}"),
+                None => source.tell(
+                    pointer.strip_prefix("/demonstration").filter(|rest| rest.is_empty()).unwrap_or(pointer),
+                    detail,
+                ),
+            }
+        };
+        faulty(faults.iter().map(tell).collect(), n_more)
+    }
+
+    /// The same, of faults that were found here.
+    pub(super) fn told_of(&self, faults: &Faults, source: &Source, spots: &[Spot]) -> CliError {
+        self.told(faults.listed(), faults.count() - faults.listed().len(), source, spots)
+    }
+}
+
+/// The error that tells of these faults, and of how many more there are.
+pub(super) fn faulty(mut faults: Vec<String>, n_more: usize) -> CliError {
+    if let ([fault], 0) = (&*faults, n_more) {
+        return CliError::Faulty(fault.clone());
+    }
+    let count = faults.len() + n_more;
+    if n_more > 0 {
+        faults.push(format!("and {n_more} more"));
+    }
+    CliError::Faulty(format!("{count} faults:\n{}", faults.join("\n")))
+}
+
+/// The first part of a pointer, and the rest, with the slash that it begins with.
+fn split_pointer(pointer: &str) -> (&str, &str) {
+    pointer.split_at(pointer.find('/').unwrap_or(pointer.len()))
+}
+
+/// How many observations past the current one a step may wait for; `none`: all.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Lookahead(pub(super) Option<NonZeroU32>);
+
+impl Lookahead {
+    /// As in a request.
+    pub(super) fn document(self) -> Value {
+        json!(self.0)
+    }
+}
+
+impl FromStr for Lookahead {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        /// As long as the longest demonstration.
+        const LONGEST: usize = Demonstration::MAX_OBSERVATIONS;
+        if text == "none" {
+            return Ok(Self(None));
+        }
+        let lookahead = text.parse().ok().filter(|lookahead: &NonZeroU32| lookahead.get() as usize <= LONGEST);
+        let lookahead = lookahead.ok_or_else(|| format!("expected a number from 1 to {LONGEST}, or none"))?;
+        Ok(Self(Some(lookahead)))
+    }
+}
+
+fn parse_weight(text: &str) -> Result<(String, f64), String> {
+    let (attribute, weight) = text.rsplit_once('=').ok_or("expected ATTRIBUTE=WEIGHT")?;
+    let weight: f64 = weight.parse().map_err(|_| format!("expected a number, found {weight:?}"))?;
+    if weight.is_finite() { Ok((attribute.to_owned(), weight)) } else { Err("expected a finite number".to_owned()) }
+}
