@@ -58,7 +58,9 @@ enum Broken {
 impl From<CliError> for Broken {
     fn from(error: CliError) -> Self {
         match error {
-            CliError::Http { .. } | CliError::Answer { status: 503, .. } => Self::Lost(error),
+            CliError::NoService { .. } | CliError::Http { .. } | CliError::Answer { status: 503, .. } => {
+                Self::Lost(error)
+            }
             _ => Self::Failed(error),
         }
     }
