@@ -60,6 +60,10 @@ struct Counts {
     states: Option<u64>,
     /// Transitions; `null` if the states are.
     transitions: Option<u64>,
+    /// Pairs of a state and an action that have several outcomes, each with its probability. Where there are any, the model can be registered and
+    /// read, and is not searched yet: what would search it is refused.
+    #[serde(rename = "stochastic")]
+    n_stochastic: u64,
     /// States that must never be entered.
     #[serde(rename = "unsafe")]
     n_unsafe: u64,
@@ -75,6 +79,7 @@ impl From<ModelSummary> for ModelBody {
                 actions: summary.actions.len(),
                 states: summary.size.map(|size| size.n_states),
                 transitions: summary.size.map(|size| size.n_transitions),
+                n_stochastic: summary.n_stochastic,
                 n_unsafe: summary.n_unsafe,
             },
             attributes: summary.attributes,

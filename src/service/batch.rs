@@ -377,6 +377,7 @@ fn read_shared(
     faults: &mut Faults,
 ) -> Option<(Weights, Options)> {
     let options = Options::read(object, model, &Options::default(), faults);
+    Options::check_model(model, object, faults);
     Options::check_lookahead_is_possible(model, object, faults);
     let base = base_weights(model, learner, faults)?;
     let options = options?;

@@ -151,6 +151,7 @@ impl Etude {
                 n_states: model.graph().n_states() as u64,
                 n_transitions: model.n_transitions() as u64,
             }),
+            n_stochastic: model.n_stochastic() as u64,
             n_unsafe: model.n_unsafe() as u64,
             created_at: as_stored(caller.now),
         };

@@ -64,6 +64,7 @@ pub(super) fn read(
         let detail = "this world is searched lazily, which needs the whole demonstration: ask for a policy instead";
         faults.note_at(&Path::Member(&Path::Root, "model"), detail);
     }
+    Options::check_model(model, object, faults);
     let weights = base_weights(model, learner, faults);
     // Without the general options, a fault was noted.
     let options = general.unwrap_or_default().read_of_model(object, model, faults)?;

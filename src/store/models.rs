@@ -25,6 +25,8 @@ pub struct ModelSummary {
     pub actions: Vec<ActionDocument>,
     /// How many states and transitions it has; `None` if it is searched lazily.
     pub size: Option<ModelSize>,
+    /// Of how many states and actions there are several outcomes.
+    pub n_stochastic: u64,
     /// How many of its states are unsafe.
     pub n_unsafe: u64,
     /// When it was registered.
@@ -190,7 +192,7 @@ impl Store {
         let sizes: Vec<i64> = sizes.fetch_all(&mut *reader).await?;
         let (n_rows, rest) = page::fitting(&sizes, limit);
         let query = sqlx::query(
-            "SELECT name, hash, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms
+            "SELECT name, hash, attributes, actions, n_states, n_transitions, n_stochastic, n_unsafe, created_at_ms
              FROM models WHERE name > $1 ORDER BY name LIMIT $2",
         );
         let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(&mut *reader);
@@ -215,6 +217,7 @@ fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
             UNKNOWN => None,
             _ => Some(ModelSize { n_states: count("n_states")?, n_transitions: count("n_transitions")? }),
         },
+        n_stochastic: count("n_stochastic")?,
         n_unsafe: count("n_unsafe")?,
         created_at: timestamp(TABLE, "created_at_ms", row.try_get("created_at_ms")?)?,
     })
@@ -273,9 +276,9 @@ async fn register(
     let json = |source: serde_json::Error| corrupt("models", "attributes")(source);
     let inserted = sqlx::query(
         "INSERT INTO models
-             (name, hash, definition, definition_id, attributes, actions, n_states, n_transitions, n_unsafe,
+             (name, hash, definition, definition_id, attributes, actions, n_states, n_transitions, n_stochastic, n_unsafe,
               created_at_ms)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10) ON CONFLICT (name) DO NOTHING",
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11) ON CONFLICT (name) DO NOTHING",
     )
     .bind(&summary.name)
     .bind(&summary.hash)
@@ -285,6 +288,7 @@ async fn register(
     .bind(serde_json::to_string(&summary.actions).map_err(json)?)
     .bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_states)))
     .bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_transitions)))
+    .bind(as_integer(summary.n_stochastic))
     .bind(as_integer(summary.n_unsafe))
     .bind(summary.created_at.as_millisecond())
     .execute(&mut *connection)
@@ -299,7 +303,7 @@ async fn register(
         return Ok(Registration::Created(summary.clone()));
     }
     let query = sqlx::query(
-        "SELECT name, hash, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms
+        "SELECT name, hash, attributes, actions, n_states, n_transitions, n_stochastic, n_unsafe, created_at_ms
          FROM models WHERE name = $1",
     );
     let query = query.bind(&summary.name);

@@ -188,6 +188,7 @@ mod tests {
                 attributes: vec![attribute.clone()],
                 actions: Vec::new(),
                 size: None,
+                n_stochastic: 0,
                 n_unsafe: 0,
                 created_at: now,
             };

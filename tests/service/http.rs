@@ -37,7 +37,10 @@ async fn a_model_is_registered_read_listed_and_deleted() {
     let service = Service::start(&[]).await;
     let (status, created) = service.put("/v1/models/corridor", &corridor()).await;
     assert_eq!(status, 201, "{created}");
-    assert_eq!(created["counts"], json!({"attributes": 3, "actions": 1, "states": 2, "transitions": 1, "unsafe": 0}));
+    assert_eq!(
+        created["counts"],
+        json!({"attributes": 3, "actions": 1, "states": 2, "transitions": 1, "stochastic": 0, "unsafe": 0})
+    );
     assert_eq!(created["attributes"][0], json!({"name": "x", "kind": "number", "scale": 1.0, "weight": 1.0}));
     assert_eq!(created["hash"].as_str().unwrap().len(), 64);
 
@@ -455,7 +458,7 @@ async fn a_world_over_the_limit_is_searched_lazily_and_stays_so() {
     assert_eq!(status, 201);
     assert_eq!(
         model["counts"],
-        json!({"attributes": 9, "actions": 6, "states": null, "transitions": null, "unsafe": 0})
+        json!({"attributes": 9, "actions": 6, "states": null, "transitions": null, "stochastic": 0, "unsafe": 0})
     );
     assert_eq!(service.put("/v1/models/large", &cave).await.0, 200);
     assert_eq!(service.get("/v1/models/large").await.1["counts"], model["counts"]);

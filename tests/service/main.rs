@@ -17,6 +17,7 @@ mod problems;
 mod batch;
 mod front;
 mod http;
+mod inputs;
 mod learning;
 mod limits;
 mod protocol;

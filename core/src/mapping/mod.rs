@@ -63,6 +63,7 @@ mod problem;
 mod recurrence;
 mod request;
 mod search;
+mod searchable;
 mod written;
 
 pub use budget::{Budget, StoppedBy};

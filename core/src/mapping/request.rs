@@ -176,18 +176,6 @@ impl Options {
         }
     }
 
-    /// Notes that searches do not know what to do with `model`, if that is so.
-    pub fn check_model(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
-        if model.n_stochastic() > 0 {
-            let detail = format!(
-                "this model is stochastic (for {} pairs of a state and an action there are several outcomes), and there are no policies \
-                 for such models yet",
-                model.n_stochastic()
-            );
-            faults.note_at(&Path::Member(&object.path, "model"), detail);
-        }
-    }
-
     /// Notes a lookahead at all in a world that is searched lazily.
     pub fn check_lookahead_is_possible(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
         if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {

@@ -98,8 +98,10 @@ impl Stream {
         let document = request.document();
         let mut faults = Faults::default();
         let object = Place::root(&document).object(RequestKind::Session.fields(), &mut faults);
-        let options =
-            object.and_then(|object| Options::read(&object, mapper.model(), &Options::default(), &mut faults));
+        let options = object.and_then(|object| {
+            Options::check_model(mapper.model(), &object, &mut faults);
+            Options::read(&object, mapper.model(), &Options::default(), &mut faults)
+        });
         let told = |faults: Faults| request.told_of(&faults, observations.source(), &[]);
         let options = faults.check(options).map_err(told)?;
 

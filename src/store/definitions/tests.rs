@@ -52,6 +52,7 @@ fn model(name: &str, pieces: NewPieces) -> NewModel {
         attributes: Vec::new(),
         actions: Vec::new(),
         size: Some(ModelSize { n_states: 1, n_transitions: 0 }),
+        n_stochastic: 0,
         n_unsafe: 0,
         created_at: Timestamp::UNIX_EPOCH,
     };

@@ -9,9 +9,11 @@
 //! ```
 
 mod interruptible;
+mod items;
 mod lists;
 mod raw;
 mod seeds;
+mod take;
 
 use std::io::{self, BufRead};
 
