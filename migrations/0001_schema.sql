@@ -82,6 +82,8 @@ CREATE TABLE sessions (
 ) STRICT;
 
 CREATE INDEX sessions_by_activity ON sessions (active_at_ms) WHERE status = 'open';
+CREATE INDEX sessions_by_policy ON sessions (policy_id) WHERE policy_id IS NOT NULL;
+CREATE INDEX sessions_by_trial ON sessions (trial_id) WHERE trial_id IS NOT NULL;
 
 -- Observations as they came, several a row. `states` is a JSON array of `n_states` states, the first of which is the
 -- observation `seq`.
@@ -109,6 +111,7 @@ CREATE TABLE learners (
     hash           TEXT    NOT NULL,
     definition     TEXT    NOT NULL,            -- JSON
     has_pending    INTEGER NOT NULL DEFAULT 0,  -- whether there are rewards that no version of the weights has folded in
+    deleted_number INTEGER NOT NULL DEFAULT 0,  -- the highest number of its trials that were deleted: it is not given out again
     created_at_ms  INTEGER NOT NULL
 ) STRICT;
 
@@ -129,6 +132,8 @@ CREATE TABLE trials (
     created_at_ms        INTEGER NOT NULL,
     UNIQUE (learner, number)
 ) STRICT;
+
+CREATE INDEX trials_by_policy ON trials (policy_id);
 
 -- The log of accepted rewards, numbered per learner. Rows are only ever added.
 CREATE TABLE rewards (

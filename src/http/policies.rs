@@ -9,10 +9,10 @@ use serde::Serialize;
 use utoipa::ToSchema;
 
 use super::answer::{json, json_text};
-use super::body::read_json;
+use super::body::{NoForm, read_json};
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
-use super::problem::{BodyProblems, Problem};
+use super::problem::{BodyProblems, DeletionProblems, Problem};
 use super::request_id::RequestId;
 use super::requests::{BatchRequest, PolicyRequest};
 use super::{SharedContext, answer};
@@ -102,6 +102,26 @@ pub(super) async fn make_policies(
 pub(super) async fn get_policy(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
     let (policy, held) = context.etude.policy(&id).await?;
     Ok(answer::counted(json_text(StatusCode::OK, policy), held))
+}
+
+/// Delete a policy. A policy that it refines, or that refines it, stays and forgets it, as its session does.
+#[utoipa::path(
+    delete, path = "/v1/policies/{policy}", tag = "policies",
+    params(("policy" = String, Path, description = "Its id")),
+    responses(
+        (status = 204, description = "It is deleted"),
+        (status = 404, description = "`unknown-policy`", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "`in-use`: a trial has it", body = Problem, content_type = "application/problem+json"),
+        DeletionProblems,
+    ),
+)]
+pub(super) async fn delete_policy(
+    State(context): State<SharedContext>,
+    PathId(id): PathId,
+    _: NoForm,
+) -> Result<StatusCode, Problem> {
+    context.etude.delete_policy(&id).await?;
+    Ok(StatusCode::NO_CONTENT)
 }
 
 /// Policies without their steps, oldest first.

@@ -35,6 +35,7 @@ pub(super) enum ProblemKind {
     MethodNotAllowed,
     SlowBody,
     Conflict,
+    InUse,
     AlreadyRewarded,
     TrialFailed,
     TooLarge,
@@ -73,6 +74,7 @@ impl ProblemKind {
             }
             Self::SlowBody => ("slow-body", "The body took too long", StatusCode::REQUEST_TIMEOUT),
             Self::Conflict => ("conflict", "The name is taken", StatusCode::CONFLICT),
+            Self::InUse => ("in-use", "Something else needs it", StatusCode::CONFLICT),
             Self::AlreadyRewarded => ("already-rewarded", "The trial has a reward", StatusCode::CONFLICT),
             Self::TrialFailed => ("trial-failed", "The trial has failed", StatusCode::CONFLICT),
             Self::BatchFull => ("batch-full", "The answer is full", StatusCode::PAYLOAD_TOO_LARGE),
@@ -156,6 +158,24 @@ pub(super) enum NoBodyProblems {
     HasBody(Problem),
     #[response(status = 422, description = "`invalid`: not a name", content_type = "application/problem+json")]
     NoName(Problem),
+    #[response(
+        status = 503,
+        description = "`not-ready`, `stopping`: see `Retry-After`",
+        content_type = "application/problem+json"
+    )]
+    NotReady(Problem),
+}
+
+/// The same, of what has an id, which may be any text.
+#[derive(IntoResponses)]
+#[expect(dead_code, reason = "it only describes what a `Problem` may be")]
+pub(super) enum DeletionProblems {
+    #[response(
+        status = 415,
+        description = "`unsupported-media-type`: it takes no body",
+        content_type = "application/problem+json"
+    )]
+    HasBody(Problem),
     #[response(
         status = 503,
         description = "`not-ready`, `stopping`: see `Retry-After`",
@@ -296,6 +316,7 @@ impl From<ServiceError> for Problem {
             }
             ServiceError::BatchFull => Self::new(ProblemKind::BatchFull, detail),
             ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),
+            ServiceError::InUse { .. } => Self::new(ProblemKind::InUse, detail),
             ServiceError::UnknownVersion { .. } => Self::new(ProblemKind::UnknownVersion, detail),
             ServiceError::AlreadyRewarded { .. } => Self::new(ProblemKind::AlreadyRewarded, detail),
             ServiceError::TrialFailed { .. } => Self::new(ProblemKind::TrialFailed, detail),

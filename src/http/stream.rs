@@ -24,12 +24,12 @@ use utoipa::ToSchema;
 
 use super::SharedContext;
 use super::answer::json;
-use super::body::{is_ndjson, refuse};
+use super::body::{NoForm, is_ndjson, refuse};
 use super::connections::IsStream;
 use super::encoding::Encoding;
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
-use super::problem::{Problem, ProblemKind};
+use super::problem::{DeletionProblems, Problem, ProblemKind};
 use crate::service::Caller;
 use crate::service::SessionRecord;
 use crate::stream::{Gone, Incoming, PROTOCOL, Room, SMALL_FRAME_BYTES, Sender};
@@ -230,6 +230,27 @@ pub(super) async fn list_sessions(State(context): State<SharedContext>, paging: 
 )]
 pub(super) async fn get_session(State(context): State<SharedContext>, PathId(id): PathId) -> Result<Response, Problem> {
     Ok(json(StatusCode::OK, &SessionBody::from(context.etude.session(&id).await?)))
+}
+
+/// Delete a session with its observations, running or not. Its policy and its trial stay.
+///
+/// A connection that drives it is closed with 1008 (`taken-over`).
+#[utoipa::path(
+    delete, path = "/v1/sessions/{session}", tag = "streams",
+    params(("session" = String, Path, description = "Its id")),
+    responses(
+        (status = 204, description = "It is deleted"),
+        (status = 404, description = "`unknown-session`", body = Problem, content_type = "application/problem+json"),
+        DeletionProblems,
+    ),
+)]
+pub(super) async fn delete_session(
+    State(context): State<SharedContext>,
+    PathId(id): PathId,
+    _: NoForm,
+) -> Result<StatusCode, Problem> {
+    context.etude.delete_session(&id).await?;
+    Ok(StatusCode::NO_CONTENT)
 }
 
 #[cfg(test)]

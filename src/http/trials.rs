@@ -11,10 +11,10 @@ use serde_json::value::RawValue;
 use utoipa::{IntoParams, ToSchema};
 
 use super::answer::json;
-use super::body::{read_json, read_small_json};
+use super::body::{NoForm, read_json, read_small_json};
 use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
-use super::problem::{BodyProblems, Problem};
+use super::problem::{BodyProblems, DeletionProblems, Problem};
 use super::requests::TrialRequest;
 use super::{SharedContext, answer};
 use crate::service::TrialStatus;
@@ -196,6 +196,26 @@ pub(super) async fn get_trial(State(context): State<SharedContext>, PathId(id): 
     let mut trial = context.etude.trial(&id, context.etude.clock().now()).await?;
     let held = trial.held.take();
     Ok(answer::counted(json(StatusCode::OK, &TrialBody::of(trial)), held))
+}
+
+/// Delete a trial. Its policy stays, and its number is not given to another one.
+#[utoipa::path(
+    delete, path = "/v1/trials/{trial}", tag = "trials",
+    params(("trial" = String, Path, description = "Its id")),
+    responses(
+        (status = 204, description = "It is deleted"),
+        (status = 404, description = "`unknown-trial`", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "`in-use`: it has a reward, which its learner learns from", body = Problem, content_type = "application/problem+json"),
+        DeletionProblems,
+    ),
+)]
+pub(super) async fn delete_trial(
+    State(context): State<SharedContext>,
+    PathId(id): PathId,
+    _: NoForm,
+) -> Result<StatusCode, Problem> {
+    context.etude.delete_trial(&id).await?;
+    Ok(StatusCode::NO_CONTENT)
 }
 
 /// Give a trial its reward; durable before it is answered. Counts once, however often it is sent.

@@ -164,6 +164,16 @@ pub enum ServiceError {
         /// The hash of what is there.
         existing_hash: String,
     },
+    /// Something else needs what was to be deleted.
+    #[error("{} {} cannot be deleted: {because}", kind.name(), Quoted(id))]
+    InUse {
+        /// What it is.
+        kind: Kind,
+        /// Its id.
+        id: String,
+        /// What needs it.
+        because: &'static str,
+    },
     /// The learner never had this version of its weights.
     #[error("the weights of learner {name:?} have no version {version}")]
     UnknownVersion {

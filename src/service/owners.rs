@@ -36,6 +36,14 @@ pub(super) struct Ownership {
 pub(super) struct TakenOver;
 
 impl Owners {
+    /// Tells whoever drives the session, or waits for that, to give way: it is deleted.
+    pub(super) fn dismiss(&self, id: &str) {
+        let owners = self.owners.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(owner) = owners.get(id) {
+            owner.taken_over.cancel();
+        }
+    }
+
     /// Waits until whoever drives the session has given way.
     ///
     /// # Errors

@@ -8,7 +8,7 @@ use super::requests::{Named, SentRequest, base_weights, check_request};
 use super::search::{Extent, MAX_INLINE_BYTES, Means, Searched, follow, is_quick, max_quick_observations};
 use super::{Caller, Etude, Kind, ServiceError};
 use crate::memory::Held;
-use crate::store::Page;
+use crate::store::{Deletion, Needed, Page};
 use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Object, Path};
 use etude_core::interrupt::{Cancelled, Interrupt};
@@ -97,8 +97,23 @@ impl Etude {
     ///
     /// If there is none, or no memory for it.
     pub async fn policy(&self, id: &str) -> Result<(String, Option<Held>), ServiceError> {
-        let unknown = || ServiceError::Unknown { kind: Kind::Policy, name: id.to_owned(), pointer: None };
-        self.store.policy_within(id, &self.memory).await?.ok_or_else(unknown)
+        self.store.policy_within(id, &self.memory).await?.ok_or_else(|| unknown(id))
+    }
+
+    /// Deletes the policy with this id. What links it and others forgets it; if it waits to be refined, it does not any more.
+    ///
+    /// # Errors
+    ///
+    /// If there is none, or it is a trial's.
+    pub async fn delete_policy(&self, id: &str) -> Result<(), ServiceError> {
+        match self.store.delete_policy(id).await? {
+            Ok(Deletion::Deleted) => Ok(()),
+            Ok(Deletion::Unknown) => Err(unknown(id)),
+            Err(Needed) => {
+                let because = "it is the policy of a trial";
+                Err(ServiceError::InUse { kind: Kind::Policy, id: id.to_owned(), because })
+            }
+        }
     }
 
     /// At most `limit` policies without their steps (JSON), in the order in which they were stored, from the first after
@@ -111,6 +126,10 @@ impl Etude {
         let page = self.store.policies(after, limit).await?;
         Ok(page.map(|policy| policy.summary))
     }
+}
+
+fn unknown(id: &str) -> ServiceError {
+    ServiceError::Unknown { kind: Kind::Policy, name: id.to_owned(), pointer: None }
 }
 
 /// Reads the rest of a request, whose demonstration was read before if it is small, and searches for its policy. Nothing if something is

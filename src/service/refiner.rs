@@ -112,12 +112,16 @@ impl Etude {
         if !matches!(may_begin, Ok(Attempt::Begun)) {
             *begun = None;
         }
-        if may_begin? == Attempt::GivenUp {
-            tracing::error!(
-                policy_id,
-                "not refined: the process has ended each of the {MAX_ATTEMPTS} times that it was tried"
-            );
-            return Ok(Some(Outcome::Ended));
+        match may_begin? {
+            Attempt::Begun => {}
+            Attempt::Gone => return Ok(Some(Outcome::Ended)),
+            Attempt::GivenUp => {
+                tracing::error!(
+                    policy_id,
+                    "not refined: the process has ended each of the {MAX_ATTEMPTS} times that it was tried"
+                );
+                return Ok(Some(Outcome::Ended));
+            }
         }
         let refined = self.refine(refinement).await;
         *begun = None;

@@ -12,7 +12,9 @@ use super::requests::check_request;
 use super::search::{Searched, write};
 use super::{Caller, Etude, Kind, Name, PoolError, ServiceError, as_stored};
 use crate::memory::Held;
-use crate::store::{FailureAnswer, NewReward, NewTrial, Opened, Page, RewardAnswer, TrialRecord, TrialStatus};
+use crate::store::{
+    Deletion, FailureAnswer, Needed, NewReward, NewTrial, Opened, Page, RewardAnswer, TrialRecord, TrialStatus,
+};
 use etude_core::attribute::{Schema, Weights};
 use etude_core::document::{Faults, Object, Path, Place, Range};
 use etude_core::learning::Learner;
@@ -185,6 +187,22 @@ impl Etude {
         let mut held = held.flatten();
         self.memory.hold(&mut held, 2 * policy.as_ref().map_or(0, |policy| policy.get().len()))?;
         Ok(TrialAnswer { policy, held, ..TrialAnswer::of(trial, now)? })
+    }
+
+    /// Deletes the trial with this id. Its policy stays.
+    ///
+    /// # Errors
+    ///
+    /// If there is none, or it has a reward.
+    pub async fn delete_trial(&self, id: &str) -> Result<(), ServiceError> {
+        match self.store.delete_trial(id).await? {
+            Ok(Deletion::Deleted) => Ok(()),
+            Ok(Deletion::Unknown) => Err(unknown_trial(id)),
+            Err(Needed) => {
+                let because = "its learner learns from its reward";
+                Err(ServiceError::InUse { kind: Kind::Trial, id: id.to_owned(), because })
+            }
+        }
     }
 
     /// At most `limit` trials of a learner in the order of their numbers, from the first after the number `after`; only those

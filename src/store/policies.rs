@@ -1,7 +1,7 @@
 //! The table of policies.
 //!
-//! The text and the steps of a policy are never changed, and have a checksum. The id of the policy that refines it is a column of its own,
-//! and is put into the text when that is read.
+//! The text and the steps of a policy have a checksum, and are never changed, but that the text forgets a policy that it refines and that is
+//! deleted. The id of the policy that refines it is a column of its own, and is put into the text when that is read.
 
 use std::sync::OnceLock;
 
@@ -123,7 +123,7 @@ impl Store {
             }
             memory.hold(&mut held, COPIES * n_bytes)?;
             drop(row);
-            // Nothing but the link changes between the two reads.
+            // It has no more bytes, whichever links have changed between the two reads.
             let Some(row) = self.policy_row(id, n_bytes).await? else { return Ok(None) };
             self.read_policy(&row, held, memory).await.map(Some)
         };
@@ -261,6 +261,31 @@ fn linked(mut text: String, row: &SqliteRow) -> Result<String, StoreError> {
     text.truncate(before.len());
     text.extend([r#""refined_by":"#, &refined_by, "}"]);
     Ok(text)
+}
+
+/// Takes the link to the policy `refined`, which is deleted, out of the text of the one with this id, unless that is damaged.
+pub(super) async fn forget_refined(
+    connection: &mut SqliteConnection,
+    id: &str,
+    refined: &str,
+) -> Result<(), StoreError> {
+    let end = |refines: Option<&str>| {
+        let refines = serde_json::to_string(&refines).map_err(corrupt("summary"))?;
+        Ok::<_, StoreError>(format!(r#""refines":{refines},"refined_by":null}}"#))
+    };
+    let query = sqlx::query_as::<_, (String, i64)>("SELECT summary, checksum FROM policies WHERE id = $1").bind(id);
+    let Some((mut summary, checksum)) = query.fetch_optional(&mut *connection).await? else { return Ok(()) };
+    let of_steps = checksum & i64::from(u32::MAX);
+    if checksum != half_checksum(&summary) | of_steps {
+        return Ok(());
+    }
+    let Some(before) = summary.strip_suffix(&end(Some(refined))?) else { return Ok(()) };
+    summary.truncate(before.len());
+    summary.push_str(&end(None)?);
+    let checksum = half_checksum(&summary) | of_steps;
+    let unlinked = sqlx::query("UPDATE policies SET summary = $2, checksum = $3 WHERE id = $1");
+    unlinked.bind(id).bind(summary).bind(checksum).execute(connection).await?;
+    Ok(())
 }
 
 pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -> Result<(), StoreError> {

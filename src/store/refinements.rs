@@ -23,8 +23,10 @@ pub struct RefinementEnd {
 pub enum Attempt {
     /// It may, and this attempt is counted.
     Begun,
-    /// There were [`MAX_ATTEMPTS`] already, or it does not wait any more. Nothing of it is left.
+    /// There were [`MAX_ATTEMPTS`] already. Nothing of it is left.
     GivenUp,
+    /// It does not wait any more: its policy was deleted, or the session that has what was observed.
+    Gone,
 }
 
 /// Counts one more attempt at the refinement of this policy.
@@ -133,8 +135,8 @@ impl Verb for BeginRefinement {
             return Ok(Attempt::Begun);
         }
         let deleted = sqlx::query("DELETE FROM refinements WHERE policy_id = $1").bind(policy_id);
-        deleted.execute(&mut *writing.connection).await?;
-        Ok(Attempt::GivenUp)
+        let deleted = deleted.execute(&mut *writing.connection).await?;
+        Ok(if deleted.rows_affected() > 0 { Attempt::GivenUp } else { Attempt::Gone })
     }
 }
 

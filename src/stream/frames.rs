@@ -133,7 +133,7 @@ pub enum ServerFrame<'f> {
     Step(StepFrame<'f>),
     /// The policy of the whole demonstration is stored.
     Done {
-        /// Its id.
+        /// Its id; `None` once it was deleted.
         policy_id: Option<&'f str>,
         /// What was proven of it.
         status: Status,
@@ -283,7 +283,7 @@ impl<'f> From<&'f CommittedStep> for StepFrame<'f> {
 impl<'f> From<&'f SessionPolicy> for ServerFrame<'f> {
     fn from(policy: &'f SessionPolicy) -> Self {
         let SessionPolicy { id, status, cost, actions } = policy;
-        Self::Done { policy_id: Some(id), status: *status, cost: *cost, actions: Some(actions) }
+        Self::Done { policy_id: id.as_deref(), status: *status, cost: *cost, actions: Some(actions) }
     }
 }
 

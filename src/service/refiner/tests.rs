@@ -141,3 +141,26 @@ async fn the_refined_policy_is_the_optimum_however_the_first_one_was_to_be_searc
         optimum(&mapper, problem, 1e9, Stamp::default(), (&etude.memory, &etude.clock), &mut || Signal::Finish);
     assert!(refined.unwrap().unwrap().is_none());
 }
+
+#[tokio::test]
+async fn a_policy_that_is_deleted_while_it_waits_or_is_refined_leaves_nothing_to_refine() {
+    let directory = tempfile::tempdir().unwrap();
+    let etude = etude(directory.path()).await;
+    let waiting = made(&etude, &request()).await;
+    etude.delete_policy(&waiting).await.unwrap();
+    assert_eq!(etude.refine_next(&mut 0, &mut None).await.unwrap(), None);
+    // It is gone between the look at it and its attempt,
+    let early = made(&etude, &request()).await;
+    let (_, refinement) = etude.store.next_refinement(0).await.unwrap().unwrap();
+    etude.delete_policy(&early).await.unwrap();
+    assert_eq!(etude.store.begin_refinement(&early).await.unwrap(), Attempt::Gone);
+    // and while it is searched for.
+    let refined = etude.refine(refinement).await.unwrap().map(|refined| refined.at(NOW));
+    assert!(refined.is_some());
+    etude.store.end_refinement(RefinementEnd { policy_id: early, refined }).await.unwrap();
+    assert_eq!(etude.policies(0, 10).await.unwrap().items.len(), 0);
+    // Others are refined as before.
+    let next = made(&etude, &request()).await;
+    assert_eq!(etude.refine_next(&mut 0, &mut None).await.unwrap(), Some(Outcome::Ended));
+    assert!(read(&etude, &next).await["refined_by"].is_string());
+}

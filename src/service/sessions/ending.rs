@@ -27,8 +27,8 @@ pub struct Ended {
 /// What a session tells of its policy.
 #[derive(Clone, Debug)]
 pub struct SessionPolicy {
-    /// Under which it is stored.
-    pub id: String,
+    /// Under which it is stored; `None` once it was deleted.
+    pub id: Option<String>,
     /// What was proven of it.
     pub status: Status,
     /// What it costs.
@@ -39,7 +39,7 @@ pub struct SessionPolicy {
 
 impl SessionPolicy {
     /// The policy of `mapping`, which must be of `model`.
-    pub(super) fn of(id: String, model: &Model, mapping: &Mapping) -> Self {
+    pub(super) fn of(id: Option<String>, model: &Model, mapping: &Mapping) -> Self {
         let actions = mapping.moves.iter().filter_map(|step| step.action);
         let actions = actions.map(|action| model.action_name(action)).collect();
         Self { id, status: mapping.status, cost: mapping.cost, actions }
@@ -91,7 +91,7 @@ pub(super) fn conclude(
     let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
     let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), ..stamp };
     report(&stamp, &mapping);
-    let policy = SessionPolicy::of(stamp.id.clone().unwrap_or_default(), mapper.model(), &mapping);
+    let policy = SessionPolicy::of(stamp.id.clone(), mapper.model(), &mapping);
     let written = WrittenPolicy::new(&stamp, &problem, &mapping).map_err(ServiceError::from)?;
     let refinement = (mapping.status == Status::Local)
         .then(|| RefinedRequest::of(&stamp.model, &problem, mapping.cost).waiting(&stamp, Some(id)));

@@ -31,11 +31,11 @@ pub enum SessionError {
     /// Something is wrong with the frame.
     #[error("{0}")]
     Faults(#[from] Faults),
-    /// The session has expired, or was ended or taken over by another connection.
+    /// The session has expired, was deleted, or was ended or taken over by another connection.
     #[error("the session is not open any more")]
     NotOpen,
-    /// Another connection has taken the session over.
-    #[error("the session was resumed on another connection")]
+    /// Another connection has taken the session over, or it was deleted.
+    #[error("the session was resumed on another connection, or deleted")]
     TakenOver,
     /// Whatever else can go wrong.
     #[error(transparent)]

@@ -27,7 +27,9 @@ use super::owners::Ownership;
 use super::requests::Named;
 use super::{Caller, Etude, Kind, PoolError, ServiceError};
 use crate::memory::{Held, Memory};
-use crate::store::{MAX_EXPIRED_AT_ONCE, NewSession, Opened, Owner, Page, SessionRecord, SessionStatus, Taken};
+use crate::store::{
+    Deletion, MAX_EXPIRED_AT_ONCE, NewSession, Opened, Owner, Page, SessionRecord, SessionStatus, Taken,
+};
 use etude_core::attribute::{ByAttribute, Schema, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, time_until_finish};
@@ -202,12 +204,13 @@ impl Etude {
             };
             steps = session.advance(self, observations).await?;
         }
-        let policy = match (row.policy_id, session.online.take()) {
-            (Some(policy_id), Some(online)) => {
+        let policy = match (row.status, session.online.take()) {
+            (SessionStatus::Done, Some(online)) => {
                 // Whoever ended it may have been gone before there was something to refine.
                 self.refiner.wake();
                 let (mapper, memory) = (Arc::clone(&session.mapper), self.memory.clone());
-                let end = move |_: &mut dyn Interrupt| Ok(end_again(online, steps, policy_id, mapper.model(), &memory));
+                let end =
+                    move |_: &mut dyn Interrupt| Ok(end_again(online, steps, row.policy_id, mapper.model(), &memory));
                 let (ended, policy) = self.pool.run_patiently(caller.client, end).await??;
                 steps = ended;
                 session.n_steps = steps.len();
@@ -248,6 +251,22 @@ impl Etude {
     /// If there is none.
     pub async fn session(&self, id: &str) -> Result<SessionRecord, ServiceError> {
         self.store.session(id).await?.ok_or_else(|| unknown(id))
+    }
+
+    /// Deletes the session with this id with its observations, and dismisses whoever drives it. Its policy and its trial stay; a policy that
+    /// waits to be refined does not any more.
+    ///
+    /// # Errors
+    ///
+    /// If there is none.
+    pub async fn delete_session(&self, id: &str) -> Result<(), ServiceError> {
+        match self.store.delete_session(id).await? {
+            Deletion::Deleted => {
+                self.owners.dismiss(id);
+                Ok(())
+            }
+            Deletion::Unknown => Err(unknown(id)),
+        }
     }
 
     /// At most `limit` sessions in the order in which they were opened, from the first after the sequence number `after`.
@@ -333,7 +352,7 @@ const MAX_INLINE_VALUES: usize = 8192;
 fn end_again(
     online: OnlineMapping,
     mut steps: CommittedSteps,
-    policy_id: String,
+    policy_id: Option<String>,
     model: &Model,
     memory: &Memory,
 ) -> Result<(CommittedSteps, SessionPolicy), SessionError> {

@@ -203,7 +203,7 @@ pub enum FailureAnswer {
 }
 
 impl Store {
-    /// Numbers for the next trials of a learner, which no stored trial has.
+    /// Numbers for the next trials of a learner, which no trial has that is stored or was deleted.
     ///
     /// # Errors
     ///
@@ -212,9 +212,13 @@ impl Store {
         if let Some(known) = self.trial_numbers.known(learner) {
             return Ok(known);
         }
-        let query = sqlx::query("SELECT COALESCE(MAX(number), 0) AS number FROM trials WHERE learner = $1");
-        let row = query.bind(learner).fetch_one(&mut *self.reader().await?).await?;
-        Ok(self.trial_numbers.after(learner, count(&row, "trials", "number")?))
+        let query = sqlx::query(
+            "SELECT MAX(deleted_number, (SELECT COALESCE(MAX(number), 0) FROM trials WHERE learner = $1)) AS number
+             FROM learners WHERE sequence = $1",
+        );
+        let row = query.bind(learner).fetch_optional(&mut *self.reader().await?).await?;
+        let last = row.map_or(Ok(0), |row| count(&row, "trials", "number"))?;
+        Ok(self.trial_numbers.after(learner, last))
     }
 
     /// Stores a trial and its policy.

@@ -13,26 +13,26 @@ use crate::harness::service::Service;
 use crate::harness::waiting::within;
 
 /// A websocket client.
-pub(super) struct Client {
-    pub(super) socket: WebSocketStream<TcpStream>,
+pub(crate) struct Client {
+    pub(crate) socket: WebSocketStream<TcpStream>,
 }
 
 impl Client {
     /// Connects, and takes the server's hello.
-    pub(super) async fn connect(service: &Service) -> Self {
+    pub(crate) async fn connect(service: &Service) -> Self {
         Self::connect_to(&service.address.to_string()).await
     }
 
-    pub(super) async fn connect_to(address: &str) -> Self {
+    pub(crate) async fn connect_to(address: &str) -> Self {
         Self::over(TcpStream::connect(address).await.unwrap(), address).await
     }
 
     /// A client that soon has no room for what it does not read.
-    pub(super) async fn connect_narrowly(service: &Service) -> Self {
+    pub(crate) async fn connect_narrowly(service: &Service) -> Self {
         Self::over(narrow(service).await, &service.address.to_string()).await
     }
 
-    pub(super) async fn over(stream: TcpStream, address: &str) -> Self {
+    pub(crate) async fn over(stream: TcpStream, address: &str) -> Self {
         let mut request = format!("ws://{address}/v1/stream").into_client_request().unwrap();
         request.headers_mut().insert("sec-websocket-protocol", "etude.v1+json".parse().unwrap());
         // As many clients do, it closes where a message is longer than announced.
@@ -50,21 +50,21 @@ impl Client {
         client
     }
 
-    pub(super) async fn send(&mut self, frame: Value) {
+    pub(crate) async fn send(&mut self, frame: Value) {
         self.socket.send(Message::text(frame.to_string())).await.unwrap();
     }
 
-    pub(super) async fn next(&mut self) -> Message {
+    pub(crate) async fn next(&mut self) -> Message {
         within("a message", self.socket.next()).await.unwrap().unwrap()
     }
 
-    pub(super) async fn receive(&mut self) -> Value {
+    pub(crate) async fn receive(&mut self) -> Value {
         let message = self.next().await;
         serde_json::from_str(message.to_text().unwrap_or_else(|_| panic!("{message:?}"))).unwrap()
     }
 
     /// Receives frames up to one of type `kind`, which comes last.
-    pub(super) async fn receive_until(&mut self, kind: &str) -> Vec<Value> {
+    pub(crate) async fn receive_until(&mut self, kind: &str) -> Vec<Value> {
         let mut frames = Vec::new();
         loop {
             let frame = self.receive().await;
@@ -77,8 +77,18 @@ impl Client {
         }
     }
 
+    /// Receives frames up to an error, which it gives.
+    pub(crate) async fn receive_until_error(&mut self) -> Value {
+        loop {
+            let frame = self.receive().await;
+            if frame["type"] == "error" {
+                return frame;
+            }
+        }
+    }
+
     /// Receives the close code.
-    pub(super) async fn closed(&mut self) -> u16 {
+    pub(crate) async fn closed(&mut self) -> u16 {
         loop {
             match self.next().await {
                 Message::Close(frame) => return frame.unwrap().code.into(),
@@ -89,7 +99,7 @@ impl Client {
     }
 
     /// Opens a session and gives its id.
-    pub(super) async fn open(&mut self, open: Value) -> String {
+    pub(crate) async fn open(&mut self, open: Value) -> String {
         self.send(open).await;
         let opened = self.receive().await;
         assert_eq!((&opened["type"], &opened["received"]), (&json!("opened"), &json!(0)), "{opened}");

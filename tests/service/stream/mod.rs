@@ -4,7 +4,7 @@
 //! in files of its own.
 
 mod application;
-mod client;
+pub(crate) mod client;
 mod long_messages;
 mod slow_readers;
 
