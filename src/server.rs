@@ -141,6 +141,7 @@ impl Server {
         let Self { listener, address, etude, router, tasks, streams, stopping, abort, connections, drain_timeout } =
             self;
         tracing::info!(%address, "listening on http://{address}");
+        tracing::info!("to read about it and try it: http://{address}/docs/");
         let announce = async {
             stop.await;
             tracing::info!("stopping");

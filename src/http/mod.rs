@@ -35,6 +35,7 @@ use std::sync::Arc;
 
 use axum::Router;
 use axum::middleware;
+use axum::routing::get;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -202,6 +203,7 @@ pub fn router(context: Context) -> Router {
     let context = Arc::new(context);
     let mut router = router
         .merge(operation::docs())
+        .route("/", get(operation::front))
         .fallback(|| async { Problem::new(ProblemKind::NotFound, "there is nothing at this path") })
         .method_not_allowed_fallback(|| async {
             Problem::new(

@@ -5,7 +5,7 @@ use std::sync::LazyLock;
 use axum::Router;
 use axum::extract::State;
 use axum::http::header::CONTENT_TYPE;
-use axum::response::IntoResponse;
+use axum::response::{IntoResponse, Redirect};
 use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use super::SharedContext;
@@ -67,6 +67,11 @@ pub(super) async fn metrics(State(context): State<SharedContext>) -> impl IntoRe
 pub(super) async fn openapi_yaml() -> impl IntoResponse {
     static YAML: LazyLock<String> = LazyLock::new(super::openapi);
     ([(CONTENT_TYPE, "application/yaml")], YAML.as_str())
+}
+
+/// Whoever looks at the service with a browser is led to the page that describes it.
+pub(super) async fn front() -> Redirect {
+    Redirect::temporary("/docs/")
 }
 
 /// The description as a page to read and to try things in, from files that are part of the program.
