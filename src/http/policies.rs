@@ -19,11 +19,12 @@ use super::{SharedContext, answer};
 use crate::service::{Caller, ServiceError};
 use etude_core::mapping::{Policy, PolicySummary};
 
-/// Follow a demonstration: the policy whose effects come closest to it, stored.
+/// Follow a demonstration: the policy whose effects come closest to it, stored unless the request says otherwise.
 #[utoipa::path(
     post, path = "/v1/policies", tag = "policies",
     request_body = PolicyRequest,
     responses(
+        (status = 200, description = "The policy, of which nothing is kept as `store` is false: it has no `id`, and is not refined", body = Policy),
         (status = 201, description = "The policy", body = Policy,
             headers(("location" = String, description = "Where it can be read again"))),
         BodyProblems,
@@ -39,8 +40,10 @@ pub(super) async fn make_policy(
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
     let made = context.etude.make_policy(body, caller).await?;
-    let mut response = answer::counted(json_text(StatusCode::CREATED, made.policy), made.held);
-    if let Ok(location) = HeaderValue::try_from(format!("/v1/policies/{}", made.id)) {
+    let status = if made.id.is_some() { StatusCode::CREATED } else { StatusCode::OK };
+    let mut response = answer::counted(json_text(status, made.policy), made.held);
+    let location = made.id.map(|id| HeaderValue::try_from(format!("/v1/policies/{id}")));
+    if let Some(Ok(location)) = location {
         response.headers_mut().insert(LOCATION, location);
     }
     Ok(response)
@@ -51,7 +54,7 @@ pub(super) async fn make_policy(
 /// Options beside `items` hold for every item that has none of its own; weights are merged attribute by attribute. What is wrong
 /// with an item is told in its place, with pointers into the batch, and does not keep the others from their policies; what is
 /// wrong with the batch itself fails the whole. The policies are those that single requests give, and they are stored together:
-/// all of them are durable when the batch is answered, and none is if it is not.
+/// all of them are durable when the batch is answered, and none is if it is not. With `store` false, none is kept, and none has an `id`.
 #[utoipa::path(
     post, path = "/v1/policies:batch", tag = "policies",
     request_body = BatchRequest,

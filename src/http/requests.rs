@@ -21,6 +21,9 @@ struct PolicyMembers {
     /// Name of a learner whose mean weights are used, for attributes that `weights` does not name.
     #[serde(skip_serializing_if = "Option::is_none")]
     learner: Option<String>,
+    /// Whether the policy is stored; `true` if left out. One that is not has no `id`, and is not refined.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    store: Option<bool>,
 }
 
 /// A request for policies, as it is written in JSON. Its options are those of items without their own.
@@ -40,6 +43,9 @@ struct BatchMembers {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(maximum = 86_400_000)]
     deadline_ms: Option<u64>,
+    /// Whether the policies are stored; `true` if left out. Those that are not have no `id`, and are not refined.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    store: Option<bool>,
 }
 
 /// An item of a batch: a demonstration, with options of its own where it needs them; attributes that its weights do not name keep the

@@ -53,7 +53,7 @@ pub struct MadePolicies {
 }
 
 impl Etude {
-    /// Makes a policy for every item of the batch in `body` (JSON), and stores them all at once. Gives for each item, in order, its policy
+    /// Makes a policy for every item of the batch in `body` (JSON), and stores them all at once, unless the batch says otherwise. Gives for each item, in order, its policy
     /// or what is wrong with it.
     ///
     /// # Errors
@@ -72,7 +72,7 @@ impl Etude {
         let place = self.pool.admit(caller.client)?;
         let Some(sent) = self.read_sent(RequestKind::Batch, body, &place).await? else { return Ok(None) };
         let (names, faults) = self.read_names(&sent.rest, RequestKind::Batch, None);
-        let names = names.filter(|names| faults.is_empty() && names.over_limits.is_empty());
+        let names = names.filter(|names| faults.is_empty() && names.own_faults.is_empty());
         let Some(names) = names else { return Ok(None) };
         let deadline = self.deadline(&names, caller.arrived);
         let place = place.waiting_until(deadline);
@@ -101,23 +101,23 @@ impl Etude {
         let mut items = Vec::with_capacity(made.len());
         for (_, searched) in made {
             items.push(searched.map(|Searched { policy, row, refinement, .. }| {
-                let row = row.at(caller.now);
-                let id = row.id.clone();
-                rows.push(row);
+                let row = row.map(|row| row.at(caller.now));
+                let id = row.as_ref().map(|row| row.id.clone());
+                rows.extend(row);
                 refinements.extend(refinement);
                 MadePolicy { id, policy, held: None }
             }));
         }
         let are_refined = !refinements.is_empty();
-        let is_any_stored = !rows.is_empty();
-        if is_any_stored {
+        if !rows.is_empty() {
             self.store.add_policies(rows, refinements).await?;
         }
         if are_refined {
             self.refiner.wake();
         }
         // Once they are stored, they are answered, whatever else is told.
-        let held = batch.answer().held.take().or_else(|| self.memory.try_take(0).ok().filter(|_| is_any_stored));
+        let is_any_made = items.iter().any(Result::is_ok);
+        let held = batch.answer().held.take().or_else(|| self.memory.try_take(0).ok().filter(|_| is_any_made));
         Ok(Some(MadePolicies { items, held }))
     }
 }
@@ -200,6 +200,8 @@ struct Batch {
     mapper: Arc<Mapper>,
     /// What the policies have in common.
     stamp: Stamp,
+    /// Whether they are stored.
+    is_stored: bool,
     /// What an item's own weights are written over.
     weights: Weights,
     /// What an item has unless it has its own.
@@ -267,6 +269,7 @@ impl Batch {
             _sent_held: held,
             mapper: named.mapper,
             stamp,
+            is_stored: names.is_stored,
             weights,
             shared,
             memory,
@@ -330,7 +333,8 @@ impl Batch {
             Ok(request) => request,
             Err(faults) => return Ok(Err(faults.into())),
         };
-        let stamp = Stamp { id: Some(self.ids.next().to_string()), ..self.stamp.clone() };
+        let id = self.is_stored.then(|| self.ids.next().to_string());
+        let stamp = Stamp { id, ..self.stamp.clone() };
         let observed = match observed {
             Some(observed) => observed,
             // To be refined, it is stored as text.

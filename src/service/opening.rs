@@ -31,7 +31,8 @@ pub(super) fn read_names(object: &Object<'_, '_>, faults: &mut Faults) -> Option
         faults.note(&place, "an exploring session draws its weights");
     }
     let learner = learner.flatten().map(str::to_owned);
-    let names = Names { model: model?.to_owned(), learner, deadline: None, over_limits: Faults::default() };
+    let names =
+        Names { model: model?.to_owned(), learner, deadline: None, is_stored: true, own_faults: Faults::default() };
     Some((names, explores))
 }
 

@@ -15,11 +15,11 @@ use etude_core::interrupt::{Cancelled, Interrupt};
 use etude_core::mapping::{Demonstration, RequestKind, Stamp};
 use etude_core::model::Model;
 
-/// A policy that was just made and stored.
+/// A policy that was just made.
 #[derive(Debug)]
 pub struct MadePolicy {
-    /// Its id.
-    pub id: String,
+    /// Under which it is stored; `None` if it is not to be.
+    pub id: Option<String>,
     /// The policy: JSON.
     pub policy: String,
     /// For the policy, and as much again while it is written into an answer, if it is much.
@@ -27,7 +27,7 @@ pub struct MadePolicy {
 }
 
 impl Etude {
-    /// Makes a policy for the request in `body` (JSON), and stores it.
+    /// Makes a policy for the request in `body` (JSON), and stores it unless the request says otherwise.
     ///
     /// # Errors
     ///
@@ -50,12 +50,13 @@ impl Etude {
         // The next request can be read to where this one stands, while the disk writes.
         drop(body);
         let Searched { policy, row, refinement, held } = searched;
+        let Some(row) = row else { return Ok(MadePolicy { id: None, policy, held }) };
         let is_refined = refinement.is_some();
         self.store.add_policies(vec![row.at(caller.now)], refinement.into_iter().collect()).await?;
         if is_refined {
             self.refiner.wake();
         }
-        Ok(MadePolicy { id, policy, held })
+        Ok(MadePolicy { id: Some(id), policy, held })
     }
 
     /// Searches for the policy that a request asks for, and stamps it. `weights` are those from which the request starts, and what is to
@@ -72,7 +73,7 @@ impl Etude {
         let place = self.pool.admit_when_needed(caller.client);
         let Some(sent) = self.read_sent(kind, body, &place).await? else { return Ok(None) };
         let (names, faults) = self.read_names(&sent.rest, kind, None);
-        let names = names.filter(|names| faults.is_empty() && names.over_limits.is_empty());
+        let names = names.filter(|names| faults.is_empty() && names.own_faults.is_empty());
         let Some(names) = names else { return Ok(None) };
         let deadline = self.deadline(&names, caller.arrived);
         let place = place.waiting_until(deadline);
@@ -245,7 +246,7 @@ mod tests {
         let memory = Memory::with_room(1 << 30);
         let sent = SentRequest::read(RequestKind::Policy, &document.to_string().into(), &memory).unwrap().unwrap();
         let named = Named { learner: None, model_hash: "hash".to_owned(), mapper };
-        let stamp = Stamp { model: "m".to_owned(), ..Stamp::default() };
+        let stamp = Stamp { id: Some("p".to_owned()), model: "m".to_owned(), ..Stamp::default() };
         let weights = |model: &Model, learner: Option<&LearnerState>, faults: &mut Faults| {
             Some((base_weights(model, learner, faults)?, ()))
         };

@@ -119,8 +119,10 @@ pub(super) struct Names {
     pub(super) model: String,
     pub(super) learner: Option<String>,
     pub(super) deadline: Option<Duration>,
-    /// What is wrong with the request that only the service's settings tell. It is told once the model is found.
-    pub(super) over_limits: Faults,
+    /// Whether policies are stored.
+    pub(super) is_stored: bool,
+    /// What is wrong with the request that is the service's alone to know. It is told once the model is found.
+    pub(super) own_faults: Faults,
 }
 
 /// What a request names.
@@ -131,8 +133,9 @@ pub(super) struct Named {
 }
 
 impl Names {
-    /// `stamp`, with what the policies of this request have in common.
+    /// `stamp`, with what the policies of this request have in common: if they are not stored, that they have no id.
     pub(super) fn stamp(&self, stamp: Stamp, named: &Named) -> Stamp {
+        let stamp = Stamp { id: stamp.id.filter(|_| self.is_stored), ..stamp };
         let stamp = Stamp { model: self.model.clone(), model_hash: named.model_hash.clone(), ..stamp };
         match &named.learner {
             None => stamp,
@@ -177,12 +180,16 @@ impl Etude {
         }
         let options = Options::read_general(&object, &Options::default(), &mut faults);
         let deadline = options.and_then(|options| options.deadline());
+        let mut own_faults = self.check_deadline(deadline);
+        let store = object.optional("store").filter(|_| kind.fields().contains(&"store"));
+        let is_stored = store.and_then(|place| place.boolean(&mut own_faults)).unwrap_or(true);
         let names = model.zip(learner.map_or(Some(None), |learner| learner.map(Some)));
         let names = names.map(|(model, learner)| Names {
             model: model.to_owned(),
             learner: learner.map(str::to_owned),
             deadline,
-            over_limits: self.check_deadline(deadline),
+            is_stored,
+            own_faults,
         });
         (names, faults)
     }
@@ -270,7 +277,7 @@ impl Etude {
                 Ok(held) => held,
                 Err(no_room) => return Ok(Err(ServiceError::from(no_room))),
             };
-            let mut faults = names.over_limits;
+            let mut faults = names.own_faults;
             if let Some(object) = Place::root(&document).object(kind.fields(), &mut faults) {
                 check(&object, model, learner.as_ref(), &mut faults);
             }

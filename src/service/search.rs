@@ -77,8 +77,9 @@ pub(super) struct Means<'e> {
 pub(super) struct Searched {
     /// The policy: JSON.
     pub(super) policy: String,
-    pub(super) row: PolicyText,
-    /// What is to be done about the policy, if it is local.
+    /// `None` if it is not to be stored.
+    pub(super) row: Option<PolicyText>,
+    /// What is to be done about the policy, if it is local and to be stored.
     pub(super) refinement: Option<NewRefinement>,
     /// For all of this, if it is much.
     pub(super) held: Option<Held>,
@@ -105,7 +106,7 @@ impl PolicyText {
 }
 
 /// Follows what `request` asks for with what that needs of the memory, and writes the policy, unless that is too large. `observed` is the text
-/// of the demonstration, which is at `path` in what the client sent.
+/// of the demonstration, which is at `path` in what the client sent. A policy without an id is not to be stored, nor refined.
 pub(super) fn follow(
     mapper: &Arc<Mapper>,
     mut request: Request<'_>,
@@ -133,7 +134,7 @@ pub(super) fn follow(
         return Ok(Err(faults.into()));
     }
     let n_bytes = N_COPIES * Policy::steps_bytes(mapper.model(), &mapping);
-    let is_refined = mapping.status == Status::Local;
+    let is_refined = mapping.status == Status::Local && stamp.id.is_some();
     let n_refined_bytes = if is_refined { RefinedRequest::most_bytes(mapper.model(), observed) } else { 0 };
     let mut held = None;
     if let Err(no_room) = memory.hold(&mut held, n_bytes + n_refined_bytes) {
@@ -149,7 +150,7 @@ pub(super) fn follow(
     let written = refinement.transpose().and_then(|refinement| {
         let written = WrittenPolicy::new(&stamp, &request.problem, &mapping)?;
         let policy = written.answer(None)?;
-        let row = PolicyText::of(stamp, written)?;
+        let row = stamp.id.is_some().then(|| PolicyText::of(stamp, written)).transpose()?;
         // What was estimated may have been too little.
         memory.hold(&mut held, N_COPIES * policy.len() + n_refined_bytes)?;
         Ok(Searched { policy, row, refinement, held })

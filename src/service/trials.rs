@@ -112,7 +112,7 @@ impl Etude {
             weights: weights.clone(),
             weights_version,
             policy_id: policy_id.clone(),
-            policy: Some(row.at(now)),
+            policy: row.map(|row| row.at(now)),
             refinement,
             created_at: now,
             lease_expires_at,

@@ -323,3 +323,16 @@ async fn a_deadline_holds_for_the_whole_batch() {
         assert_eq!(policy["steps"].as_array().unwrap().last().unwrap()["observation"], 19_999);
     }
 }
+
+#[tokio::test]
+async fn the_policies_of_a_batch_that_is_not_to_be_stored_have_no_ids() {
+    let service = figure_4(&[]).await;
+    let batch = json!({
+        "model": "figure-4", "store": false, "lookahead": 1,
+        "items": [{"demonstration": demonstration(3)}, {"demonstration": []}, {"demonstration": demonstration(5)}],
+    });
+    let items = items(&service, &batch).await;
+    assert!(items[0]["steps"].is_array() && items[1]["problem"].is_object() && items[2]["steps"].is_array());
+    assert!(items.iter().all(|item| item.get("id").is_none()), "{items:?}");
+    assert_eq!(service.get("/v1/policies").await.1["items"], json!([]));
+}

@@ -528,7 +528,7 @@ async fn a_body_cut_off_in_the_middle_is_refused_and_changes_nothing() {
 #[tokio::test]
 async fn unknown_paths_and_methods_are_problems_too() {
     let service = Service::start(&[]).await;
-    for path in ["/", "/v1", "/v2/models", "/v1/models/a/b", "/v1/models/", "/docs/nope"] {
+    for path in ["/v1", "/v2/models", "/v1/models/a/b", "/v1/models/", "/docs/nope"] {
         let (status, problem) = service.get(path).await;
         assert_eq!((status, &problem["type"]), (404, &json!("/problems/not-found")), "{path}");
     }
@@ -555,6 +555,17 @@ async fn every_answer_carries_a_request_id_and_problems_repeat_it() {
     let odd = service.client.get(service.url("/livez")).header("x-request-id", "not{plain}").send().await.unwrap();
     let made = odd.headers()["x-request-id"].to_str().unwrap();
     assert_eq!((odd.status().as_u16(), made.len()), (200, 36), "{made}");
+}
+
+#[tokio::test]
+async fn a_browser_is_led_from_the_root_to_the_page_that_describes_the_service() {
+    let service = Service::start(&[]).await;
+    let response = service.client.get(service.url("/")).send().await.unwrap();
+    assert_eq!((response.status().as_u16(), response.url().path()), (200, "/docs/"));
+    assert!(response.text().await.unwrap().contains("<html"));
+    let stays = reqwest::Client::builder().no_proxy().redirect(reqwest::redirect::Policy::none()).build().unwrap();
+    let response = stays.get(service.url("/")).send().await.unwrap();
+    assert_eq!((response.status().as_u16(), &response.headers()[LOCATION]), (307, &"/docs/".parse().unwrap()));
 }
 
 #[tokio::test]
@@ -739,4 +750,37 @@ async fn a_small_request_for_an_enormous_policy_is_refused() {
     let (status, problem) = service.post("/v1/policies", &request).await;
     assert_eq!((status, pointers(&problem)), (422, vec!["/demonstration"]), "{problem}");
     assert!(problem["detail"].as_str().unwrap().contains("64 MB is the most"), "{problem}");
+}
+
+#[tokio::test]
+async fn a_policy_that_is_not_to_be_stored_is_answered_and_nothing_of_it_is_kept() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let mut request = example("figure-4/request.json");
+    // It would be refined.
+    request["lookahead"] = json!(1);
+    let mut unstored = request.clone();
+    unstored["store"] = json!(false);
+    let response = service.send(Method::POST, "/v1/policies", &unstored).await;
+    assert!(!response.headers().contains_key(LOCATION));
+    let (status, mut policy) = answer(response).await;
+    assert_eq!((status, &policy["status"]), (200, &json!("local")), "{policy}");
+    assert!(policy.get("id").is_none(), "{policy}");
+    assert_eq!(service.get("/v1/policies").await.1["items"], json!([]));
+
+    request["store"] = json!(true);
+    let (status, mut stored) = service.post("/v1/policies", &request).await;
+    assert_eq!(status, 201);
+    service.refined(stored["id"].as_str().unwrap()).await;
+    assert_eq!(service.get("/v1/policies").await.1["items"].as_array().unwrap().len(), 2, "only the other is refined");
+    stored.as_object_mut().unwrap().remove("id");
+    for policy in [&mut policy, &mut stored] {
+        policy["search"]["elapsed_us"] = Value::Null;
+    }
+    assert_eq!(policy, stored);
+
+    request["store"] = json!("no");
+    request["start"] = json!(-1);
+    let (status, problem) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, pointers(&problem)), (422, vec!["/store", "/start"]), "{problem}");
 }

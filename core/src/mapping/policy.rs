@@ -35,7 +35,8 @@ pub struct Stamp {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Policy {
-    /// Under which it is stored; `null` if it is not.
+    /// Under which it is stored; left out of answers if it is not, and `null` in files.
+    #[serde(default)]
     #[cfg_attr(feature = "openapi", schema(example = "01938d3e-5c7a-7cc0-9f6e-1f2a3b4c5d6e"))]
     pub id: Option<String>,
     /// Name of the model.
@@ -77,7 +78,9 @@ pub struct Policy {
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct PolicySummary<'p> {
-    /// Under which it is stored.
+    /// Under which it is stored; left out if it is not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(nullable = false))]
     pub id: Option<&'p str>,
     /// Name of the model.
     pub model: &'p str,

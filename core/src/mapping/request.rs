@@ -50,6 +50,7 @@ impl RequestKind {
                 "heuristic",
                 "max_expansions",
                 "deadline_ms",
+                "store",
             ],
             Self::Batch => &[
                 "model",
@@ -61,6 +62,7 @@ impl RequestKind {
                 "heuristic",
                 "max_expansions",
                 "deadline_ms",
+                "store",
             ],
             Self::Item => &["demonstration", "weights", "lookahead", "start", "heuristic", "max_expansions"],
             Self::Trial => &["model", "demonstration", "start", "lookahead"],

@@ -22,7 +22,7 @@ fn read(text: &str, mapper: &Arc<Mapper>, memory: &Memory) -> Result<Option<Batc
     let sent = SentRequest::read(RequestKind::Batch, &Bytes::from(text.to_owned()), memory)?;
     let Some(sent) = sent else { return Ok(None) };
     let model = sent.rest["model"].as_str().unwrap_or_default().to_owned();
-    let names = Names { model, learner: None, deadline: None, over_limits: Faults::default() };
+    let names = Names { model, learner: None, deadline: None, is_stored: true, own_faults: Faults::default() };
     let named = Named { learner: None, model_hash: "hash".to_owned(), mapper: Arc::clone(mapper) };
     Batch::read(&sent, &names, named, (memory.clone(), Clock::system(), Ids::random()))
 }

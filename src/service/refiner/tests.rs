@@ -27,7 +27,7 @@ fn request() -> Value {
 }
 
 async fn made(etude: &Etude, request: &Value) -> String {
-    etude.make_policy(request.to_string().into_bytes(), caller()).await.unwrap().id
+    etude.make_policy(request.to_string().into_bytes(), caller()).await.unwrap().id.unwrap()
 }
 
 async fn read(etude: &Etude, id: &str) -> Value {
