@@ -1,9 +1,10 @@
 //! How inputs are read: what is taken, and what is told of what is not.
 
+use reqwest::Method;
 use reqwest::header::CONTENT_TYPE;
 use serde_json::{Value, json};
 
-use crate::harness::service::Service;
+use crate::harness::service::{Service, answer};
 
 /// A line of three states, over which a body goes on or back.
 fn line() -> Value {
@@ -70,5 +71,156 @@ async fn a_model_of_several_outcomes_is_kept_and_refused_where_it_would_be_searc
     let frames = stream(&service, &[json!({"type": "open", "model": "slippery"})]).await;
     let told = &frames[1]["problem"]["errors"][0];
     assert!(told["pointer"] == "/model" && told["detail"].as_str().unwrap().contains("stochastic"), "{frames:?}");
+    service.stop().await;
+}
+
+/// Sends text as JSON.
+async fn send_text(service: &Service, method: Method, path: &str, text: impl Into<reqwest::Body>) -> (u16, Value) {
+    let request = service.client.request(method, service.url(path)).header(CONTENT_TYPE, "application/json");
+    answer(request.body(text).send().await.unwrap()).await
+}
+
+/// The pointers of what is told to be wrong.
+fn pointers(errors: &Value) -> Vec<&str> {
+    errors.as_array().unwrap().iter().map(|error| error["pointer"].as_str().unwrap()).collect()
+}
+
+#[tokio::test]
+async fn a_key_given_twice_is_a_fault_with_its_place_wherever_it_stands() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/line", &line()).await;
+    service.put("/v1/learners/l", &json!({"attributes": ["x"]})).await;
+    let (_, trial) =
+        service.post("/v1/learners/l/trials", &json!({"model": "line", "demonstration": [{"x": 1}]})).await;
+    let reward = format!("/v1/trials/{}/reward", trial["id"].as_str().unwrap());
+    let model = line().to_string().replacen("\"cost\":0.3", "\"cost\":0.3,\"cost\":0.4", 1);
+    for (method, path, text, pointer) in [
+        (
+            Method::POST,
+            "/v1/policies",
+            r#"{"model": "line", "demonstration": [{"x": 1}], "weights": {"x": 1, "x": 5}}"#,
+            "/weights/x",
+        ),
+        (
+            Method::POST,
+            "/v1/policies",
+            r#"{"model": "line", "demonstration": [{"x": 1}, {"x": 1, "x": 2}]}"#,
+            "/demonstration/1/x",
+        ),
+        (Method::POST, "/v1/policies", r#"{"model": "line", "demonstration": [{"x": 1}], "model": "line"}"#, "/model"),
+        (
+            Method::POST,
+            "/v1/policies:batch",
+            r#"{"model": "line", "items": [{"demonstration": [{"x": 1}], "weights": {"x": 1, "x": 5}}]}"#,
+            "/items/0/weights/x",
+        ),
+        (
+            Method::POST,
+            "/v1/policies:batch",
+            r#"{"model": "line", "items": [{"demonstration": [{"x": 1, "x": 1}]}]}"#,
+            "/items/0/demonstration/0/x",
+        ),
+        (
+            Method::POST,
+            "/v1/learners/l/trials",
+            r#"{"model": "line", "demonstration": [{"x": null, "x": 1}]}"#,
+            "/demonstration/0/x",
+        ),
+        (Method::PUT, "/v1/learners/k", r#"{"attributes": ["x"], "mean": {"x": 1, "x": 2}}"#, "/mean/x"),
+        (Method::PUT, &reward, r#"{"reward": 1, "reward": 2}"#, "/reward"),
+        (Method::PUT, "/v1/models/other", &model, "/actions/0/cost"),
+    ] {
+        let (status, problem) = send_text(&service, method, path, text.to_owned()).await;
+        assert_eq!((status, pointers(&problem["errors"])), (422, vec![pointer]), "{path} {text}: {problem}");
+        assert!(problem["errors"][0]["detail"].as_str().unwrap().contains("twice"), "{problem}");
+    }
+    let frames = stream_text(&service, r#"{"type": "open", "model": "line", "weights": {"x": 1, "x": 2}}"#).await;
+    assert_eq!(pointers(&frames[1]["problem"]["errors"]), ["/weights/x"], "{frames:?}");
+    let observing = "{\"type\": \"open\", \"model\": \"line\"}\n{\"type\": \"observe\", \"seq\": 0, \"states\": [{\"x\": 1, \"x\": 2}]}\n";
+    let frames = stream_text(&service, observing).await;
+    assert_eq!(pointers(&frames[2]["problem"]["errors"]), ["/states/0/x"], "{frames:?}");
+    service.stop().await;
+}
+
+#[tokio::test]
+async fn a_body_a_frame_or_a_line_may_begin_with_a_byte_order_mark() {
+    let service = Service::start(&[]).await;
+    let marked = |value: &Value| format!("\u{feff}{value}");
+    assert_eq!(send_text(&service, Method::PUT, "/v1/models/line", marked(&line())).await.0, 201);
+    // Large enough to be read as it comes.
+    let spaces = " ".repeat(2 << 20);
+    let large = format!("\u{feff}{spaces}{}", line());
+    assert_eq!(send_text(&service, Method::PUT, "/v1/models/large", large).await.0, 201);
+    let request = json!({"model": "line", "demonstration": [{"x": 0}, {"x": 2}]});
+    let (status, policy) = send_text(&service, Method::POST, "/v1/policies", marked(&request)).await;
+    assert_eq!((status, &policy["cost"]["total"]), (201, &json!(1.3)), "{policy}");
+    let batch = json!({"model": "line", "items": [{"demonstration": [{"x": 0}]}]});
+    assert_eq!(send_text(&service, Method::POST, "/v1/policies:batch", marked(&batch)).await.0, 200);
+    assert_eq!(send_text(&service, Method::PUT, "/v1/learners/l", marked(&json!({"attributes": ["x"]}))).await.0, 201);
+    let frames = [
+        json!({"type": "open", "model": "line"}),
+        json!({"type": "observe", "seq": 0, "states": [{"x": 1}]}),
+        json!({"type": "end", "seq": 1}),
+    ];
+    let answered = stream_text(&service, frames.iter().map(marked).collect::<Vec<_>>().join("\n")).await;
+    assert_eq!(answered.last().unwrap()["type"], "done", "{answered:?}");
+    service.stop().await;
+}
+
+#[tokio::test]
+async fn whole_numbers_may_be_written_with_a_point_or_an_exponent() {
+    let service = Service::start(&[]).await;
+    let mut model = line();
+    model["dynamics"]["transitions"] = json!([[0.0, "on", 1.0], [1, 0.0, 2.0], [1.0, 1.0, 0], [2, "back", 1]]);
+    model["dynamics"]["start"] = json!(0.0);
+    let (_, plain) = service.put("/v1/models/plain", &line()).await;
+    let (status, made) = service.put("/v1/models/line", &model).await;
+    assert_eq!((status, &made["hash"]), (201, &plain["hash"]), "{made}");
+    let text = r#"{"model": "line", "demonstration": [{"x": 0}, {"x": 2}], "lookahead": 8.0, "max_expansions": 1e2, "deadline_ms": 1.5e3, "start": 1.0}"#;
+    let (status, policy) = send_text(&service, Method::POST, "/v1/policies", text).await;
+    assert_eq!(
+        (status, &policy["lookahead"], &policy["steps"][0]["state_index"]),
+        (201, &json!(8), &json!(1)),
+        "{policy}"
+    );
+    let cave = r#"{"dynamics": {"kind": "wumpus", "width": 4.0, "height": 3e0, "pits": [[1.0, 1]], "start": {"x": 0.0, "y": 0}, "arrows": 1.0}}"#;
+    assert_eq!(send_text(&service, Method::PUT, "/v1/models/cave", cave).await.0, 201);
+    let seed = r#"{"attributes": ["x"], "seed": 7.0, "lease_s": 6e2}"#;
+    assert_eq!(send_text(&service, Method::PUT, "/v1/learners/l", seed).await.0, 201);
+    let frames = stream_text(
+        &service,
+        "{\"type\": \"open\", \"model\": \"line\", \"lookahead\": 1.0}\n{\"type\": \"observe\", \"seq\": 0.0, \"states\": [{}]}\n\
+         {\"type\": \"end\", \"seq\": 1.0}\n",
+    )
+    .await;
+    assert_eq!(frames.last().unwrap()["type"], "done", "{frames:?}");
+    for text in ["8.5", "-8.0", "1e-1"] {
+        let text = format!(r#"{{"model": "line", "demonstration": [{{}}], "lookahead": {text}}}"#);
+        let (status, problem) = send_text(&service, Method::POST, "/v1/policies", text).await;
+        assert_eq!((status, pointers(&problem["errors"])), (422, vec!["/lookahead"]), "{problem}");
+    }
+    service.stop().await;
+}
+
+#[tokio::test]
+async fn an_integer_that_no_number_holds_exactly_is_told_to_be_a_category() {
+    const BEYOND: u64 = 9_007_199_254_740_993;
+    let service = Service::start(&[]).await;
+    let mut model = line();
+    model["dynamics"]["states"] = json!([[BEYOND, "a"], [BEYOND - 1, "a"], [-9_007_199_254_740_993_i64, "a"]]);
+    let (status, problem) = service.put("/v1/models/m", &model).await;
+    assert_eq!((status, pointers(&problem["errors"])), (422, vec!["/dynamics/states/0/0", "/dynamics/states/2/0"]));
+    assert!(problem["errors"][0]["detail"].as_str().unwrap().contains("a category"), "{problem}");
+    service.put("/v1/models/line", &line()).await;
+    let observed =
+        json!({"model": "line", "demonstration": [{"x": BEYOND - 1}, {"x": BEYOND}], "start": {"x": BEYOND}});
+    let (status, problem) = service.post("/v1/policies", &observed).await;
+    assert_eq!((status, pointers(&problem["errors"])), (422, vec!["/demonstration/1/x", "/start/x"]), "{problem}");
+    // As categories, they are told apart.
+    model["attributes"][0]["kind"] = json!("category");
+    assert_eq!(service.put("/v1/models/m", &model).await.0, 201);
+    let request = json!({"model": "m", "demonstration": [{"x": BEYOND - 1}], "start": {"x": BEYOND - 1}});
+    let (_, policy) = service.post("/v1/policies", &request).await;
+    assert_eq!((&policy["steps"][0]["state_index"], &policy["cost"]["total"]), (&json!(1), &json!(0.0)), "{policy}");
     service.stop().await;
 }

@@ -2,6 +2,7 @@
 
 use std::collections::HashSet;
 
+use super::reading::exact;
 use super::{Attribute, Cycle, Kind, Labels, MAX_COST, Scalar, Schema, Value, Weights};
 
 /// Why an attribute, a schema, a model or a demonstration could not be built.
@@ -170,13 +171,12 @@ impl Attribute {
     /// [`BuildError::Value`] if `scalar` is not a value of this attribute.
     pub fn value(&self, scalar: impl Into<Scalar>) -> Result<Value, BuildError> {
         let scalar = scalar.into();
-        #[expect(clippy::cast_precision_loss, reason = "integers beyond 2^53 are read from JSON likewise")]
         let value = match (&self.kind, &scalar) {
             (Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. }, Scalar::Number(number)) => {
                 number.is_finite().then_some(Value::Number(number + 0.0))
             }
             (Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. }, Scalar::Integer(integer)) => {
-                Some(Value::Number(*integer as f64))
+                exact((*integer).into()).map(Value::Number)
             }
             (Kind::Cyclic { cycle: Cycle::Labels(labels), .. }, Scalar::Text(text)) => {
                 labels.position(text).map(Value::Label)

@@ -29,7 +29,7 @@ pub use schema::{AttributeDocument, KindName, Schema};
 pub use value::{Scalar, Value};
 pub use weights::Weights;
 
-use crate::document::{Faults, Place, Range, list_known};
+use crate::document::{Faults, Place, Range, list_known, whole};
 
 /// Largest cost of an action, and largest term of a distance; dimensionless. Keeps every sum along a path finite: even a
 /// hundred million of them stay below the largest float.
@@ -147,6 +147,12 @@ impl Attribute {
         use serde_json::Value as Json;
         match (&self.kind, place.value) {
             (Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. }, _) => {
+                let integer = place.value.as_i64().map(i128::from).or_else(|| place.value.as_u64().map(i128::from));
+                if integer.is_some_and(|integer| reading::exact(integer).is_none()) {
+                    let detail = "which no number holds exactly (they are 64-bit floats, whole up to 2^53): make the attribute a category";
+                    faults.note(place, format!("found {}, {detail}", place.value));
+                    return None;
+                }
                 place.number(Range::Finite, faults).map(Value::Number)
             }
             (Kind::Cyclic { cycle: Cycle::Labels(labels), .. }, value) => {
@@ -157,8 +163,10 @@ impl Attribute {
             }
             (Kind::Category, Json::String(_)) => read_text(place, faults).map(|text| Value::Text(text.into())),
             (Kind::Category, Json::Bool(flag)) => Some(Value::Boolean(*flag)),
-            (Kind::Category, Json::Number(number)) if number.is_i64() => number.as_i64().map(Value::Integer),
-            (Kind::Category, _) => place.mismatch(&self.expected(), faults),
+            (Kind::Category, value) => {
+                let integer = value.as_i64().or_else(|| value.as_f64().filter(|_| value.is_f64()).and_then(whole));
+                integer.map(Value::Integer).or_else(|| place.mismatch(&self.expected(), faults))
+            }
         }
     }
 

@@ -5,6 +5,7 @@ use std::fmt;
 use serde::de::{DeserializeSeed, Deserializer, Error, Visitor};
 
 use super::{Attribute, Cycle, Kind, Value};
+use crate::document::whole;
 
 /// Reads a value of this attribute, or `null`: not observed. It accepts exactly the values that [`Attribute::read_value`] accepts, which a
 /// property test of demonstrations holds. Its errors do not explain what is wrong; the faults of `read_value` do.
@@ -35,25 +36,27 @@ impl Visitor<'_> for ValueSeed<'_> {
     }
 
     fn visit_i64<E: Error>(self, integer: i64) -> Result<Self::Value, E> {
-        #[expect(clippy::cast_precision_loss, reason = "numbers are floats")]
         let read = match self.0.kind {
             Kind::Category => Some(Value::Integer(integer)),
-            _ => self.number(integer as f64),
+            _ => exact(integer.into()).and_then(|number| self.number(number)),
         };
         checked(read)
     }
 
     fn visit_u64<E: Error>(self, integer: u64) -> Result<Self::Value, E> {
-        #[expect(clippy::cast_precision_loss, reason = "numbers are floats")]
         let read = match self.0.kind {
             Kind::Category => i64::try_from(integer).ok().map(Value::Integer),
-            _ => self.number(integer as f64),
+            _ => exact(integer.into()).and_then(|number| self.number(number)),
         };
         checked(read)
     }
 
     fn visit_f64<E: Error>(self, number: f64) -> Result<Self::Value, E> {
-        checked(self.number(number))
+        let read = match self.0.kind {
+            Kind::Category => whole(number).map(Value::Integer),
+            _ => self.number(number),
+        };
+        checked(read)
     }
 
     fn visit_str<E: Error>(self, text: &str) -> Result<Self::Value, E> {
@@ -72,6 +75,19 @@ impl ValueSeed<'_> {
         // Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bits.
         let is_number = matches!(self.0.kind, Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. });
         (is_number && number.is_finite()).then_some(Value::Number(number + 0.0))
+    }
+}
+
+/// The float that is this integer; `None` if there is none.
+#[inline]
+pub(super) fn exact(integer: i128) -> Option<f64> {
+    const ALL_EXACT: std::ops::RangeInclusive<i128> = -(1 << 53)..=1 << 53;
+    #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, reason = "whether it is exact is asked")]
+    if ALL_EXACT.contains(&integer) {
+        Some(integer as i64 as f64)
+    } else {
+        let number = integer as f64;
+        (number as i128 == integer).then_some(number)
     }
 }
 

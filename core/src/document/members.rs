@@ -7,6 +7,7 @@ use serde::de::{Deserializer, Error as _, MapAccess, Visitor};
 use serde_json::value::RawValue;
 use serde_json::{Map, Value};
 
+use super::parsing::{TWICE, parse};
 use super::size::parsed_bytes;
 
 /// The members of an object, as text.
@@ -21,10 +22,11 @@ pub struct Members<'t> {
 }
 
 impl<'t> Members<'t> {
-    /// The members of the object in `text`, which may have these names. Of a member that stands twice, the last one counts. `None` if
+    /// The members of the object in `text`, which may have these names, each once. `None` if
     /// the text is something else; [`parse`](super::parse) and [`Place::object`](super::Place::object) tell what is wrong with it.
     #[must_use]
     pub fn split(text: &'t str, names: &'static [&'static str]) -> Option<Self> {
+        let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         let mut deserializer = serde_json::Deserializer::from_str(text);
         let members = deserializer.deserialize_map(Split(names)).ok()?;
         deserializer.end().ok()?;
@@ -49,13 +51,13 @@ impl<'t> Members<'t> {
         self.texts.iter().flatten().map(|text| text.len()).sum()
     }
 
-    /// The members as an object. `None` if one of them cannot be held: a number beyond the range of 64-bit floats.
+    /// The members as an object. `None` if one of them cannot be held, as [`parse`](super::parse) tells.
     #[must_use]
     pub fn parse(&self) -> Option<Value> {
         let mut object = Map::new();
         for (name, text) in self.names.iter().zip(&self.texts) {
             if let Some(text) = text {
-                object.insert((*name).to_owned(), serde_json::from_str(text).ok()?);
+                object.insert((*name).to_owned(), parse(text.as_bytes()).ok()?);
             }
         }
         Some(Value::Object(object))
@@ -77,7 +79,9 @@ impl<'de> Visitor<'de> for Split {
         while let Some(name) = members.next_key::<Cow<'de, str>>()? {
             let position = names.iter().position(|known| *known == name);
             let position = position.ok_or_else(|| A::Error::custom("unknown member"))?;
-            texts[position] = Some(members.next_value::<&'de RawValue>()?.get());
+            if texts[position].replace(members.next_value::<&'de RawValue>()?.get()).is_some() {
+                return Err(A::Error::custom(TWICE));
+            }
         }
         Ok(Members { names, texts })
     }
@@ -96,7 +100,7 @@ mod tests {
         for text in [
             r#"{"model":"a","demonstration":[{"model":"b"}],"start":7}"#,
             r#" { "start" : 7 , "demonstration" : [{"model":"b"}] , "m\u006fdel" : "a" } "#,
-            r#"{"model":"b","start":{},"model":"a","demonstration":[{"model":"b"}],"start":7}"#,
+            "\u{feff}{\"model\":\"a\",\"demonstration\":[{\"model\":\"b\"}],\"start\":7}",
         ] {
             let mut members = Members::split(text, &NAMES).unwrap();
             assert_eq!(members.take("demonstration"), Some(r#"[{"model":"b"}]"#), "{text}");
@@ -108,9 +112,13 @@ mod tests {
 
     #[test]
     fn what_is_no_object_of_these_members_is_left_to_be_explained() {
-        for text in ["", "[]", "7", r#"{"model":"a"} x"#, r#"{"model":"a""#, r#"{"hurry":1}"#, r#"{"model":01}"#] {
+        let twice = r#"{"model":"b","start":{},"model":"a"}"#;
+        for text in ["", "[]", "7", r#"{"model":"a"} x"#, r#"{"model":"a""#, r#"{"hurry":1}"#, r#"{"model":01}"#, twice]
+        {
             assert!(Members::split(text, &NAMES).is_none(), "{text}");
         }
-        assert_eq!(Members::split(r#"{"start":1e999}"#, &NAMES).unwrap().parse(), None);
+        for text in [r#"{"start":1e999}"#, r#"{"start":{"x":1,"x":1}}"#] {
+            assert_eq!(Members::split(text, &NAMES).unwrap().parse(), None);
+        }
     }
 }

@@ -23,11 +23,11 @@ mod size;
 
 pub use fault::{Fault, Faults};
 pub use members::Members;
-pub(crate) use parsing::BEYOND_FLOATS;
+pub(crate) use parsing::{BEYOND_FLOATS, BYTE_ORDER_MARK, TWICE};
 pub use parsing::{ParseError, parse};
 pub use path::Path;
-pub(crate) use place::index_of;
 pub use place::{Object, Place, Range};
+pub(crate) use place::{index_of, whole};
 pub use shown::Quoted;
 pub(crate) use shown::{Excerpt, list_known};
 pub use size::{parsed_bytes, size_bytes};

@@ -1,9 +1,10 @@
 //! Text to values.
 
+use std::collections::HashSet;
 use std::fmt;
 
-use serde::de::{DeserializeSeed, Deserializer, MapAccess, SeqAccess, Visitor};
-use serde_json::Value;
+use serde::de::{DeserializeSeed, Deserializer, Error as _, MapAccess, SeqAccess, Visitor};
+use serde_json::{Map, Value};
 
 use super::fault::Faults;
 use super::path::escape;
@@ -21,43 +22,126 @@ pub enum ParseError {
         /// What the parser met.
         detail: String,
     },
-    /// The text is JSON with a value that cannot be held: a number beyond the range of 64-bit floats.
+    /// The text is JSON that cannot be held: an object has a member twice, or a number is beyond the range of 64-bit floats.
     #[error(transparent)]
     Faults(#[from] Faults),
 }
 
-/// Parses JSON text.
+/// Parses JSON text, which may begin with a byte order mark.
 ///
 /// # Errors
 ///
-/// [`ParseError::Syntax`] if `text` is not JSON (`NaN` and `Infinity` are not), [`ParseError::Faults`] if a
-/// number in it overflows a 64-bit float.
+/// [`ParseError::Syntax`] if `text` is not JSON (`NaN` and `Infinity` are not), [`ParseError::Faults`] if an object in it has a member
+/// twice, or a number overflows a 64-bit float.
 pub fn parse(text: &[u8]) -> Result<Value, ParseError> {
-    serde_json::from_slice(text).map_err(|error| explain_parse_error(text, &error))
+    let text = text.strip_prefix(BYTE_ORDER_MARK).unwrap_or(text);
+    let mut json = serde_json::Deserializer::from_slice(text);
+    let read = Whole.deserialize(&mut json).and_then(|value| json.end().map(|()| value));
+    read.map_err(|_| explain_parse_error(text))
 }
+
+/// What some programs write at the beginning of a text (U+FEFF in UTF-8). It says nothing.
+pub(crate) const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
+
+/// What is wrong with a member whose name an object has already.
+pub(crate) const TWICE: &str = "stands twice in this object";
 
 /// Parses once more, slowly, to say where the fault is.
-fn explain_parse_error(text: &[u8], error: &serde_json::Error) -> ParseError {
-    let place = || {
-        let mut pointer = String::new();
-        // What it ends with is known; where it does is not.
-        let _ = Tracked(&mut pointer).deserialize(&mut serde_json::Deserializer::from_slice(text));
-        Faults::one(pointer, BEYOND_FLOATS)
-    };
-    ParseError::of(error, place)
+fn explain_parse_error(text: &[u8]) -> ParseError {
+    let (mut pointer, mut faults) = (String::new(), Faults::default());
+    // What it ends with is known; where it does is not.
+    let mut json = serde_json::Deserializer::from_slice(text);
+    let read = Tracked { pointer: &mut pointer, faults: &mut faults }.deserialize(&mut json);
+    match read.and_then(|()| json.end()) {
+        // There was something, so there is a fault.
+        Ok(()) => faults.into(),
+        Err(error) => ParseError::of(&error, || {
+            let mut faults = faults;
+            faults.append(Faults::one(pointer, BEYOND_FLOATS));
+            faults
+        }),
+    }
 }
 
-/// Reads a value and leaves the pointer to where that failed.
-struct Tracked<'p>(&'p mut String);
+/// Reads a value as serde_json does, but for members that stand twice, which it refuses.
+struct Whole;
+
+impl<'de> DeserializeSeed<'de> for Whole {
+    type Value = Value;
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Whole {
+    type Value = Value;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("any valid JSON value")
+    }
+
+    fn visit_bool<E>(self, flag: bool) -> Result<Value, E> {
+        Ok(flag.into())
+    }
+
+    fn visit_i64<E>(self, number: i64) -> Result<Value, E> {
+        Ok(number.into())
+    }
+
+    fn visit_u64<E>(self, number: u64) -> Result<Value, E> {
+        Ok(number.into())
+    }
+
+    fn visit_f64<E>(self, number: f64) -> Result<Value, E> {
+        Ok(number.into())
+    }
+
+    fn visit_str<E>(self, text: &str) -> Result<Value, E> {
+        Ok(text.into())
+    }
+
+    fn visit_string<E>(self, text: String) -> Result<Value, E> {
+        Ok(text.into())
+    }
+
+    fn visit_unit<E>(self) -> Result<Value, E> {
+        Ok(Value::Null)
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Value, A::Error> {
+        let mut held = Vec::new();
+        while let Some(item) = items.next_element_seed(Self)? {
+            held.push(item);
+        }
+        Ok(held.into())
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<Value, A::Error> {
+        let mut held = Map::new();
+        while let Some(name) = members.next_key::<String>()? {
+            if held.insert(name, members.next_value_seed(Self)?).is_some() {
+                return Err(A::Error::custom(TWICE));
+            }
+        }
+        Ok(held.into())
+    }
+}
+
+/// Reads a value, notes members that stand twice, and leaves the pointer to where reading failed, if it did.
+struct Tracked<'p> {
+    pointer: &'p mut String,
+    faults: &'p mut Faults,
+}
 
 impl Tracked<'_> {
     /// Reads what is under `name` with `read`. The pointer leads there if that fails.
     fn under<T, E>(&mut self, name: &str, read: impl FnOnce(Tracked<'_>) -> Result<T, E>) -> Result<T, E> {
-        let n_bytes = self.0.len();
-        self.0.push('/');
-        self.0.push_str(name);
-        let value = read(Tracked(self.0))?;
-        self.0.truncate(n_bytes);
+        let n_bytes = self.pointer.len();
+        self.pointer.push('/');
+        self.pointer.push_str(name);
+        let value = read(Tracked { pointer: self.pointer, faults: self.faults })?;
+        self.pointer.truncate(n_bytes);
         Ok(value)
     }
 }
@@ -87,8 +171,15 @@ impl<'de> Visitor<'de> for Tracked<'_> {
     }
 
     fn visit_map<A: MapAccess<'de>>(mut self, mut members: A) -> Result<(), A::Error> {
+        let mut names = HashSet::new();
         while let Some(name) = members.next_key::<String>()? {
-            self.under(&escape(&name), |member| members.next_value_seed(member))?;
+            self.under(&escape(&name), |member| {
+                if names.contains(&name) {
+                    member.faults.append(Faults::one(member.pointer.as_str(), TWICE));
+                }
+                members.next_value_seed(member)
+            })?;
+            names.insert(name);
         }
         Ok(())
     }

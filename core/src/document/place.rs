@@ -86,9 +86,17 @@ impl<'v, 'p> Place<'v, 'p> {
         if range.contains(number) { Some(number + 0.0) } else { self.mismatch(&range.describe(), faults) }
     }
 
+    /// The whole number of at least 0 that is here, if it is one; it may be written with a point or an exponent, as in 8.0 or 1e2.
+    #[must_use]
+    pub fn whole(&self) -> Option<u64> {
+        self.value
+            .as_u64()
+            .or_else(|| self.value.as_f64().and_then(whole).and_then(|number| u64::try_from(number).ok()))
+    }
+
     /// Reads a whole number from `least` to `most`.
     pub fn integer(&self, least: u64, most: u64, faults: &mut Faults) -> Option<u64> {
-        match self.value.as_u64() {
+        match self.whole() {
             Some(number) if (least..=most).contains(&number) => Some(number),
             _ => self.mismatch(&format!("a whole number from {least} to {most}"), faults),
         }
@@ -96,8 +104,7 @@ impl<'v, 'p> Place<'v, 'p> {
 
     /// Reads an index into a collection of `len` things, called `what` in the fault.
     pub fn index(&self, len: usize, what: &str, faults: &mut Faults) -> Option<u32> {
-        let index = self.value.as_u64().and_then(|index| u32::try_from(index).ok());
-        match index {
+        match self.whole().and_then(|index| u32::try_from(index).ok()) {
             Some(index) if (index as usize) < len => Some(index),
             Some(index) => {
                 faults.note_no_index(&self.path, what, index, len);
@@ -113,6 +120,16 @@ impl<'v, 'p> Place<'v, 'p> {
         None
     }
 }
+
+/// The whole number that `number` is, if it is one, and none other is the same float.
+pub(crate) fn whole(number: f64) -> Option<i64> {
+    let is_whole = number.fract() == 0.0 && number.abs() <= MAX_WHOLE;
+    #[expect(clippy::cast_possible_truncation, reason = "whole, and far below 2^63")]
+    is_whole.then_some(number as i64)
+}
+
+/// 2^53: up to here, every whole number is a float of its own.
+pub(crate) const MAX_WHOLE: f64 = 9_007_199_254_740_992.0;
 
 /// What is expected where a thing called `what` is referred to by its index.
 pub(crate) fn index_of(what: &str) -> String {

@@ -57,3 +57,39 @@ fn an_index_of_an_action_is_asked_for_in_english() {
     Place::root(&json!("x")).index(3, "action", &mut faults);
     assert_eq!(faults.listed()[0].detail, "expected the index of an action, found \"x\"");
 }
+
+#[test]
+fn every_member_that_stands_twice_is_a_fault_with_its_place() {
+    let text = r#"{"a": {"x": 1, "x": 1}, "b": [{"c/d": [], "y": {}, "c/d": null, "c\u002fd": 2}], "a": {"z": 1}}"#;
+    let Err(ParseError::Faults(faults)) = parse(text.as_bytes()) else { panic!("it has faults") };
+    let pointers: Vec<_> = faults.listed().iter().map(|fault| fault.pointer.as_str()).collect();
+    assert_eq!(pointers, ["/a/x", "/b/0/c~1d", "/b/0/c~1d", "/a"]);
+    assert!(faults.to_string().contains("stands twice"), "{faults}");
+    // What is wrong with the text itself counts more.
+    assert!(matches!(parse(br#"{"a": 1, "a": 2"#), Err(ParseError::Syntax { .. })));
+    let Err(ParseError::Faults(faults)) = parse(br#"{"a": 1, "a": 1e999}"#) else { panic!("it has faults") };
+    assert_eq!(faults.count(), 2, "{faults}");
+}
+
+#[test]
+fn a_byte_order_mark_says_nothing() {
+    assert_eq!(parse("\u{feff}{\"a\": [7.5, -1, \"\u{feff}\"]}".as_bytes()), Ok(json!({"a": [7.5, -1, "\u{feff}"]})));
+    assert!(parse("\u{feff}\u{feff}7".as_bytes()).is_err());
+}
+
+#[test]
+fn a_whole_number_may_have_a_point_or_an_exponent() {
+    let read = |text: &str| {
+        let (value, mut faults) = (parse(text.as_bytes()).unwrap(), Faults::default());
+        let (integer, index) =
+            (Place::root(&value).integer(0, 1000, &mut faults), Place::root(&value).index(9, "state", &mut faults));
+        (integer, index, faults.count())
+    };
+    assert_eq!(read("8.0"), (Some(8), Some(8), 0));
+    assert_eq!(read("0.8e1"), (Some(8), Some(8), 0));
+    assert_eq!(read("-0.0"), (Some(0), Some(0), 0));
+    assert_eq!(read("1e2"), (Some(100), None, 1));
+    for text in ["8.5", "-1.0", "1e300", "1e-3"] {
+        assert_eq!(read(text), (None, None, 2), "{text}");
+    }
+}

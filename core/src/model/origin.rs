@@ -43,7 +43,7 @@ impl Model {
                 Some(Origin::Row(OriginRow(row.into())))
             }
             Some(_) => {
-                let index = place.value.as_u64().and_then(|index| StateIdx::try_from(index).ok());
+                let index = place.whole().and_then(|index| StateIdx::try_from(index).ok());
                 match index.filter(|index| *index < self.states.len()) {
                     Some(index) => Some(Origin::State(index)),
                     None => place.mismatch(

@@ -6,6 +6,7 @@ use serde::de::{DeserializeSeed, Deserializer, Error as _, MapAccess, SeqAccess,
 
 use super::Demonstration;
 use crate::attribute::{Schema, Value, ValueSeed};
+use crate::document::TWICE;
 
 /// Reads a demonstration that is well-formed from JSON as it comes, in a fraction of the time that a document takes. An error does not
 /// tell what is wrong with it, as [`Demonstration::read`] can.
@@ -61,8 +62,15 @@ impl<'de> Visitor<'de> for WellFormed<'_> {
         let mut len = 0;
         // Most observations have their members in the order of the first, and that is mostly the attributes'.
         let mut order: Vec<usize> = (0..schema.len()).collect();
-        while items.next_element_seed(OneObservation { schema, values: &mut values, order: &mut order })?.is_some() {
-            len += 1;
+        let mut last_seen = vec![0; schema.len()];
+        loop {
+            let number = len + 1;
+            let observation =
+                OneObservation { schema, values: &mut values, order: &mut order, last_seen: &mut last_seen, number };
+            if items.next_element_seed(observation)?.is_none() {
+                break;
+            }
+            len = number;
             // As they come: what is not observed takes as much room as what is.
             if len > max_len {
                 return Err(A::Error::custom("too many observations"));
@@ -81,6 +89,10 @@ struct OneObservation<'s, 'v> {
     values: &'v mut Vec<Option<Value>>,
     /// The attributes that members were of, by their place, in the observation before.
     order: &'v mut [usize],
+    /// By attribute: the number of the last observation that has it.
+    last_seen: &'v mut [usize],
+    /// That of this one, from 1.
+    number: usize,
 }
 
 impl<'de> DeserializeSeed<'de> for OneObservation<'_, '_> {
@@ -110,13 +122,16 @@ impl<'de> Visitor<'de> for OneObservation<'_, '_> {
     fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<(), A::Error> {
         let first = self.values.len();
         self.values.resize(first + self.schema.len(), None);
-        let Self { schema, values, order } = self;
+        let Self { schema, values, order, last_seen, number } = self;
         let mut places = order.iter_mut();
         loop {
             let mut further = 0;
             let expected = places.next().unwrap_or(&mut further);
             let Some(position) = members.next_key_seed(Name { schema, expected: *expected })? else { return Ok(()) };
             *expected = position;
+            if std::mem::replace(&mut last_seen[position], number) == number {
+                return Err(A::Error::custom(TWICE));
+            }
             values[first + position] = members.next_value_seed(ValueSeed(&schema.attributes()[position]))?;
         }
     }
@@ -269,11 +284,17 @@ mod tests {
     }
 
     #[test]
-    fn of_a_member_that_stands_twice_the_last_counts() {
-        let text = r#"[{"x":1,"angle":2,"x":3,"angle":null}]"#;
-        let document = document::parse(text.as_bytes()).unwrap();
-        let read = Demonstration::read(&schema(), &Place::root(&document), &mut Faults::default());
-        assert!(read.is_some());
-        assert_eq!(read_well_formed(&schema(), text), read);
+    fn an_attribute_that_is_observed_twice_is_no_observation() {
+        let well = |text: &str| read_well_formed(&schema(), text);
+        assert!(well(r#"[{"x":1,"angle":2},{"angle":2,"x":1},{"x":1,"angle":2}]"#).is_some());
+        for text in [
+            r#"[{"x":1,"angle":2,"x":3}]"#,
+            r#"[{"x":null,"x":3}]"#,
+            r#"[{"x":1},{"angle":2,"\u0061ngle":2}]"#,
+            r#"[{"x":1,"angle":2},{"x":1,"x":2}]"#,
+        ] {
+            assert_eq!(well(text), None, "{text}");
+            assert!(document::parse(text.as_bytes()).is_err(), "{text}");
+        }
     }
 }

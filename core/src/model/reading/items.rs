@@ -7,6 +7,7 @@ use super::lists::{NoTransition, RawIndex, RawStates, RawTerms, RawTransitions};
 use super::raw::{Distinct, Raw};
 use super::take::{Take, Taking, traced};
 use crate::attribute::Schema;
+use crate::document::whole;
 
 /// Takes a state.
 pub(super) struct Row<'r> {
@@ -129,6 +130,10 @@ impl Take<'_> for Index {
     fn scalar(self, found: Raw<&str>) -> RawIndex {
         match found {
             Raw::Whole(number) => u32::try_from(number).map_err(|_| found.owned()),
+            Raw::Float(bits) => {
+                let number = whole(f64::from_bits(bits)).and_then(|number| u32::try_from(number).ok());
+                number.ok_or_else(|| found.owned())
+            }
             _ => Err(found.owned()),
         }
     }

@@ -27,7 +27,7 @@ use serde::de::DeserializeSeed;
 use serde_json::Value;
 
 use super::Limits;
-use crate::document::{self, BEYOND_FLOATS, Faults, ParseError, Path};
+use crate::document::{self, BEYOND_FLOATS, BYTE_ORDER_MARK, Faults, ParseError, Path};
 use crate::interrupt::{Cancelled, Interrupted, Meter};
 
 /// How the text of a model is laid out.
@@ -91,7 +91,7 @@ pub(super) struct Skeleton {
     pub(super) states: Option<RawStates>,
     /// The transitions, if the document lists any.
     pub(super) transitions: Option<RawTransitions>,
-    /// Faults of the lines after the first.
+    /// Faults of the lines after the first, and members that stand twice.
     pub(super) faults: Faults,
 }
 
@@ -106,8 +106,8 @@ pub(super) struct Reader<'m, 'i> {
     /// About how much memory the values of the skeleton take, in bytes.
     n_held_bytes: usize,
     max_held_bytes: usize,
-    /// Members that stand twice on the line that is read, if that is not the line of the model.
-    twice: Vec<String>,
+    /// Members that stand twice.
+    twice: Faults,
     /// Why reading was stopped, if not for a fault of the text.
     stop: Option<Stop>,
     /// The path of the value at which an error occurred, innermost step first.
@@ -146,7 +146,7 @@ impl<'m, 'i> Reader<'m, 'i> {
             line: None,
             n_held_bytes: 0,
             max_held_bytes: MAX_HELD_BYTES.min(limits.max_bytes),
-            twice: Vec::new(),
+            twice: Faults::default(),
             stop: None,
             trace: Vec::new(),
         }
@@ -155,19 +155,21 @@ impl<'m, 'i> Reader<'m, 'i> {
     /// Reads what is in memory already.
     pub(super) fn read_value(mut self, document: &Value) -> Result<Skeleton, ReadError> {
         self.max_held_bytes = usize::MAX;
-        let root = Seed::new(&mut self, Position::Root).deserialize(document);
+        let root = Seed::new(&mut self, Position::Root, Path::Root).deserialize(document);
         let root = root.map_err(|error| self.explain(error))?;
         Ok(self.finish(root, Faults::default()))
     }
 
     pub(super) fn read_text(self, text: &[u8], format: Format) -> Result<Skeleton, ReadError> {
+        let text = text.strip_prefix(BYTE_ORDER_MARK).unwrap_or(text);
         match format {
             Format::Json => self.read_json(&mut serde_json::Deserializer::from_slice(text)),
             Format::Ndjson => self.read_ndjson(text),
         }
     }
 
-    pub(super) fn read_from(self, reader: impl BufRead, format: Format) -> Result<Skeleton, ReadError> {
+    pub(super) fn read_from(self, mut reader: impl BufRead, format: Format) -> Result<Skeleton, ReadError> {
+        skip_byte_order_mark(&mut reader)?;
         match format {
             Format::Json => self.read_json(&mut serde_json::Deserializer::from_reader(reader)),
             Format::Ndjson => self.read_ndjson(reader),
@@ -178,7 +180,7 @@ impl<'m, 'i> Reader<'m, 'i> {
         mut self,
         json: &mut serde_json::Deserializer<R>,
     ) -> Result<Skeleton, ReadError> {
-        let root = Seed::new(&mut self, Position::Root).deserialize(&mut *json);
+        let root = Seed::new(&mut self, Position::Root, Path::Root).deserialize(&mut *json);
         let root = root.and_then(|root| json.end().map(|()| root)).map_err(|error| self.explain(error))?;
         Ok(self.finish(root, Faults::default()))
     }
@@ -197,18 +199,15 @@ impl<'m, 'i> Reader<'m, 'i> {
             }
             self.line = Some(number);
             let position = if root.is_none() { Position::Root } else { Position::Chunk };
-            let mut json = serde_json::Deserializer::from_slice(&line);
-            let read = Seed::new(&mut self, position).deserialize(&mut json);
+            let text = line.strip_prefix(BYTE_ORDER_MARK).unwrap_or(&line);
+            let mut json = serde_json::Deserializer::from_slice(text);
+            let read = Seed::new(&mut self, position, Path::Line(number)).deserialize(&mut json);
             let read = read.and_then(|read| json.end().map(|()| read)).map_err(|error| self.explain(error))?;
             if root.is_none() {
                 model_line = self.line;
                 root = Some(read);
             } else {
                 check_chunk(&read, number, &mut faults);
-                for name in self.twice.drain(..) {
-                    // Items of the two lists could not be told apart later.
-                    faults.note_at(&Path::Member(&Path::Line(number), &name), "stands twice on this line");
-                }
             }
         }
         self.line = model_line;
@@ -230,7 +229,8 @@ impl<'m, 'i> Reader<'m, 'i> {
         Ok(self.finish(root, faults))
     }
 
-    fn finish(self, root: Value, faults: Faults) -> Skeleton {
+    fn finish(self, root: Value, mut faults: Faults) -> Skeleton {
+        faults.append(self.twice);
         Skeleton { root, line: self.line, states: self.states, transitions: self.transitions, faults }
     }
 
@@ -258,6 +258,28 @@ impl<'m, 'i> Reader<'m, 'i> {
             (error, _) => error.into(),
         }
     }
+}
+
+/// Takes a byte order mark out of what is to be read, if it begins with one.
+fn skip_byte_order_mark(reader: &mut impl BufRead) -> Result<(), ReadError> {
+    for (n, byte) in BYTE_ORDER_MARK.iter().enumerate() {
+        let next = loop {
+            match reader.fill_buf() {
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                available => break available?.first().copied(),
+            }
+        };
+        if next == Some(*byte) {
+            reader.consume(1);
+        } else if n == 0 {
+            break;
+        } else {
+            // No JSON begins with a part of it.
+            let detail = "expected value".to_owned();
+            return Err(ParseError::Syntax { line: 1, column: 1, detail }.into());
+        }
+    }
+    Ok(())
 }
 
 /// Notes a number beyond floats where `trace` leads to.

@@ -8,6 +8,7 @@ use super::lists::{RawStates, RawTransitions};
 use super::raw::Raw;
 use super::take::{Take, Taking, traced};
 use super::{Limits, PathStep, Reader, Stop};
+use crate::document::{Path, TWICE};
 use crate::interrupt::Meter;
 
 /// Where in the document a value stands.
@@ -40,18 +41,19 @@ impl Position {
 }
 
 /// Keeps a value as it is, without the long lists.
-pub(super) struct Seed<'r, 'm, 'i> {
+pub(super) struct Seed<'r, 'm, 'i, 'p> {
     reader: &'r mut Reader<'m, 'i>,
     position: Position,
+    path: Path<'p>,
 }
 
-impl<'r, 'm, 'i> Seed<'r, 'm, 'i> {
-    pub(super) fn new(reader: &'r mut Reader<'m, 'i>, position: Position) -> Self {
-        Self { reader, position }
+impl<'r, 'm, 'i, 'p> Seed<'r, 'm, 'i, 'p> {
+    pub(super) fn new(reader: &'r mut Reader<'m, 'i>, position: Position, path: Path<'p>) -> Self {
+        Self { reader, position, path }
     }
 }
 
-impl<'de> DeserializeSeed<'de> for Seed<'_, '_, '_> {
+impl<'de> DeserializeSeed<'de> for Seed<'_, '_, '_, '_> {
     type Value = Value;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Value, D::Error> {
@@ -60,7 +62,7 @@ impl<'de> DeserializeSeed<'de> for Seed<'_, '_, '_> {
     }
 }
 
-impl<'de> Take<'de> for Seed<'_, '_, '_> {
+impl<'de> Take<'de> for Seed<'_, '_, '_, '_> {
     type Taken = Value;
 
     fn scalar(self, found: Raw<&str>) -> Value {
@@ -71,7 +73,7 @@ impl<'de> Take<'de> for Seed<'_, '_, '_> {
     }
 
     fn array<A: SeqAccess<'de>>(self, mut items: A) -> Result<Value, A::Error> {
-        let Self { reader, position } = self;
+        let Self { reader, position, path } = self;
         match position {
             Position::States { is_in_model } => return reader.take_states(items, is_in_model),
             Position::Transitions { is_in_model } => return reader.take_transitions(items, is_in_model),
@@ -79,7 +81,8 @@ impl<'de> Take<'de> for Seed<'_, '_, '_> {
         }
         let mut held = Vec::new();
         loop {
-            let item = items.next_element_seed(Seed::new(reader, Position::Elsewhere));
+            let place = Path::Item(&path, held.len());
+            let item = items.next_element_seed(Seed::new(reader, Position::Elsewhere, place));
             match reader.traced(item, || PathStep::Item(held.len()))? {
                 Some(item) => held.push(item),
                 None => return Ok(Value::Array(held)),
@@ -88,19 +91,17 @@ impl<'de> Take<'de> for Seed<'_, '_, '_> {
     }
 
     fn object<A: MapAccess<'de>>(self, mut members: A) -> Result<Value, A::Error> {
-        let Self { reader, position } = self;
-        if position == Position::Dynamics {
-            // The last of members with the same name counts.
-            (reader.states, reader.transitions) = (None, None);
-        }
+        let Self { reader, position, path } = self;
         let mut held = Map::new();
         while let Some(name) = members.next_key::<String>()? {
             reader.hold(size_of::<String>() + name.len())?;
-            let member = members.next_value_seed(Seed::new(reader, position.of_member(&name)));
-            let member = reader.traced(member, || PathStep::Member(name.clone()))?;
-            if position == Position::Chunk && held.contains_key(&name) {
-                reader.twice.push(name.clone());
+            let place = Path::Member(&path, &name);
+            if held.contains_key(&name) {
+                // Items of two lists could not be told apart later.
+                reader.twice.note_at(&place, TWICE);
             }
+            let member = members.next_value_seed(Seed::new(reader, position.of_member(&name), place));
+            let member = reader.traced(member, || PathStep::Member(name.clone()))?;
             held.insert(name, member);
         }
         Ok(Value::Object(held))

@@ -215,14 +215,40 @@ proptest! {
 }
 
 #[test]
-fn of_members_that_stand_twice_the_last_one_counts() {
+fn every_member_that_stands_twice_is_a_fault_with_its_place() {
     let text = r#"{
-        "attributes": [{"name": "x", "kind": "number"}], "actions": [{"name": "on"}],
-        "dynamics": {"kind": "table", "states": ["no"], "transitions": [[0, "on", 1]], "states": [[0], [1]]}
+        "attributes": [{"name": "x", "kind": "number", "weight": 1, "weight": 2}], "actions": [{"name": "on"}],
+        "dynamics": {"kind": "table", "states": [[7]], "transitions": [[0, "on", 1]], "states": [[0], [1]], "start": 0, "start": 1},
+        "actions": []
     }"#;
-    let once = text.replace(r#""states": ["no"], "#, "");
-    assert_eq!(outcome(parse(text, Format::Json)), outcome(parse(&once, Format::Json)));
-    assert!(parse(text, Format::Json).is_ok());
+    let faults = outcome(parse(text, Format::Json)).unwrap_err();
+    let twice = faults.iter().filter(|fault| fault.detail.contains("twice")).map(|fault| fault.pointer.as_str());
+    let places = ["/attributes/0/weight", "/dynamics/states", "/dynamics/start", "/actions"];
+    assert_eq!(twice.collect::<Vec<_>>(), places);
+    let read = Definition::parse_from(text.as_bytes(), Format::Json, Limits::DEFAULT, &mut Uninterrupted);
+    assert_eq!(outcome(read), Err(faults));
+    let line = text.replace('\n', " ");
+    let faults = outcome(parse(&line, Format::Ndjson)).unwrap_err();
+    assert!(places.iter().all(|place| faults.iter().any(|fault| (fault.line, &*fault.pointer) == (Some(1), *place))));
+}
+
+#[test]
+fn a_text_or_a_line_may_begin_with_a_byte_order_mark() {
+    let model = r#"{"attributes": [{"name": "x", "kind": "number"}], "actions": [], "dynamics": {"kind": "table", "states": [[0]], "transitions": []}}"#;
+    let expected = outcome(parse(model, Format::Json));
+    assert!(expected.is_ok());
+    let marked = format!("\u{feff}{model}");
+    for format in [Format::Json, Format::Ndjson] {
+        assert_eq!(outcome(parse(&marked, format)), expected);
+        let trickle = io::BufReader::with_capacity(1, Trickle(marked.as_bytes()));
+        assert_eq!(outcome(Definition::parse_from(trickle, format, Limits::DEFAULT, &mut Uninterrupted)), expected);
+    }
+    let lines = format!("{model}\n\u{feff}{{\"states\": [[1]]}}\n");
+    assert!(parse(&lines, Format::Ndjson).is_ok());
+    for text in [&b"\xef"[..], b"\xef\xbb{}"] {
+        let read = Definition::parse_from(text, Format::Json, Limits::DEFAULT, &mut Uninterrupted);
+        assert!(matches!(read, Err(ReadError::Parse(ParseError::Syntax { line: 1, .. }))), "{read:?}");
+    }
 }
 
 #[test]
@@ -258,12 +284,13 @@ fn what_is_wrong_is_said_as_it_always_was() {
             "/dynamics/states/4/1: expected a string, an integer or a boolean, found an object",
             "/dynamics/states/5/0: expected a number, found \"1\"",
             "/dynamics/states/5/1: expected a string, an integer or a boolean, found 1.5",
+            "/dynamics/states/6/0: found 18446744073709551615, which no number holds exactly (they are 64-bit floats, whole up \
+             to 2^53): make the attribute a category",
             "/dynamics/states/6/1: expected a string, an integer or a boolean, found null",
             "/dynamics/transitions/2/0: there is no state 8: there are 8, counted from 0",
             "/dynamics/transitions/2/1: expected one of the actions \"on\", \"back\", found \"up\"",
             "/dynamics/transitions/2/2: expected the index of a state, found 4294967296",
             "/dynamics/transitions/3/1: there is no action 2: there are 2, counted from 0",
-            "/dynamics/transitions/4/0: expected the index of a state, found 1.0",
             "/dynamics/transitions/4/1: expected the index of an action, found an array of 1",
             "/dynamics/transitions/4/2: expected the index of a state, found -1",
             "/dynamics/transitions/5: expected [from, action, to, probability, cost], of which the last two may be left out, \

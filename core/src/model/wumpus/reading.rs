@@ -166,7 +166,9 @@ fn note_deadly(
         for (n, item) in list.value.as_array().into_iter().flatten().enumerate() {
             meter.spend_or_stop(1)?;
             let cell = item.as_array().map(Vec::as_slice).unwrap_or_default();
-            if !cell.iter().map(serde_json::Value::as_u64).eq([Some(x.into()), Some(y.into())]) {
+            let place = list.item(n, item);
+            let coordinates = cell.iter().enumerate().map(|(k, coordinate)| place.item(k, coordinate).whole());
+            if !coordinates.eq([Some(x.into()), Some(y.into())]) {
                 continue;
             }
             match object.optional("start") {
