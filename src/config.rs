@@ -1,13 +1,19 @@
 //! How `etude serve` is set up: by flags, or by environment variables of the same meaning.
 
+mod values;
+
 use std::net::SocketAddr;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use axum::http::HeaderValue;
-use clap::Args;
+use clap::{Arg, Args, Command};
 
+pub(crate) use self::values::{MIN_CONNECTIONS, parse_address, parse_count, parse_database, parse_whole};
+use self::values::{
+    parse_bytes, parse_connections, parse_duration, parse_memory, parse_period, parse_places, parse_threads,
+};
 use crate::clock::{Clock, Ids};
 use crate::http::{self, ConnectionLimits};
 use crate::memory::{self, Memory};
@@ -19,10 +25,10 @@ use etude_core::model;
 #[derive(Args, Clone, Debug)]
 pub struct ServeConfig {
     /// Address to listen on; port 0 takes a free one and logs it.
-    #[arg(long, env = "ETUDE_LISTEN", default_value = "127.0.0.1:8080")]
+    #[arg(long, env = "ETUDE_LISTEN", default_value = "127.0.0.1:8080", value_parser = parse_address, value_name = "HOST:PORT")]
     pub listen: SocketAddr,
     /// SQLite database; created if missing.
-    #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_name = "FILE")]
+    #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_parser = parse_database, value_name = "FILE")]
     pub database: PathBuf,
     /// Name by which the service may be asked for, besides IP addresses, localhost and the machine's own names; `*` for any.
     #[arg(
@@ -41,27 +47,27 @@ pub struct ServeConfig {
     #[arg(long, env = "ETUDE_SEARCH_QUEUE", default_value_t = 256, value_parser = parse_places, value_name = "N")]
     pub search_queue: usize,
     /// Largest request body; once it is decompressed, too.
-    #[arg(long, env = "ETUDE_MAX_BODY_BYTES", default_value_t = 8 * 1024 * 1024, value_name = "BYTES")]
+    #[arg(long, env = "ETUDE_MAX_BODY_BYTES", value_parser = parse_bytes::<usize>, default_value_t = 8 * 1024 * 1024, value_name = "BYTES")]
     pub max_body_bytes: usize,
     /// Largest model, as it is sent [default: as other bodies].
-    #[arg(long, env = "ETUDE_MAX_MODEL_BYTES", value_name = "BYTES")]
+    #[arg(long, env = "ETUDE_MAX_MODEL_BYTES", value_parser = parse_bytes::<usize>, value_name = "BYTES")]
     pub max_model_bytes: Option<usize>,
     /// Largest model, once it is decompressed.
-    #[arg(long, env = "ETUDE_MAX_MODEL_TEXT_BYTES", default_value_t = 512 * 1024 * 1024, value_name = "BYTES")]
+    #[arg(long, env = "ETUDE_MAX_MODEL_TEXT_BYTES", value_parser = parse_bytes::<u64>, default_value_t = 512 * 1024 * 1024, value_name = "BYTES")]
     pub max_model_text_bytes: u64,
     /// Most states of a model; a wumpus world of more is searched lazily.
-    #[arg(long, env = "ETUDE_MAX_STATES", default_value_t = model::Limits::DEFAULT.max_states, value_name = "N")]
+    #[arg(long, env = "ETUDE_MAX_STATES", value_parser = parse_whole::<usize>, default_value_t = model::Limits::DEFAULT.max_states, value_name = "N")]
     pub max_states: usize,
     /// Most transitions of a model.
     #[arg(
-        long, env = "ETUDE_MAX_TRANSITIONS", default_value_t = model::Limits::DEFAULT.max_transitions, value_name = "N"
+        long, env = "ETUDE_MAX_TRANSITIONS", value_parser = parse_whole::<usize>, default_value_t = model::Limits::DEFAULT.max_transitions, value_name = "N"
     )]
     pub max_transitions: usize,
     /// Memory that the service may use in all [default: three quarters of what the machine or its cgroup has].
     #[arg(long, env = "ETUDE_MAX_MEMORY", value_parser = parse_memory, value_name = "BYTES")]
     pub max_memory: Option<u64>,
     /// Of that, for models that are kept ready to be searched [default: a quarter, 1 GiB at most].
-    #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", value_name = "BYTES")]
+    #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", value_parser = parse_bytes::<u64>, value_name = "BYTES")]
     pub model_cache_bytes: Option<u64>,
     /// How long a search may take, from the arrival of its request, unless that says so itself.
     #[arg(
@@ -188,59 +194,16 @@ const STREAM_PING_INTERVAL: Duration = Duration::from_secs(30);
 /// Most memory for models by default.
 const MAX_MODEL_CACHE_BYTES: u64 = 1 << 30;
 
-/// Least memory of a service: it keeps half of that for what it does not count.
-const MIN_MEMORY_BYTES: u64 = 128 << 20;
-
-/// Most threads: half of those that the runtime has for what blocks.
-const MAX_THREADS: usize = 256;
-
 /// Most searches that have run for longer than a moment, each of which keeps its memory until it is done. One client may have half of
 /// these.
 const MAX_LONG_SEARCHES: usize = 32;
 
-/// Fewest connections, whatever the limits are.
-pub(crate) const MIN_CONNECTIONS: usize = 16;
-
-/// Most searches that wait, connections, and streams: beyond what memory and files allow.
-const MAX_PLACES: usize = 1_000_000;
-
-fn parse_at_most(text: &str, most: usize) -> Result<usize, String> {
-    let count: usize = text.parse().map_err(|error: std::num::ParseIntError| error.to_string())?;
-    if count <= most { Ok(count) } else { Err(format!("expected at most {most}")) }
-}
-
-fn parse_places(text: &str) -> Result<usize, String> {
-    parse_at_most(text, MAX_PLACES)
-}
-
-fn parse_connections(text: &str) -> Result<usize, String> {
-    let count = parse_places(text)?;
-    if count >= MIN_CONNECTIONS { Ok(count) } else { Err(format!("expected at least {MIN_CONNECTIONS}")) }
-}
-
-fn parse_threads(text: &str) -> Result<NonZeroUsize, String> {
-    NonZeroUsize::new(parse_at_most(text, MAX_THREADS)?).ok_or_else(|| "expected at least 1".to_owned())
-}
-
-/// Reads a number of bytes, such as 800000000, 512M or 2G (2^20 and 2^30 bytes).
-fn parse_memory(text: &str) -> Result<u64, String> {
-    const UNITS: [(char, u64); 3] = [('K', 1 << 10), ('M', 1 << 20), ('G', 1 << 30)];
-    let number = text.strip_suffix("iB").unwrap_or(text);
-    let with_unit = UNITS.iter().find_map(|(letter, unit)| Some((number.strip_suffix(*letter)?, *unit)));
-    let (digits, unit) = with_unit.unwrap_or((number, 1));
-    let n_bytes = digits.parse::<u64>().ok().and_then(|count| count.checked_mul(unit));
-    let n_bytes = n_bytes.ok_or("expected a number of bytes, such as 800000000, 512M or 2G")?;
-    if n_bytes >= MIN_MEMORY_BYTES { Ok(n_bytes) } else { Err("expected at least 128M".to_owned()) }
-}
-
-fn parse_duration(text: &str) -> Result<Duration, String> {
-    let duration: jiff::SignedDuration = text.parse().map_err(|error: jiff::Error| error.to_string())?;
-    Duration::try_from(duration).map_err(|_| "expected a time of at least 0".to_owned())
-}
-
-fn parse_period(text: &str) -> Result<Duration, String> {
-    parse_duration(text)
-        .and_then(|period| if period.is_zero() { Err("expected a time above 0".to_owned()) } else { Ok(period) })
+/// The same command, for which environment variables that are set and empty are as if they were not set.
+#[must_use]
+pub fn without_empty_variables(command: Command) -> Command {
+    let is_empty = |arg: &Arg| arg.get_env().and_then(std::env::var_os).is_some_and(|value| value.is_empty());
+    let command = command.mut_args(|arg| if is_empty(&arg) { arg.env(None) } else { arg });
+    command.mut_subcommands(without_empty_variables)
 }
 
 #[cfg(test)]
@@ -261,29 +224,5 @@ mod tests {
         assert_eq!(allowed("10000", 1_000_000), 5461, "a third of the memory is theirs");
         let few = config("16").within(1024);
         assert_eq!((few.stream_limits().streams, few.connection_limits().max_connections), (12, 16));
-        assert!(parse_connections("15").is_err() && parse_connections("1000001").is_err());
-    }
-
-    #[test]
-    fn times_are_written_with_their_unit() {
-        assert_eq!(parse_duration("1s"), Ok(Duration::from_secs(1)));
-        assert_eq!(parse_duration("500ms"), Ok(Duration::from_millis(500)));
-        assert!(parse_duration("-1s").is_err() && parse_duration("7").is_err());
-    }
-
-    #[test]
-    fn memory_is_written_in_bytes_or_with_a_unit() {
-        assert_eq!((parse_memory("134217728"), parse_memory("2G")), (Ok(128 << 20), Ok(2 << 30)));
-        assert_eq!((parse_memory("512M"), parse_memory("512MiB")), (Ok(512 << 20), Ok(512 << 20)));
-        for text in ["", "G", "1.5G", "-1", "127M", "99999999999G", "2T"] {
-            assert!(parse_memory(text).is_err(), "{text}");
-        }
-    }
-
-    #[test]
-    fn more_places_than_there_can_be_are_refused() {
-        assert_eq!((parse_places("0"), parse_places("1000000")), (Ok(0), Ok(MAX_PLACES)));
-        assert!(parse_places("1000001").is_err() && parse_places("18446744073709551615").is_err());
-        assert!(parse_threads("256").is_ok() && parse_threads("257").is_err() && parse_threads("0").is_err());
     }
 }

@@ -11,7 +11,7 @@ use tokio::sync::oneshot;
 
 use super::client::{answer, client};
 use super::{CliError, render, runtime, side_by_side};
-use crate::config::ServeConfig;
+use crate::config::{ServeConfig, without_empty_variables};
 use crate::experiment::{CurvePlan, Scene};
 use crate::server::Server;
 use etude_core::mapping::Policy;
@@ -40,7 +40,7 @@ pub(super) fn run(out: &mut impl Write) -> Result<(), CliError> {
 /// The defaults of the service, but for a free port and a temporary database.
 fn config(database: &Path) -> Result<ServeConfig, CliError> {
     let option = |error: clap::Error| CliError::Faulty(error.to_string());
-    let command = ServeConfig::augment_args(clap::Command::new("demo"));
+    let command = without_empty_variables(ServeConfig::augment_args(clap::Command::new("demo")));
     let matches = command.try_get_matches_from(["demo"]).map_err(option)?;
     let config = ServeConfig::from_arg_matches(&matches).map_err(option)?;
     let listen = SocketAddr::from((Ipv4Addr::LOCALHOST, 0));

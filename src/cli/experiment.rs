@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fs;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -11,8 +11,9 @@ use serde_json::{Value, json};
 use tokio::runtime::Runtime;
 
 use super::client::{Client, ServerUrl};
-use super::{CliError, runtime};
+use super::{CliError, runtime, write_file};
 use crate::clock::Ids;
+use crate::config::{parse_count, parse_whole};
 use crate::experiment::{self, Attempt, CurvePlan, Followed, Laboratory, LearnerId, Local, LocalError, Scene, plot};
 use etude_core::learning::LearnerDocument;
 
@@ -28,13 +29,13 @@ pub(super) struct Experiment {
     #[arg(long, value_name = "URL")]
     server: Option<ServerUrl>,
     /// Seed of the first learner; further runs take the next ones.
-    #[arg(long, default_value_t = 1, value_name = "N")]
+    #[arg(long, default_value_t = 1, value_parser = parse_whole::<u64>, value_name = "N")]
     seed: u64,
     /// Runs of figure 7.
-    #[arg(long, default_value_t = 5, value_name = "N")]
+    #[arg(long, default_value_t = 5, value_parser = parse_count, value_name = "N")]
     runs: usize,
     /// Trials of a run.
-    #[arg(long, default_value_t = 200, value_name = "N")]
+    #[arg(long, default_value_t = 200, value_parser = parse_count, value_name = "N")]
     trials: usize,
 }
 
@@ -55,7 +56,8 @@ enum Figure {
 
 impl Experiment {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
-        fs::create_dir_all(&self.out)?;
+        let created = fs::create_dir_all(&self.out);
+        created.map_err(|source| CliError::Write { path: self.out.clone(), source })?;
         match &self.server {
             None => self.run_in(&mut Local::new(), out),
             Some(url) => self.run_in(&mut Remote::new(url)?, out),
@@ -68,7 +70,7 @@ impl Experiment {
     {
         let documented = CurvePlan::documented();
         let learner = LearnerDocument { seed: Some(self.seed), ..documented.learner };
-        let plan = CurvePlan { learner, n_runs: self.runs.max(1), n_trials: self.trials.max(1) };
+        let plan = CurvePlan { learner, n_runs: self.runs, n_trials: self.trials };
         let is_wanted = |figure| self.figure == figure || self.figure == Figure::All;
         if is_wanted(Figure::Figure4) {
             let paths = experiment::figure_4(laboratory)?;
@@ -101,8 +103,8 @@ impl Experiment {
     }
 
     fn write(&self, name: &str, text: &str, out: &mut impl Write) -> Result<(), CliError> {
-        let path: &Path = &self.out.join(name);
-        fs::write(path, text)?;
+        let path = self.out.join(name);
+        write_file(&path, text)?;
         writeln!(out, "  wrote {}", path.display())?;
         Ok(())
     }

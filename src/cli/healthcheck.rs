@@ -6,6 +6,7 @@ use std::time::Duration;
 use clap::Args;
 
 use super::{CliError, client, runtime};
+use crate::config::parse_address;
 
 /// How long the service may take to say that it is ready.
 const TIMEOUT: Duration = Duration::from_secs(3);
@@ -13,7 +14,7 @@ const TIMEOUT: Duration = Duration::from_secs(3);
 #[derive(Args, Debug)]
 pub(super) struct Healthcheck {
     /// Address that the service listens on.
-    #[arg(long, env = "ETUDE_LISTEN", default_value = "127.0.0.1:8080")]
+    #[arg(long, env = "ETUDE_LISTEN", default_value = "127.0.0.1:8080", value_parser = parse_address, value_name = "HOST:PORT")]
     listen: SocketAddr,
 }
 

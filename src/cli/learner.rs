@@ -1,6 +1,5 @@
 //! `etude learner`.
 
-use std::fs;
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -13,8 +12,9 @@ use tokio_util::task::TaskTracker;
 
 use super::client::{Client, ServerUrl};
 use super::map::read_json;
-use super::{CliError, runtime};
+use super::{CliError, runtime, write_file};
 use crate::clock::{Clock, Ids};
+use crate::config::parse_database;
 use crate::memory::{self, Memory};
 use crate::service::{Etude, Name, PoolSettings, Replay, Settings, TimeLimits};
 use etude_core::document::{Faults, Place};
@@ -37,7 +37,7 @@ enum Command {
         /// The learner.
         name: String,
         /// SQLite database of the service.
-        #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_name = "FILE")]
+        #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_parser = parse_database, value_name = "FILE")]
         database: PathBuf,
     },
     /// Write a learner with what it has learned as JSON.
@@ -66,7 +66,7 @@ enum Command {
 #[derive(Args, Debug)]
 struct Location {
     /// SQLite database of a service, which must not run if it is written to.
-    #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_name = "FILE")]
+    #[arg(long, env = "ETUDE_DATABASE", default_value = "etude.db", value_parser = parse_database, value_name = "FILE")]
     database: PathBuf,
     /// A running service, such as `http://127.0.0.1:8080`, instead of a database.
     #[arg(long, value_name = "URL")]
@@ -96,7 +96,7 @@ impl LearnerCommand {
                 let exported = runtime.block_on(export(name, place))?;
                 let text = serde_json::to_string_pretty(&exported).map_err(io::Error::from)? + "\n";
                 match file {
-                    Some(file) => Ok(fs::write(file, text)?),
+                    Some(file) => write_file(file, &text),
                     None => Ok(out.write_all(text.as_bytes())?),
                 }
             }
@@ -176,7 +176,8 @@ fn read_exported(file: &Path) -> Result<Exported, CliError> {
     let faulty = |faults| CliError::Faults { what: file.display().to_string(), faults };
     let format = Place::root(&document).value.get("format").and_then(Value::as_str);
     if format != Some(FORMAT) {
-        return Err(faulty(Faults::one("/format", format!("expected {FORMAT:?}"))));
+        let detail = format!("{}: is no exported learner: its \"format\" is not {FORMAT:?}", file.display());
+        return Err(CliError::Faulty(detail));
     }
     let exported: Exported = serde_json::from_value(document)
         .map_err(|error| faulty(Faults::one("", format!("this is no exported learner: {error}"))))?;
@@ -209,10 +210,7 @@ async fn with_database<T>(
     work: impl AsyncFnOnce(&Etude) -> Result<T, CliError>,
 ) -> Result<T, CliError> {
     if !database.exists() {
-        let detail = format!(
-            "there is no database {}: name another one by --database, or a service by --server",
-            database.display()
-        );
+        let detail = format!("there is no database {}: name the one of the service by --database", database.display());
         return Err(CliError::Faulty(detail));
     }
     let settings = Settings {

@@ -14,6 +14,7 @@ use super::input::{Cells, Observations, Spot};
 use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags};
 use super::{CliError, render};
 use crate::clock::Clock;
+use crate::config::parse_whole;
 use crate::service::hash_of;
 use etude_core::document::{self, Faults, Place};
 use etude_core::interrupt::{Interrupted, Signal, Uninterrupted, time_until_finish};
@@ -40,10 +41,10 @@ pub(super) struct Map {
     #[arg(long, value_enum)]
     heuristic: Option<HeuristicArg>,
     /// Most nodes to expand.
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_parser = parse_whole::<u64>)]
     max_expansions: Option<u64>,
     /// Most milliseconds to search.
-    #[arg(long, value_name = "MS")]
+    #[arg(long, value_name = "MS", value_parser = parse_whole::<u64>)]
     deadline_ms: Option<u64>,
     /// Print the policy as JSON instead of a table.
     #[arg(long)]
@@ -142,7 +143,7 @@ fn as_micros(duration: Duration) -> u64 {
 /// Reads and compiles a model. There is no limit to tables but memory: nobody else is served.
 pub(super) fn read_model(path: &Path) -> Result<(Definition, Model), CliError> {
     let model_error = |error| match error {
-        CompileError::Faults(faults) => CliError::Faults { what: path.display().to_string(), faults },
+        CompileError::Faults(faults) => CliError::Faults { what: format!("the model {}", path.display()), faults },
         CompileError::Cancelled(cancelled) => cancelled.into(),
         CompileError::OutOfTime => Interrupted::OutOfTime.into(),
     };

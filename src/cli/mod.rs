@@ -16,11 +16,13 @@ mod stream;
 
 use std::error::Error;
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::{Parser, Subcommand};
+use clap::error::{ContextKind, ContextValue};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
+use crate::config::without_empty_variables;
 use crate::server::ServerError;
 use crate::telemetry::{LogConfig, start_logging};
 use etude_core::document::Faults;
@@ -67,6 +69,13 @@ enum CliError {
         #[source]
         source: io::Error,
     },
+    /// A file cannot be written.
+    #[error("cannot write {}", path.display())]
+    Write {
+        path: PathBuf,
+        #[source]
+        source: io::Error,
+    },
     /// A file is JSON, but not what was asked for.
     #[error("{what} has faults:\n{faults}")]
     Faults { what: String, faults: Faults },
@@ -89,9 +98,7 @@ enum CliError {
     #[error(transparent)]
     Server(#[from] ServerError),
     /// There is no service to be asked.
-    #[error(
-        "no service answers at {url}: {why}. Start one with `etude serve`, or name another by --server, such as http://127.0.0.1:8080"
-    )]
+    #[error("no service answers at {url}: {why}. Start one with `etude serve`, or give the address of another")]
     NoService { url: String, why: String },
     /// A service could not be asked.
     #[error("cannot ask {url}")]
@@ -132,7 +139,7 @@ enum CliError {
 /// Runs the program with the arguments of the process.
 #[must_use]
 pub fn run() -> ExitCode {
-    let Cli { log, command } = Cli::parse();
+    let Cli { log, command } = arguments();
     // Other commands have their output, which log lines would stand between.
     let default_filter = if matches!(command, Command::Serve(_)) { "info" } else { "warn" };
     // What was logged is written before an error is reported.
@@ -159,13 +166,41 @@ pub fn run() -> ExitCode {
     }
 }
 
+/// The arguments of the process. Ends it if they are wrong, or ask for help.
+fn arguments() -> Cli {
+    // What begins like a number is the value of a flag, not another flag.
+    let command =
+        without_empty_variables(Cli::command()).mut_subcommands(|command| command.allow_negative_numbers(true));
+    let read = command.clone().try_get_matches().and_then(|mut matches| Cli::from_arg_matches_mut(&mut matches));
+    read.unwrap_or_else(|error| with_variable(error, &command).exit())
+}
+
+/// The same error, which says so if what is wrong was said by an environment variable.
+fn with_variable(mut error: clap::Error, command: &clap::Command) -> clap::Error {
+    let Some(ContextValue::String(shown)) = error.get(ContextKind::InvalidArg) else { return error };
+    let flag = shown.split(' ').next().unwrap_or_default().to_owned();
+    let is_typed = |argument: std::ffi::OsString| {
+        argument.to_str().is_some_and(|argument| argument.split('=').next() == Some(&flag))
+    };
+    let all = std::iter::once(command).chain(command.get_subcommands());
+    let mut variables = all.flat_map(clap::Command::get_arguments).filter_map(|arg| {
+        let is_meant = arg.get_long().is_some_and(|long| flag.strip_prefix("--") == Some(long));
+        arg.get_env().filter(|variable| is_meant && std::env::var_os(variable).is_some())
+    });
+    if let Some(variable) = variables.next().filter(|_| !std::env::args_os().any(is_typed)) {
+        let told = format!("this is the value of the environment variable {}", variable.display());
+        error.insert(ContextKind::Suggested, ContextValue::StyledStrs(vec![told.into()]));
+    }
+    error
+}
+
 /// Writes an error and its causes to standard error, without the numbers that the system has for them.
 fn report(error: &CliError) {
-    let mut text = error.to_string();
+    let plain = |message: String| message.split(" (os error ").next().unwrap_or_default().to_owned();
+    let mut text = plain(error.to_string());
     let mut cause = error.source();
     while let Some(error) = cause {
-        let message = error.to_string();
-        let message = message.split(" (os error ").next().unwrap_or_default().to_owned();
+        let message = plain(error.to_string());
         // Some messages include their cause already.
         if !text.contains(&message) {
             text.push_str(": ");
@@ -182,6 +217,10 @@ fn note(text: &str) {
     {
         eprintln!("etude: {text}");
     }
+}
+
+fn write_file(path: &Path, text: &str) -> Result<(), CliError> {
+    std::fs::write(path, text).map_err(|source| CliError::Write { path: path.to_owned(), source })
 }
 
 /// A runtime for what is asynchronous.

@@ -18,7 +18,7 @@ pub(super) struct OptionFlags {
     #[arg(long = "weight", value_name = "ATTRIBUTE=WEIGHT", value_parser = parse_weight)]
     weights: Vec<(String, f64)>,
     /// Where the imitator starts: a state's index, or a JSON object of attribute values.
-    #[arg(long, value_name = "STATE", value_parser = parse_json)]
+    #[arg(long, value_name = "STATE", value_parser = parse_start)]
     start: Option<Value>,
 }
 
@@ -171,8 +171,14 @@ impl FromStr for Lookahead {
     }
 }
 
+fn parse_start(text: &str) -> Result<Value, String> {
+    parse_json(text).map_err(|_| {
+        r#"expected a state's index, or attribute values such as '{"x": 0, "heading": "east"}'"#.to_owned()
+    })
+}
+
 fn parse_weight(text: &str) -> Result<(String, f64), String> {
-    let (attribute, weight) = text.rsplit_once('=').ok_or("expected ATTRIBUTE=WEIGHT")?;
+    let (attribute, weight) = text.rsplit_once('=').ok_or("expected ATTRIBUTE=WEIGHT, such as x=2")?;
     let weight: f64 = weight.parse().map_err(|_| format!("expected a number, found {weight:?}"))?;
     if weight.is_finite() { Ok((attribute.to_owned(), weight)) } else { Err("expected a finite number".to_owned()) }
 }

@@ -69,7 +69,15 @@ impl Database {
     ///
     /// If its directory is not there.
     pub(super) fn new(path: &Path, locking: Locking) -> Result<Self, StoreError> {
-        let path = resolve(path).map_err(|source| StoreError::Create { path: path.to_owned(), source })?;
+        let path = resolve(path).map_err(|source| match path.parent() {
+            Some(directory) if !directory.as_os_str().is_empty() && !directory.exists() => {
+                StoreError::NoDirectory { directory: directory.to_owned() }
+            }
+            _ => StoreError::Create { path: path.to_owned(), source },
+        })?;
+        if path.is_dir() {
+            return Err(StoreError::Directory { path });
+        }
         let identity = Identity::of(&path).ok();
         let (lock, log_identity, readers) = (None, None, None);
         Ok(Self { path, locking, lock, identity, log_identity, is_looked_at: false, has_log: false, readers })

@@ -28,6 +28,18 @@ pub enum StoreError {
         #[source]
         source: io::Error,
     },
+    /// The directory of the database is missing.
+    #[error("there is no directory {}: make it with `mkdir -p {}`, or use another database", directory.display(), directory.display())]
+    NoDirectory {
+        /// The directory.
+        directory: PathBuf,
+    },
+    /// The database is a directory.
+    #[error("it is a directory: name a file in it, such as {}", path.join("etude.db").display())]
+    Directory {
+        /// The directory.
+        path: PathBuf,
+    },
     /// A process works with the database, and there may be only one.
     #[error(
         "another process works with the database and holds {}: stop it, go through it (`--server`, for commands that have it), or \

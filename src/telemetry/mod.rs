@@ -15,7 +15,7 @@ use tracing_subscriber::filter::ParseError;
 #[derive(Args, Clone, Debug)]
 pub struct LogConfig {
     /// What is logged: a level, or directives such as `etude=debug,sqlx=warn` [default: info for serve, else warn].
-    #[arg(long = "log", env = "ETUDE_LOG", value_name = "FILTER", global = true)]
+    #[arg(long = "log", env = "ETUDE_LOG", value_parser = parse_filter, value_name = "FILTER", global = true)]
     pub filter: Option<String>,
     /// How lines are written.
     #[arg(long = "log-format", env = "ETUDE_LOG_FORMAT", value_enum, default_value_t, global = true)]
@@ -30,6 +30,12 @@ pub enum LogFormat {
     Text,
     /// One JSON object a line.
     Json,
+}
+
+fn parse_filter(text: &str) -> Result<String, String> {
+    const EXPECTED: &str =
+        "expected off, error, warn, info, debug or trace, or directives with them, such as etude=debug,sqlx=warn";
+    EnvFilter::try_new(text).map(|_| text.to_owned()).map_err(|_| EXPECTED.to_owned())
 }
 
 /// Why nothing can be logged.

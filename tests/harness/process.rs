@@ -29,7 +29,7 @@ impl Process {
     /// Starts the service with variables in its environment.
     pub(crate) fn start_under(variables: &[(&str, &Path)], flags: &[&str], database: &Path) -> Self {
         let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
-        command.envs(variables.iter().copied());
+        command.env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG").envs(variables.iter().copied());
         Self::start_as(command, flags, database)
     }
 
@@ -37,7 +37,7 @@ impl Process {
     pub(crate) fn start_within(ulimit: &str, flags: &[&str], database: &Path) -> Self {
         let mut shell = Command::new("sh");
         let script = format!("ulimit {ulimit} && exec \"$0\" \"$@\"");
-        shell.args(["-c", &script, env!("CARGO_BIN_EXE_etude")]);
+        shell.args(["-c", &script, env!("CARGO_BIN_EXE_etude")]).env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG");
         Self::start_as(shell, flags, database)
     }
 
@@ -46,7 +46,6 @@ impl Process {
         if !flags.contains(&"--log-format") {
             command.args(["--log-format", "text"]);
         }
-        command.env_remove("ETUDE_LISTEN").env_remove("ETUDE_LOG");
         let mut child = command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
         let watched = Watchdog::watch(child.id());
         let mut lines = BufReader::new(child.stderr.take().unwrap()).lines().map_while(Result::ok);

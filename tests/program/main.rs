@@ -5,6 +5,7 @@
 #[path = "../harness/mod.rs"]
 mod harness;
 
+mod command_lines;
 mod commands;
 mod disk;
 mod inputs;

@@ -86,7 +86,11 @@ impl Observations {
                     Value::Array(items) => (items, "", Members::new()),
                     Value::Object(mut request) => {
                         let Some(Value::Array(items)) = request.remove("demonstration") else {
-                            let detail = "/demonstration: expected an array of observations";
+                            let detail = if request.contains_key("dynamics") {
+                                "this is a model, and no demonstration"
+                            } else {
+                                "/demonstration: expected an array of observations"
+                            };
                             return Err(CliError::Faulty(format!("{name}: {detail}")));
                         };
                         (items, "/demonstration", request)

@@ -28,6 +28,7 @@ use super::input::{Cells, Observation, Observations};
 use super::map::{read_json, read_model};
 use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags, faulty};
 use super::{CliError, client as http, runtime};
+use crate::config::parse_whole;
 use crate::stream::frames::ServerFrame;
 use etude_core::attribute::AttributeDocument;
 use etude_core::document::{Faults, Place};
@@ -51,7 +52,7 @@ pub(super) struct Stream {
     #[arg(long, value_name = "URL")]
     server: Option<ServerUrl>,
     /// How often in a row a lost connection to the service is tried anew before it is given up.
-    #[arg(long, value_name = "N", default_value_t = 10)]
+    #[arg(long, value_name = "N", default_value_t = 10, value_parser = parse_whole::<u32>)]
     retries: u32,
     /// How many observations past the current one a step may wait for; none: commit only what is proven [default: 8].
     #[arg(long, value_name = "N|none")]
@@ -85,6 +86,12 @@ impl Stream {
     }
 
     fn run_here(&self, printer: &mut Printer<'_, impl Write>) -> Result<(), CliError> {
+        let is_name = !self.model.exists() && self.model.components().count() == 1 && self.model.extension().is_none();
+        if is_name {
+            let detail =
+                "there is no such file; if it is the name of a model at a service, say where that is by --server";
+            return Err(CliError::Faulty(format!("--model {}: {detail}", self.model.display())));
+        }
         let (_, model) = read_model(&self.model)?;
         if model.is_lazy() {
             let detail = "this world has so many states that it is searched lazily, which needs the whole demonstration: use etude map";
