@@ -224,3 +224,31 @@ async fn an_integer_that_no_number_holds_exactly_is_told_to_be_a_category() {
     assert_eq!((&policy["steps"][0]["state_index"], &policy["cost"]["total"]), (&json!(1), &json!(0.0)), "{policy}");
     service.stop().await;
 }
+
+#[tokio::test]
+async fn a_fault_at_every_observation_is_told_once_with_how_often() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/line", &line()).await;
+    let seen: Vec<Value> = (0..92)
+        .map(|n| if n < 2 { json!({"x": n}) } else { json!({"x": n.to_string(), "gold": n, "door": n}) })
+        .collect();
+    let told = json!([
+        {"pointer": "/demonstration/2/gold", "detail": "unknown attribute \"gold\"; the model has \"x\", \"door\" (and in 89 more observations)"},
+        {"pointer": "/demonstration/2/x", "detail": "expected a number, found \"2\" (and in 89 more observations)"},
+        {"pointer": "/demonstration/91", "detail": "expected 2 values, one per attribute, found 1"},
+    ]);
+    let mut seen_with_more = seen.clone();
+    seen_with_more[91] = json!([1]);
+    let (status, problem) =
+        service.post("/v1/policies", &json!({"model": "line", "demonstration": seen_with_more})).await;
+    let told = told.to_string().replace("89 more", "88 more");
+    assert_eq!((status, problem["errors"].to_string()), (422, told), "{problem}");
+    let batch = json!({"model": "line", "items": [{"demonstration": [{"x": 1}]}, {"demonstration": seen}]});
+    let (_, answers) = service.post("/v1/policies:batch", &batch).await;
+    let errors = &answers["items"][1]["problem"]["errors"];
+    assert_eq!(pointers(errors), ["/items/1/demonstration/2/gold", "/items/1/demonstration/2/x"], "{answers}");
+    let frames = [json!({"type": "open", "model": "line"}), json!({"type": "observe", "seq": 0, "states": seen})];
+    let frames = stream(&service, &frames).await;
+    assert_eq!(pointers(&frames[2]["problem"]["errors"]), ["/states/2/gold", "/states/2/x"], "{frames:?}");
+    service.stop().await;
+}

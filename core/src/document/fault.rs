@@ -51,6 +51,20 @@ impl Faults {
         }
     }
 
+    /// Lists a fault, if there is room for it.
+    pub(super) fn list(&mut self, fault: Fault) {
+        if self.listed.len() < Self::MAX_LISTED {
+            self.listed.push(fault);
+        } else {
+            self.n_unlisted += 1;
+        }
+    }
+
+    /// The faults that are listed.
+    pub(super) fn into_listed(self) -> Vec<Fault> {
+        self.listed
+    }
+
     /// Notes that something else was `expected` at `path` than what was `found`.
     pub(crate) fn note_mismatch(&mut self, path: &Path<'_>, expected: &str, found: impl fmt::Display) {
         self.note_at(path, format!("expected {expected}, found {found}"));

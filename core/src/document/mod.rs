@@ -18,6 +18,7 @@ mod members;
 mod parsing;
 mod path;
 mod place;
+mod repeated;
 mod shown;
 mod size;
 
@@ -28,6 +29,7 @@ pub use parsing::{ParseError, parse};
 pub use path::Path;
 pub use place::{Object, Place, Range};
 pub(crate) use place::{index_of, whole};
+pub use repeated::Repeated;
 pub use shown::Quoted;
 pub(crate) use shown::{Excerpt, list_known};
 pub use size::{parsed_bytes, size_bytes};

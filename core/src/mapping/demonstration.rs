@@ -5,7 +5,7 @@ mod well_formed;
 pub use well_formed::WellFormed;
 
 use crate::attribute::{BuildError, Scalar, Schema, Value, check_count};
-use crate::document::{Faults, Place};
+use crate::document::{Faults, Place, Repeated};
 
 /// The observed states `o_0 .. o_n` of a demonstration, at least one. Nothing is known of the demonstrator's actions.
 #[derive(Clone, Debug, PartialEq)]
@@ -65,12 +65,21 @@ impl Demonstration {
             faults.note(place, detail);
             return None;
         }
-        let n_before = faults.count();
         let mut values = Vec::with_capacity(items.len() * schema.len());
-        for (n, item) in items.iter().enumerate() {
-            values.extend(schema.read_observation(&place.item(n, item), faults).unwrap_or_default());
-        }
-        (faults.count() == n_before).then_some(Self { values, n_attributes: schema.len() })
+        let items = items.iter().enumerate().map(|(n, item)| place.item(n, item));
+        read_each(schema, items, faults, |observation| values.extend(observation))?;
+        Some(Self { values, n_attributes: schema.len() })
+    }
+
+    /// Reads observations, each of shape `[n_attributes]`. What is wrong with several of them in the same way is told once.
+    pub fn read_observations<'v, 'p>(
+        schema: &Schema,
+        places: impl ExactSizeIterator<Item = Place<'v, 'p>>,
+        faults: &mut Faults,
+    ) -> Option<Vec<Vec<Option<Value>>>> {
+        let mut observations = Vec::with_capacity(places.len());
+        read_each(schema, places, faults, |observation| observations.push(observation))?;
+        Some(observations)
     }
 
     /// Reads observations that were read without faults before: arrays of them, one after the other, `n_observations` in all. `None` if
@@ -130,4 +139,22 @@ impl Demonstration {
     pub fn observation(&self, index: usize) -> &[Option<Value>] {
         &self.values[index * self.n_attributes..(index + 1) * self.n_attributes]
     }
+}
+
+/// Reads observations one by one. Those with faults, which are noted, are not to be used.
+fn read_each<'v, 'p>(
+    schema: &Schema,
+    places: impl Iterator<Item = Place<'v, 'p>>,
+    faults: &mut Faults,
+    mut take: impl FnMut(Vec<Option<Value>>),
+) -> Option<()> {
+    let n_before = faults.count();
+    let mut repeated = Repeated::default();
+    for place in places {
+        let mut own = Faults::default();
+        take(schema.read_observation(&place, &mut own).unwrap_or_default());
+        repeated.take_in(own, &place.path);
+    }
+    repeated.tell("observations", faults);
+    (faults.count() == n_before).then_some(())
 }

@@ -174,12 +174,9 @@ impl Session {
             return Err(faults.into());
         }
         let schema = self.mapper.model().schema();
-        let read = new.iter().enumerate().map(|(n, state)| {
-            let place = states.item(n_known + n, state);
-            schema.read_observation(&place, &mut faults)
-        });
-        let observations: Vec<_> = read.collect();
-        let observations = faults.check(observations.into_iter().collect::<Option<Vec<_>>>())?;
+        let places = new.iter().enumerate().map(|(n, state)| states.item(n_known + n, state));
+        let read = Demonstration::read_observations(schema, places, &mut faults);
+        let observations = faults.check(read)?;
         #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
         let n_states = new.len() as u32;
         let appending = etude.store.append_observations(NewObservations {
