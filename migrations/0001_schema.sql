@@ -52,6 +52,20 @@ CREATE TABLE policies (
     created_at_ms  INTEGER NOT NULL
 ) STRICT;
 
+-- Keys that clients gave their requests, with what each request has made: sent again, it is answered alike. Kept for a day.
+CREATE TABLE request_keys (
+    sequence       INTEGER NOT NULL PRIMARY KEY,
+    scope          TEXT    NOT NULL, -- what is asked for: `policies`, or `trials of` a learner, by its sequence number
+    key            TEXT    NOT NULL,
+    body_hash      TEXT    NOT NULL, -- SHA-256 of the request's body
+    made_id        TEXT    NOT NULL, -- of the policy or the trial
+    created_at_ms  INTEGER NOT NULL,
+    UNIQUE (scope, key)
+) STRICT;
+
+CREATE INDEX request_keys_by_made ON request_keys (made_id);
+CREATE INDEX request_keys_by_age ON request_keys (created_at_ms);
+
 -- Policies that a finite lookahead decided and that wait to be refined to the global optimum.
 CREATE TABLE refinements (
     policy_id   TEXT    NOT NULL PRIMARY KEY,

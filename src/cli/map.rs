@@ -90,7 +90,7 @@ impl Map {
         let stamp = Stamp {
             id: None,
             model: document["model"].as_str().unwrap_or_default().to_owned(),
-            model_hash: hash_of(&definition.text()),
+            model_hash: hash_of(definition.text()),
             lookahead: asked.lookahead.map(NonZeroU32::get),
             elapsed_us: as_micros(clock.elapsed(started)),
             ..Stamp::default()

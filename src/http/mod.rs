@@ -24,6 +24,7 @@ mod path;
 mod places;
 mod policies;
 mod problem;
+mod repeated;
 mod request_id;
 mod requests;
 mod stalled;

@@ -13,6 +13,7 @@ use super::body::{NoForm, read_json};
 use super::paging::{List, Paging, after_sequence};
 use super::path::PathId;
 use super::problem::{BodyProblems, DeletionProblems, Problem};
+use super::repeated::Key;
 use super::request_id::RequestId;
 use super::requests::{BatchRequest, PolicyRequest};
 use super::{SharedContext, answer};
@@ -22,6 +23,7 @@ use etude_core::mapping::{Policy, PolicySummary};
 /// Follow a demonstration: the policy whose effects come closest to it, stored unless the request says otherwise.
 #[utoipa::path(
     post, path = "/v1/policies", tag = "policies",
+    params(("idempotency-key" = Option<String>, Header, description = "1 to 255 visible ASCII characters, such as a UUID: the same key with the same body gives the same answer for a day, however often it is sent. Requests that fail are not remembered, nor those with `store` false")),
     request_body = PolicyRequest,
     responses(
         (status = 200, description = "The policy, of which nothing is kept as `store` is false: it has no `id`, and is not refined", body = Policy),
@@ -29,17 +31,21 @@ use etude_core::mapping::{Policy, PolicySummary};
             headers(("location" = String, description = "Where it can be read again"))),
         BodyProblems,
         (status = 404, description = "`unknown-model`, `unknown-learner`", body = Problem, content_type = "application/problem+json"),
-        (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`; `idempotency-key-reused`: the key came with another body before", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
 pub(super) async fn make_policy(
     State(context): State<SharedContext>,
     caller: Caller,
+    Key(key): Key,
     request: Request,
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
-    let made = context.etude.make_policy(body, caller).await?;
+    let made = match key {
+        None => context.etude.make_policy(body, caller).await?,
+        Some(key) => Box::pin(context.etude.make_policy_once(&key, body, caller)).await?,
+    };
     let status = if made.id.is_some() { StatusCode::CREATED } else { StatusCode::OK };
     let mut response = answer::counted(json_text(status, made.policy), made.held);
     let location = made.id.map(|id| HeaderValue::try_from(format!("/v1/policies/{id}")));

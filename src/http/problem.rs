@@ -36,6 +36,7 @@ pub(super) enum ProblemKind {
     SlowBody,
     Conflict,
     InUse,
+    KeyReused,
     AlreadyRewarded,
     TrialFailed,
     TooLarge,
@@ -74,6 +75,9 @@ impl ProblemKind {
             }
             Self::SlowBody => ("slow-body", "The body took too long", StatusCode::REQUEST_TIMEOUT),
             Self::Conflict => ("conflict", "The name is taken", StatusCode::CONFLICT),
+            Self::KeyReused => {
+                ("idempotency-key-reused", "The key is another request's", StatusCode::UNPROCESSABLE_ENTITY)
+            }
             Self::InUse => ("in-use", "Something else needs it", StatusCode::CONFLICT),
             Self::AlreadyRewarded => ("already-rewarded", "The trial has a reward", StatusCode::CONFLICT),
             Self::TrialFailed => ("trial-failed", "The trial has failed", StatusCode::CONFLICT),
@@ -316,6 +320,7 @@ impl From<ServiceError> for Problem {
             }
             ServiceError::BatchFull => Self::new(ProblemKind::BatchFull, detail),
             ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),
+            ServiceError::KeyReused { .. } => Self::new(ProblemKind::KeyReused, detail),
             ServiceError::InUse { .. } => Self::new(ProblemKind::InUse, detail),
             ServiceError::UnknownVersion { .. } => Self::new(ProblemKind::UnknownVersion, detail),
             ServiceError::AlreadyRewarded { .. } => Self::new(ProblemKind::AlreadyRewarded, detail),

@@ -15,6 +15,7 @@ use super::body::{NoForm, read_json, read_small_json};
 use super::paging::{List, Paging};
 use super::path::{PathId, PathName};
 use super::problem::{BodyProblems, DeletionProblems, Problem};
+use super::repeated::Key;
 use super::requests::TrialRequest;
 use super::{SharedContext, answer};
 use crate::service::TrialStatus;
@@ -104,14 +105,17 @@ pub(super) struct FailureBody {
 /// Draw weights from a learner, and map a demonstration with them.
 #[utoipa::path(
     post, path = "/v1/learners/{learner}/trials", tag = "trials",
-    params(("learner" = String, Path, description = "The learner's name")),
+    params(
+        ("learner" = String, Path, description = "The learner's name"),
+        ("idempotency-key" = Option<String>, Header, description = "1 to 255 visible ASCII characters, such as a UUID: the same key with the same body gives the same answer for a day, however often it is sent. Requests that fail are not remembered"),
+    ),
     request_body = TrialRequest,
     responses(
         (status = 201, description = "The trial, with its policy", body = TrialBody,
             headers(("location" = String, description = "Where it can be read again"))),
         BodyProblems,
         (status = 404, description = "`unknown-learner`, `unknown-model`", body = Problem, content_type = "application/problem+json"),
-        (status = 422, description = "`invalid`; also if the model lacks an attribute of the learner", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`; also if the model lacks an attribute of the learner; `idempotency-key-reused`: the key came with another body before", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
@@ -119,10 +123,14 @@ pub(super) async fn make_trial(
     State(context): State<SharedContext>,
     PathName(name): PathName,
     caller: Caller,
+    Key(key): Key,
     request: Request,
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
-    let mut made = context.etude.make_trial(&name, body, caller).await?;
+    let mut made = match key {
+        None => context.etude.make_trial(&name, body, caller).await?,
+        Some(key) => Box::pin(context.etude.make_trial_once(&name, &key, body, caller)).await?,
+    };
     let held = made.held.take();
     let made = TrialBody::of(made);
     let location = HeaderValue::from_str(&format!("/v1/trials/{}", made.id));

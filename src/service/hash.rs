@@ -2,9 +2,9 @@
 
 use sha2::{Digest, Sha256};
 
-/// SHA-256 of a canonical text, in hexadecimal: equal for equal content, however that was written.
+/// SHA-256 of a text, in hexadecimal: of a canonical one, equal for equal content, however that was written.
 #[must_use]
-pub fn hash_of(canonical: &str) -> String {
+pub fn hash_of(canonical: impl AsRef<[u8]>) -> String {
     hex(Sha256::digest(canonical))
 }
 

@@ -13,6 +13,7 @@ mod cache;
 mod caller;
 mod compiler;
 mod definitions;
+mod error;
 mod hash;
 mod learner_task;
 mod learners;
@@ -25,6 +26,7 @@ mod policies;
 mod pool;
 mod refined;
 mod refiner;
+mod repeats;
 mod requests;
 mod search;
 mod sessions;
@@ -39,6 +41,7 @@ use jiff::{Timestamp, Unit};
 pub use batch::{MAX_BATCH_ITEMS, MadePolicies};
 pub use caller::{Caller, Client};
 pub use definitions::{DefinitionReader, ModelText, OpenText};
+pub use error::ServiceError;
 pub use hash::hash_of;
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, Registered};
@@ -47,6 +50,7 @@ pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
 pub(crate) use pool::Places;
 pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
+pub use repeats::{IdempotencyKey, InvalidIdempotencyKey};
 pub use sessions::{
     CommittedSteps, Ended, Observation, Received, Resumed, RewardState, Session, SessionError, SessionPolicy,
 };
@@ -55,18 +59,17 @@ use tokio_util::task::TaskTracker;
 pub use trials::TrialAnswer;
 
 use crate::clock::{Clock, Ids};
-use crate::memory::{Memory, NoRoom};
+use crate::memory::Memory;
 pub(crate) use crate::store::PIECE_BYTES;
 use crate::store::Store;
 pub use crate::store::{AcceptedReward, ModelSummary, Page, SessionRecord, StoreError, TrialStatus, Unavailable};
 use cache::ModelNames;
 use compiler::Compiler;
-use etude_core::document::{Faults, ParseError, Quoted};
-use etude_core::mapping::WriteError;
 use etude_core::model::Limits;
 use models::Uploads;
 use owners::Owners;
 use refiner::Refiner;
+use repeats::Turns;
 
 /// How the service is set up.
 #[derive(Clone, Debug)]
@@ -129,133 +132,6 @@ impl TimeLimits {
     };
 }
 
-/// Why the service could not do as asked.
-#[derive(Debug, thiserror::Error)]
-pub enum ServiceError {
-    /// The body is not JSON.
-    #[error(transparent)]
-    Parse(#[from] ParseError),
-    /// The body is JSON, but not what was asked for.
-    #[error("{0}")]
-    Faults(#[from] Faults),
-    /// What must be kept of the body while it is read is too large.
-    #[error("{0}")]
-    TooLarge(String),
-    /// The body could not be read to its end.
-    #[error("the body could not be read")]
-    Body(#[source] std::io::Error),
-    /// There is nothing of this kind with this name or id.
-    #[error("there is no {} {}", kind.name(), Quoted(name))]
-    Unknown {
-        /// What was looked for.
-        kind: Kind,
-        /// By which name or id.
-        name: String,
-        /// Where the request's body names it, if it does.
-        pointer: Option<&'static str>,
-    },
-    /// The name is taken by something else.
-    #[error("{kind} {name:?} exists with other content (hash {existing_hash}); delete it first or use another name")]
-    Conflict {
-        /// What it is the name of.
-        kind: &'static str,
-        /// The name.
-        name: String,
-        /// The hash of what is there.
-        existing_hash: String,
-    },
-    /// Something else needs what was to be deleted.
-    #[error("{} {} cannot be deleted: {because}", kind.name(), Quoted(id))]
-    InUse {
-        /// What it is.
-        kind: Kind,
-        /// Its id.
-        id: String,
-        /// What needs it.
-        because: &'static str,
-    },
-    /// The learner never had this version of its weights.
-    #[error("the weights of learner {name:?} have no version {version}")]
-    UnknownVersion {
-        /// The learner.
-        name: String,
-        /// What was asked for.
-        version: u64,
-    },
-    /// The trial has a reward, and that is not changed.
-    #[error("trial {trial} has earned {existing} already")]
-    AlreadyRewarded {
-        /// The trial.
-        trial: String,
-        /// What it has earned.
-        existing: f64,
-    },
-    /// The trial has failed, and takes neither a reward nor another reason.
-    #[error("trial {trial} has failed")]
-    TrialFailed {
-        /// The trial.
-        trial: String,
-    },
-    /// The searches cannot keep up, or the service is shutting down.
-    #[error(transparent)]
-    Pool(#[from] PoolError),
-    /// The answer to a batch has no room for this item.
-    #[error("the answer to this batch is full; send this item again with the next one")]
-    BatchFull,
-    /// There is no memory for it now, or there never is.
-    #[error(transparent)]
-    NoRoom(#[from] NoRoom),
-    /// The deadline is over, and the model is still being compiled.
-    #[error("model {name:?} is still being compiled; try again shortly")]
-    Compiling {
-        /// The model.
-        name: String,
-    },
-    /// The store failed.
-    #[error(transparent)]
-    Store(StoreError),
-    /// What the store holds cannot be read as what was stored.
-    #[error("table {table} holds an invalid {column} in the row of {row:?}")]
-    Unreadable {
-        /// Where.
-        table: &'static str,
-        /// In which column.
-        column: &'static str,
-        /// In which row, by its name or id.
-        row: String,
-        /// What is wrong with it.
-        #[source]
-        source: Box<dyn std::error::Error + Send + Sync>,
-    },
-    /// What was made could not be written as JSON: a defect.
-    #[error("an answer could not be written")]
-    Write(#[source] serde_json::Error),
-    /// A policy could not be written: a defect.
-    #[error("a policy could not be written")]
-    WritePolicy(#[from] WriteError),
-}
-
-impl ServiceError {
-    /// A row, known by its name or id, whose content cannot be read.
-    fn unreadable(
-        table: &'static str,
-        column: &'static str,
-        row: impl Into<String>,
-        source: impl Into<Box<dyn std::error::Error + Send + Sync>>,
-    ) -> Self {
-        Self::Unreadable { table, column, row: row.into(), source: source.into() }
-    }
-}
-
-impl From<StoreError> for ServiceError {
-    fn from(error: StoreError) -> Self {
-        match error {
-            StoreError::NoRoom(no_room) => Self::NoRoom(no_room),
-            error => Self::Store(error),
-        }
-    }
-}
-
 /// The application.
 #[derive(Debug)]
 pub struct Etude {
@@ -268,6 +144,7 @@ pub struct Etude {
     model_names: ModelNames,
     refiner: Refiner,
     owners: Owners,
+    turns: Turns,
     time_limits: TimeLimits,
     session_idle_timeout: Duration,
     n_search_threads: usize,
@@ -312,6 +189,7 @@ impl Etude {
             model_names: ModelNames::new(),
             refiner: Refiner::default(),
             owners: Owners::default(),
+            turns: Turns::default(),
             session_idle_timeout: settings.session_idle_timeout,
             n_search_threads: settings.pool.n_threads.max(1),
             limits: settings.limits,

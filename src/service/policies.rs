@@ -4,11 +4,12 @@ use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
 
 use super::learners::LearnerState;
+use super::repeats::{IdempotencyKey, Repeat};
 use super::requests::{Named, SentRequest, base_weights, check_request};
 use super::search::{Extent, MAX_INLINE_BYTES, Means, Searched, follow, is_quick, max_quick_observations};
-use super::{Caller, Etude, Kind, ServiceError};
+use super::{Caller, Etude, Kind, PoolError, ServiceError};
 use crate::memory::Held;
-use crate::store::{Deletion, Needed, Page};
+use crate::store::{Deletion, KeyTaken, Links, Needed, NewRequestKey, Page};
 use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Object, Path};
 use etude_core::interrupt::{Cancelled, Interrupt};
@@ -33,7 +34,41 @@ impl Etude {
     ///
     /// If the body is no request, names no model, or the service cannot do it now.
     pub async fn make_policy(&self, body: impl Into<Bytes>, caller: Caller) -> Result<MadePolicy, ServiceError> {
+        self.make_keyed_policy(None, body.into(), caller).await?.map_err(|KeyTaken| PoolError::Busy.into())
+    }
+
+    /// As [`Self::make_policy`], once: the same body with the same key again gives the same policy for a day, as it was made, if it was
+    /// stored.
+    ///
+    /// # Errors
+    ///
+    /// Likewise, and [`ServiceError::KeyReused`] if another body came with the key.
+    pub async fn make_policy_once(
+        &self,
+        key: &IdempotencyKey,
+        body: impl Into<Bytes>,
+        caller: Caller,
+    ) -> Result<MadePolicy, ServiceError> {
         let body = body.into();
+        let id = match self.repeat("policies".to_owned(), key, &body, caller).await? {
+            Repeat::First(first) => match self.make_keyed_policy(Some(&first.key), body, caller).await? {
+                Ok(made) => return Ok(made),
+                Err(KeyTaken) => self.made_meanwhile(&first.key).await?,
+            },
+            Repeat::Answered(id) => id,
+        };
+        let made = self.store.policy_within(&id, Links::AsMade, &self.memory).await?;
+        let (policy, held) = made.ok_or_else(|| unknown(&id))?;
+        Ok(MadePolicy { id: Some(id), policy, held })
+    }
+
+    /// Makes a policy, and stores it with the key of its request, if that has one.
+    async fn make_keyed_policy(
+        &self,
+        key: Option<&NewRequestKey>,
+        body: Bytes,
+        caller: Caller,
+    ) -> Result<Result<MadePolicy, KeyTaken>, ServiceError> {
         let id = self.ids.next().to_string();
         let stamp = Stamp { id: Some(id.clone()), ..Stamp::default() };
         let weights = |model: &Model, learner: Option<&LearnerState>, faults: &mut Faults| {
@@ -50,13 +85,21 @@ impl Etude {
         // The next request can be read to where this one stands, while the disk writes.
         drop(body);
         let Searched { policy, row, refinement, held } = searched;
-        let Some(row) = row else { return Ok(MadePolicy { id: None, policy, held }) };
+        let Some(row) = row else { return Ok(Ok(MadePolicy { id: None, policy, held })) };
         let is_refined = refinement.is_some();
-        self.store.add_policies(vec![row.at(caller.now)], refinement.into_iter().collect()).await?;
+        let row = row.at(caller.now);
+        match key {
+            None => self.store.add_policies(vec![row], refinement.into_iter().collect()).await?,
+            Some(key) => {
+                if let Err(taken) = self.store.add_keyed_policy(key.clone(), row, refinement).await? {
+                    return Ok(Err(taken));
+                }
+            }
+        }
         if is_refined {
             self.refiner.wake();
         }
-        Ok(MadePolicy { id: Some(id), policy, held })
+        Ok(Ok(MadePolicy { id: Some(id), policy, held }))
     }
 
     /// Searches for the policy that a request asks for, and stamps it. `weights` are those from which the request starts, and what is to
@@ -98,7 +141,7 @@ impl Etude {
     ///
     /// If there is none, or no memory for it.
     pub async fn policy(&self, id: &str) -> Result<(String, Option<Held>), ServiceError> {
-        self.store.policy_within(id, &self.memory).await?.ok_or_else(|| unknown(id))
+        self.store.policy_within(id, Links::Now, &self.memory).await?.ok_or_else(|| unknown(id))
     }
 
     /// Deletes the policy with this id. What links it and others forgets it; if it waits to be refined, it does not any more.
@@ -181,6 +224,7 @@ mod tests {
     use crate::clock::Clock;
     use crate::memory::{Memory, SMALL_BYTES};
     use crate::service::{Client, ModelText, Name, Settings};
+    use crate::store::RequestKey;
     use etude_core::interrupt::Uninterrupted;
     use etude_core::mapping::Mapper;
     use etude_core::model::{Definition, Format, Limits};
@@ -224,6 +268,25 @@ mod tests {
         assert!(made.policy.len() > 64 << 10 && free - etude.memory.free() >= made.policy.len() as u64);
         drop(made);
         assert_eq!(etude.memory.free(), free);
+    }
+
+    /// The client of the first one went away, but what it has asked for was on its way to the disk.
+    #[tokio::test]
+    async fn a_policy_whose_key_was_taken_while_it_was_searched_for_is_not_stored() {
+        let directory = tempfile::tempdir().unwrap();
+        let etude = etude(directory.path(), &line(3)).await;
+        let body = Bytes::from(json!({"model": "m", "demonstration": [{"end": 1}]}).to_string());
+        let key = IdempotencyKey::new(b"k").unwrap();
+        let first = etude.make_policy_once(&key, body.clone(), caller()).await.unwrap();
+        let Repeat::First(other) = etude.repeat("other".to_owned(), &key, &body, caller()).await.unwrap() else {
+            panic!("it is of another scope")
+        };
+        let taken =
+            NewRequestKey { key: RequestKey { scope: "policies".to_owned(), ..other.key.key.clone() }, ..other.key };
+        let late = etude.make_keyed_policy(Some(&taken), body, caller()).await.unwrap();
+        assert_eq!(late.unwrap_err(), KeyTaken);
+        assert_eq!(etude.policies(0, 10).await.unwrap().items.len(), 1);
+        assert_eq!(Some(etude.made_meanwhile(&taken).await.unwrap()), first.id);
     }
 
     #[test]

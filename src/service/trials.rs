@@ -8,12 +8,14 @@ use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
 
 use super::learners::{LearnerState, unknown};
+use super::repeats::{IdempotencyKey, Repeat};
 use super::requests::check_request;
 use super::search::{Searched, write};
 use super::{Caller, Etude, Kind, Name, PoolError, ServiceError, as_stored};
 use crate::memory::Held;
 use crate::store::{
-    Deletion, FailureAnswer, Needed, NewReward, NewTrial, Opened, Page, RewardAnswer, TrialRecord, TrialStatus,
+    Deletion, FailureAnswer, KeyTaken, Links, Needed, NewRequestKey, NewReward, NewTrial, Opened, Page, RewardAnswer,
+    TrialRecord, TrialStatus,
 };
 use etude_core::attribute::{Schema, Weights};
 use etude_core::document::{Faults, Object, Path, Place, Range};
@@ -62,7 +64,44 @@ impl Etude {
         body: impl Into<Bytes>,
         caller: Caller,
     ) -> Result<TrialAnswer, ServiceError> {
+        self.make_keyed_trial(name, None, body.into(), caller).await?.map_err(|KeyTaken| PoolError::Busy.into())
+    }
+
+    /// As [`Self::make_trial`], once: the same body with the same key again gives the same trial for a day, as it was drawn.
+    ///
+    /// # Errors
+    ///
+    /// Likewise, and [`ServiceError::KeyReused`] if another body came with the key.
+    pub async fn make_trial_once(
+        &self,
+        name: &Name,
+        key: &IdempotencyKey,
+        body: impl Into<Bytes>,
+        caller: Caller,
+    ) -> Result<TrialAnswer, ServiceError> {
         let body = body.into();
+        let scope = format!("trials of {}", self.learner_row(name).await?.sequence);
+        let id = match self.repeat(scope, key, &body, caller).await? {
+            Repeat::First(first) => match self.make_keyed_trial(name, Some(&first.key), body, caller).await? {
+                Ok(made) => return Ok(made),
+                Err(KeyTaken) => self.made_meanwhile(&first.key).await?,
+            },
+            Repeat::Answered(id) => id,
+        };
+        let trial = self.store.trial(&id).await?.ok_or_else(|| unknown_trial(&id))?;
+        let drawn = TrialRecord { failed: None, reward: None, learned_version: None, ..trial };
+        let answer = self.with_policy(drawn, Links::AsMade, caller.now).await?;
+        Ok(TrialAnswer { status: TrialStatus::Active, ..answer })
+    }
+
+    /// Draws a trial, and stores it with the key of its request, if that has one.
+    async fn make_keyed_trial(
+        &self,
+        name: &Name,
+        key: Option<&NewRequestKey>,
+        body: Bytes,
+        caller: Caller,
+    ) -> Result<Result<TrialAnswer, KeyTaken>, ServiceError> {
         let LearnerState { sequence, name, learner, weights } = self.learner_state(name.as_str(), None).await?;
         let numbers = self.store.trial_numbers(sequence).await?;
         let id = self.ids.next().to_string();
@@ -114,6 +153,7 @@ impl Etude {
             policy_id: policy_id.clone(),
             policy: row.map(|row| row.at(now)),
             refinement,
+            key: key.cloned(),
             created_at: now,
             lease_expires_at,
         };
@@ -122,6 +162,7 @@ impl Etude {
             Opened::Yes => {}
             Opened::NoLearner => return Err(unknown(&name, None)),
             Opened::NumberTaken => return Err(PoolError::Busy.into()),
+            Opened::KeyTaken => return Ok(Err(KeyTaken)),
         }
         if is_refined {
             self.refiner.wake();
@@ -141,7 +182,7 @@ impl Etude {
             learned_version: None,
         };
         let policy = Some(read_policy(policy, &trial.policy_id)?);
-        Ok(TrialAnswer { status: TrialStatus::Active, policy, held, ..TrialAnswer::of(trial, now)? })
+        Ok(Ok(TrialAnswer { status: TrialStatus::Active, policy, held, ..TrialAnswer::of(trial, now)? }))
     }
 
     /// Draws a trial for a policy that is still in the making. The caller stores it.
@@ -167,6 +208,7 @@ impl Etude {
             policy_id: self.ids.next().to_string(),
             policy: None,
             refinement: None,
+            key: None,
             created_at: now,
             lease_expires_at: now.checked_add(Duration::from_secs(learner.lease_s())).unwrap_or(Timestamp::MAX),
         };
@@ -181,7 +223,12 @@ impl Etude {
     /// If there is none.
     pub async fn trial(&self, id: &str, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
         let trial = self.store.trial(id).await?.ok_or_else(|| unknown_trial(id))?;
-        let (policy, held) = self.store.policy_within(&trial.policy_id, &self.memory).await?.unzip();
+        self.with_policy(trial, Links::Now, now).await
+    }
+
+    /// The answer with the policy, which has these links.
+    async fn with_policy(&self, trial: TrialRecord, links: Links, now: Timestamp) -> Result<TrialAnswer, ServiceError> {
+        let (policy, held) = self.store.policy_within(&trial.policy_id, links, &self.memory).await?.unzip();
         let policy = policy.map(|policy| read_policy(policy, &trial.policy_id)).transpose()?;
         // Once more in the answer.
         let mut held = held.flatten();

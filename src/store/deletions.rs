@@ -2,8 +2,8 @@
 //!
 //! | deleted | what goes with it | what loses its link | what keeps it |
 //! |---|---|---|---|
-//! | policy | its refinement, if that waits | the policy that it refines, the one that refines it, its session | a trial that it is of |
-//! | trial | | the session that explores it | its reward |
+//! | policy | its refinement, if that waits, and the key of its request | the policy that it refines, the one that refines it, its session | a trial that it is of |
+//! | trial | the key of its request | the session that explores it | its reward |
 //! | session | its observations, and the refinement of its policy that waits for them | | |
 //!
 //! A trial's policy stays, and so do the policy and the trial of a session.
@@ -11,7 +11,7 @@
 use sqlx::Row;
 
 use super::writer::{Verb, Writing};
-use super::{Deletion, Store, StoreError, policies};
+use super::{Deletion, Store, StoreError, policies, request_keys};
 
 /// Something else needs what was to be deleted: it was left alone.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -80,6 +80,7 @@ impl Verb for DeletePolicy {
         if let Some(refined_by) = row.try_get::<Option<String>, _>("refined_by")? {
             policies::forget_refined(connection, &refined_by, id).await?;
         }
+        request_keys::forget(connection, id).await?;
         for query in [
             "DELETE FROM refinements WHERE policy_id = $1",
             "UPDATE sessions SET policy_id = NULL WHERE policy_id = $1",
@@ -104,6 +105,7 @@ impl Verb for DeleteTrial {
             let is_there = query.bind(id).fetch_one(connection).await?;
             return Ok(if is_there { Err(Needed) } else { Ok(Deletion::Unknown) });
         };
+        request_keys::forget(connection, id).await?;
         let noted = sqlx::query("UPDATE learners SET deleted_number = MAX(deleted_number, $2) WHERE sequence = $1");
         noted.bind(learner).bind(number).execute(&mut *connection).await?;
         let unlinked = sqlx::query("UPDATE sessions SET trial_id = NULL WHERE trial_id = $1");

@@ -23,6 +23,7 @@ mod observations;
 mod page;
 mod policies;
 mod refinements;
+mod request_keys;
 mod schema;
 mod sessions;
 mod trials;
@@ -45,8 +46,9 @@ pub use learners::{Fold, LearnerRecord, NewLearner, RewardRecord, WeightsRecord}
 pub use models::{ModelKey, ModelRecord, ModelSize, ModelSummary, NewDefinition, NewModel, StoredDefinition};
 pub use observations::{NewObservations, Owner, SessionRefusal};
 pub use page::Page;
-pub use policies::{NewPolicy, NewRefinement, PolicyRecord, pack_steps};
+pub use policies::{Links, NewPolicy, NewRefinement, PolicyRecord, pack_steps};
 pub use refinements::{Attempt, MAX_ATTEMPTS, RefinementEnd};
+pub use request_keys::{AnsweredRequest, KeyTaken, NewRequestKey, RequestKey};
 pub use sessions::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, SessionRecord, SessionStatus, Taken};
 
 use sqlx::Sqlite;

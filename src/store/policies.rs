@@ -81,6 +81,15 @@ pub struct PolicyRecord {
     pub summary: Box<RawValue>,
 }
 
+/// Which links the text of a policy has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Links {
+    /// Those that there are.
+    Now,
+    /// Those that it was answered with when it was made: none to a policy that refines it.
+    AsMade,
+}
+
 impl Store {
     /// Stores policies in this order, all of them or none, and notes which of them are to be refined.
     ///
@@ -103,7 +112,7 @@ impl Store {
     pub async fn policy(&self, id: &str) -> Result<Option<String>, StoreError> {
         /// Far more than any.
         const ANY: u64 = 1 << 40;
-        Ok(self.policy_within(id, &Memory::with_room(ANY)).await?.map(|(policy, _)| policy))
+        Ok(self.policy_within(id, Links::Now, &Memory::with_room(ANY)).await?.map(|(policy, _)| policy))
     }
 
     /// The policy with this id, as it was answered (JSON), and what it takes of `memory`, if it is much: taken before it is read.
@@ -111,7 +120,12 @@ impl Store {
     /// # Errors
     ///
     /// [`StoreError::NoRoom`] if there is not so much, or if the database failed.
-    pub async fn policy_within(&self, id: &str, memory: &Memory) -> Result<Option<(String, Option<Held>)>, StoreError> {
+    pub async fn policy_within(
+        &self,
+        id: &str,
+        links: Links,
+        memory: &Memory,
+    ) -> Result<Option<(String, Option<Held>)>, StoreError> {
         /// The stored bytes, and the text that is written from them: unpacked steps take up to four times as many bytes as packed ones.
         const COPIES: usize = 6;
         let read = async {
@@ -119,13 +133,13 @@ impl Store {
             let n_bytes = n_bytes_of(&row)?;
             let mut held = None;
             if n_bytes <= MAX_INLINE_BYTES {
-                return self.read_policy(&row, held, memory).await.map(Some);
+                return self.read_policy(&row, links, held, memory).await.map(Some);
             }
             memory.hold(&mut held, COPIES * n_bytes)?;
             drop(row);
             // It has no more bytes, whichever links have changed between the two reads.
             let Some(row) = self.policy_row(id, n_bytes).await? else { return Ok(None) };
-            self.read_policy(&row, held, memory).await.map(Some)
+            self.read_policy(&row, links, held, memory).await.map(Some)
         };
         read.await.map_err(|error: StoreError| error.of_row("policies", id))
     }
@@ -144,9 +158,11 @@ impl Store {
     async fn read_policy(
         &self,
         row: &SqliteRow,
+        links: Links,
         held: Option<Held>,
         memory: &Memory,
     ) -> Result<(String, Option<Held>), StoreError> {
+        let link = |answer| if links == Links::Now { linked(answer, row) } else { Ok(answer) };
         let steps: Vec<u8> = row.try_get("steps")?;
         let summary: String = row.try_get("summary")?;
         if row.try_get::<i64, _>("checksum")? != checksum(&summary, &steps) {
@@ -155,7 +171,7 @@ impl Store {
         if summary.len() + steps.len() <= MAX_INLINE_BYTES
             && let Some((answer, held)) = write_answer(&summary, &steps, MAX_INLINE_ANSWER_BYTES, memory)?
         {
-            return Ok((linked(answer, row)?, held));
+            return Ok((link(answer)?, held));
         }
         let memory = memory.clone();
         let writing = self.tasks.spawn_blocking(move || {
@@ -164,7 +180,7 @@ impl Store {
         });
         let written = writing.await.map_err(corrupt("steps"))??;
         let (answer, held) = written.ok_or_else(|| corrupt("steps")("they are too many"))?;
-        Ok((linked(answer, row)?, held))
+        Ok((link(answer)?, held))
     }
 
     /// At most `limit` policies in the order in which they became durable, from the first after the sequence number

@@ -22,6 +22,7 @@ mod inputs;
 mod learning;
 mod limits;
 mod protocol;
+mod repeats;
 mod stored_policies;
 mod stream;
 mod trials;

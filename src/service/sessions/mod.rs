@@ -107,7 +107,7 @@ impl Etude {
                 let name = source.learner.unwrap_or_default();
                 return Err(ServiceError::Unknown { kind: Kind::Learner, name, pointer: Some("/learner") }.into());
             }
-            Opened::NumberTaken => return Err(PoolError::Busy.into()),
+            Opened::NumberTaken | Opened::KeyTaken => return Err(PoolError::Busy.into()),
         }
         let online = OnlineMapping::new(&mapper, weights.clone(), start, lookahead);
         let online = Some(online);
@@ -278,7 +278,8 @@ impl Etude {
         Ok(self.store.sessions(after, limit).await?)
     }
 
-    /// Expires open sessions that have been idle for too long, now and then, until `stopping` is cancelled.
+    /// Expires open sessions that have been idle for too long, and removes keys of requests that are too old, now and then, until `stopping`
+    /// is cancelled.
     pub async fn expire_until(self: Arc<Self>, stopping: CancellationToken) {
         let mut ticks = tokio::time::interval(self.alive_every());
         loop {
@@ -288,6 +289,12 @@ impl Etude {
             }
             if let Err(error) = self.expire_sessions(self.clock.now()).await {
                 tracing::warn!(error = &error as &dyn std::error::Error, "idle sessions could not be expired");
+            }
+            if let Err(error) = self.store.remove_outdated_keys(self.clock.now()).await {
+                tracing::warn!(
+                    error = &error as &dyn std::error::Error,
+                    "outdated keys of requests could not be removed"
+                );
             }
         }
     }

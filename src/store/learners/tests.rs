@@ -35,6 +35,7 @@ async fn reward(store: &Store, learner: i64, number: u64) {
         policy_id: id.clone(),
         policy: None,
         refinement: None,
+        key: None,
         created_at: Timestamp::UNIX_EPOCH,
         lease_expires_at: Timestamp::UNIX_EPOCH,
     };
@@ -89,6 +90,7 @@ fn repeated(learner: i64) -> NewTrial {
         policy_id: String::new(),
         policy: None,
         refinement: None,
+        key: None,
         created_at: Timestamp::UNIX_EPOCH,
         lease_expires_at: Timestamp::UNIX_EPOCH,
     }

@@ -48,19 +48,19 @@ async fn a_policy_is_read_only_if_there_is_memory_for_it() {
         let new = NewPolicy { id: id.clone(), summary, steps, created_at };
         store.add_policies(vec![new], Vec::new()).await.unwrap();
         let memory = Memory::with_room(1 << 30);
-        let (read, held) = store.policy_within(&id, &memory).await.unwrap().unwrap();
+        let (read, held) = store.policy_within(&id, Links::Now, &memory).await.unwrap().unwrap();
         assert_eq!(read, answer);
         let n_held = held.as_ref().map_or(0, Held::n_bytes);
         if n_states > 3 {
             let n_bytes = answer.len() as u64;
             assert!((n_bytes..n_bytes * 5 / 4 + 4096).contains(&n_held), "{n_held} for {n_bytes}");
             let little = Memory::with_room(n_bytes / 2);
-            let refused = store.policy_within(&id, &little).await;
+            let refused = store.policy_within(&id, Links::Now, &little).await;
             assert!(matches!(refused, Err(StoreError::NoRoom(_))), "{n_states}: {refused:?}");
             assert_eq!(little.free(), little.room() / 4096 * 4096);
         }
         drop(held);
         assert_eq!(memory.free(), 1 << 30);
     }
-    assert!(store.policy_within("none", &Memory::with_room(0)).await.unwrap().is_none());
+    assert!(store.policy_within("none", Links::Now, &Memory::with_room(0)).await.unwrap().is_none());
 }

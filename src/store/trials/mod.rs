@@ -8,7 +8,7 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::{AssertSqlSafe, Row};
 
 use super::page::{Rest, Rows};
-use super::{NewPolicy, NewRefinement, Page, Store, StoreError, as_integer, count, timestamp};
+use super::{NewPolicy, NewRefinement, NewRequestKey, Page, Store, StoreError, as_integer, count, timestamp};
 pub use numbers::NextNumber;
 pub(super) use numbers::TrialNumbers;
 use verbs::FailTrial;
@@ -33,6 +33,8 @@ pub struct NewTrial {
     pub policy: Option<NewPolicy>,
     /// What is to be done about the policy, if it is local.
     pub refinement: Option<NewRefinement>,
+    /// The key of the request for it, if that has one.
+    pub key: Option<NewRequestKey>,
     /// When it is drawn.
     pub created_at: Timestamp,
     /// When it expires.
@@ -163,6 +165,8 @@ pub enum Opened {
     NoLearner,
     /// Another trial of the learner has its number: it was drawn for nothing. The next numbers come after those that are stored.
     NumberTaken,
+    /// The key of the request is another one's, which was answered.
+    KeyTaken,
 }
 
 /// What became of a reward.

@@ -64,6 +64,7 @@ mod tests {
             policy_id: id.to_owned(),
             policy: None,
             refinement: None,
+            key: None,
             created_at: Timestamp::UNIX_EPOCH,
             lease_expires_at: Timestamp::UNIX_EPOCH,
         }

@@ -11,7 +11,7 @@ use super::{
 };
 use crate::store::policies::{NewPolicy, NewRefinement};
 use crate::store::writer::{Verb, Writing};
-use crate::store::{StoreError, as_integer, corrupt, count, learners, policies, refinements};
+use crate::store::{StoreError, as_integer, corrupt, count, learners, policies, refinements, request_keys};
 
 impl Verb for NewTrial {
     type Answer = Opened;
@@ -25,8 +25,13 @@ impl Verb for NewTrial {
     }
 }
 
-/// Stores a trial and its policy.
+/// Stores a trial and its policy, and the key of the request for it.
 pub(in crate::store) async fn open(connection: &mut SqliteConnection, trial: &NewTrial) -> Result<Opened, StoreError> {
+    if let Some(key) = &trial.key
+        && request_keys::add(connection, key, &trial.id).await?.is_err()
+    {
+        return Ok(Opened::KeyTaken);
+    }
     let inserted = sqlx::query(
         "INSERT INTO trials
              (id, learner, number, weights, weights_version, policy_id, lease_expires_at_ms, created_at_ms)
@@ -44,6 +49,9 @@ pub(in crate::store) async fn open(connection: &mut SqliteConnection, trial: &Ne
     .execute(&mut *connection)
     .await?;
     if inserted.rows_affected() == 0 {
+        if trial.key.is_some() {
+            request_keys::forget(connection, &trial.id).await?;
+        }
         let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM learners WHERE sequence = $1)");
         let has_learner = query.bind(trial.learner).fetch_one(connection).await?;
         return Ok(if has_learner { Opened::NumberTaken } else { Opened::NoLearner });
