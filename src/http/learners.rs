@@ -158,7 +158,7 @@ pub(super) async fn list_learners(State(context): State<SharedContext>, paging: 
 
 /// Delete a learner with its weights and trials. Policies made with it stay.
 #[utoipa::path(
-    delete, path = "/v1/learners/{learner}", tag = "learners",
+    delete, path = "/v1/learners/{learner}", tag = "deletion",
     params(("learner" = String, Path, description = "Its name")),
     responses(
         (status = 204, description = "It is deleted"),

@@ -14,7 +14,9 @@ mod body;
 mod caller;
 mod collected;
 mod connections;
+mod description;
 mod encoding;
+mod examples;
 mod learners;
 mod models;
 mod observe;
@@ -31,7 +33,6 @@ mod stalled;
 mod stream;
 mod trials;
 
-use std::collections::btree_map::Entry;
 use std::sync::Arc;
 
 use axum::Router;
@@ -41,12 +42,12 @@ use metrics_exporter_prometheus::PrometheusHandle;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 use utoipa::OpenApi;
-use utoipa::openapi::path::Operation;
-use utoipa::openapi::{Content, Ref, RefOr, ResponseBuilder};
+use utoipa::openapi::Tag;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use crate::service::{Client, Etude};
+use crate::stream::frames::ServerFrame;
 use crate::stream::{Limits, Room, Rooms};
 pub use access::Access;
 pub(crate) use access::{allowed_host, allowed_origin};
@@ -105,12 +106,13 @@ impl Context {
     tags(
         (name = "models", description = "What a body can do in its world"),
         (name = "policies", description = "Demonstration in, policy out"),
-        (name = "streams", description = "Policy steps while the demonstration is still running"),
         (name = "learners", description = "Which attributes matter, learned from rewards"),
         (name = "trials", description = "Weights drawn from a learner, the policy that they gave, and the reward that it earned"),
+        (name = "streams", description = "Policy steps while the demonstration is still running"),
+        (name = "deletion", description = "Names that are given up: after everything else, so that what is above can be tried in order"),
         (name = "operation", description = "Health and measurements"),
     ),
-    components(schemas(Problem)),
+    components(schemas(Problem, stream::ClientFrameDocument, ServerFrame)),
 )]
 struct Description;
 
@@ -118,26 +120,26 @@ fn routes() -> OpenApiRouter<SharedContext> {
     let mut description = Description::openapi();
     // Taken from Cargo.toml, which names none.
     description.info.license = None;
-    let protocol = include_str!("../stream/protocol.md");
-    description.info.description = description.info.description.map(|text| format!("{text}\n\n{protocol}"));
+    let protocol = Tag::builder().name("stream protocol").description(Some(include_str!("../stream/protocol.md")));
+    description.tags.get_or_insert_default().push(protocol.build());
     OpenApiRouter::with_openapi(description)
         .routes(routes!(models::put_model, models::get_model, models::delete_model))
         .routes(routes!(models::list_models))
         .routes(routes!(policies::make_policy, policies::list_policies))
-        .routes(routes!(policies::get_policy, policies::delete_policy))
         .routes(routes!(policies::make_policies))
-        .routes(routes!(stream::websocket, stream::ndjson))
-        .routes(routes!(stream::list_sessions))
-        .routes(routes!(stream::get_session, stream::delete_session))
+        .routes(routes!(policies::get_policy, policies::delete_policy))
         .routes(routes!(learners::put_learner, learners::get_learner, learners::delete_learner))
         .routes(routes!(learners::list_learners))
         .routes(routes!(learners::get_weights))
         .routes(routes!(learners::list_weights))
         .routes(routes!(learners::learn))
         .routes(routes!(trials::make_trial, trials::list_trials))
-        .routes(routes!(trials::get_trial, trials::delete_trial))
         .routes(routes!(trials::put_reward))
         .routes(routes!(trials::fail_trial))
+        .routes(routes!(trials::get_trial, trials::delete_trial))
+        .routes(routes!(stream::websocket, stream::ndjson))
+        .routes(routes!(stream::list_sessions))
+        .routes(routes!(stream::get_session, stream::delete_session))
         .routes(routes!(operation::livez))
         .routes(routes!(operation::readyz))
         .routes(routes!(operation::metrics))
@@ -151,51 +153,7 @@ fn routes() -> OpenApiRouter<SharedContext> {
 /// Never: every description can be written as YAML.
 #[must_use]
 pub fn openapi() -> String {
-    /// What is not the handlers' to name, as any of them may meet it.
-    const ANYWHERE: [(&str, &str); 4] = [
-        ("400", "`bad-host`: not one `Host` header, or one that names no host"),
-        ("403", "`foreign-origin`: the request comes from a web page that may not do this"),
-        ("421", "`unknown-host`: the service is not known by the host that is asked for"),
-        ("503", "`busy`: see `Retry-After`"),
-    ];
-    /// Nor a defect or a failing disk, which those for operators do not.
-    const IN_CONTRACT: (&str, &str) = ("500", "`internal`: what went wrong was logged under the request's id");
-    /// Nor this one, which any write may meet.
-    const WRITING: (&str, &str) =
-        ("507", "`storage-full`: no room is left for the database; what is there can be read");
-    let mut description = routes().into_openapi();
-    for (name, path) in &mut description.paths.paths {
-        let in_contract = name.starts_with("/v1/").then_some(IN_CONTRACT);
-        for operation in [&mut path.get, &mut path.put, &mut path.post, &mut path.delete].into_iter().flatten() {
-            ANYWHERE
-                .into_iter()
-                .chain(in_contract)
-                .for_each(|(status, meaning)| add_problem(operation, status, meaning));
-        }
-        for operation in [&mut path.put, &mut path.post, &mut path.delete].into_iter().flatten() {
-            add_problem(operation, WRITING.0, WRITING.1);
-        }
-    }
-    description.to_yaml().expect("every description can be written as YAML")
-}
-
-/// Describes a problem of an operation that has others of this status, or none.
-fn add_problem(operation: &mut Operation, status: &str, meaning: &str) {
-    match operation.responses.responses.entry(status.to_owned()) {
-        Entry::Vacant(vacant) => {
-            let problem = Content::new(Some(Ref::from_schema_name("Problem")));
-            let response = ResponseBuilder::new().description(meaning).content("application/problem+json", problem);
-            vacant.insert(response.build().into());
-        }
-        Entry::Occupied(mut named) => {
-            let (kind, _) = meaning.split_once(':').unwrap_or((meaning, ""));
-            if let RefOr::T(response) = named.get_mut()
-                && !response.description.contains(kind)
-            {
-                response.description = format!("{kind}, {}", response.description);
-            }
-        }
-    }
+    description::published(routes().into_openapi())
 }
 
 /// The whole service as a router.

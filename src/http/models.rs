@@ -211,7 +211,7 @@ pub(super) async fn list_models(State(context): State<SharedContext>, paging: Pa
 
 /// Delete a model. Policies made with it stay.
 #[utoipa::path(
-    delete, path = "/v1/models/{model}", tag = "models",
+    delete, path = "/v1/models/{model}", tag = "deletion",
     params(("model" = String, Path, description = "Its name")),
     responses(
         (status = 204, description = "It is deleted"),

@@ -66,12 +66,31 @@ struct TrialMembers {
     demonstration: Vec<ObservationDocument>,
 }
 
+/// Opens a session, of which the demonstration follows.
+#[derive(Serialize, ToSchema)]
+struct OpenMembers {
+    /// Name of the imitator's model.
+    #[schema(example = "corridor")]
+    model: String,
+    /// Name of a learner whose mean weights are used, for attributes that `weights` does not name.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    learner: Option<String>,
+    /// Whether a trial is drawn from the learner.
+    #[serde(default)]
+    explore: bool,
+    /// How many observations past the current one a decision may wait for, 1 to 100,000: 8 if left out; `null`: only steps that are proven
+    /// are committed before the end.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 1, maximum = 100_000)]
+    lookahead: Option<u32>,
+}
+
 /// Describes a request: its own members, and the options that it may have.
 macro_rules! describe {
     ($(#[$doc:meta])* $request:ident, $members:ty, $kind:expr) => {
         $(#[$doc])*
         #[derive(Serialize)]
-        pub(super) struct $request($members);
+        pub(in crate::http) struct $request($members);
 
         impl PartialSchema for $request {
             fn schema() -> RefOr<Schema> {
@@ -108,6 +127,10 @@ describe!(
     /// A request for a trial.
     TrialRequest, TrialMembers, RequestKind::Trial
 );
+describe!(
+    /// A request for a session.
+    OpenFrame, OpenMembers, RequestKind::Session
+);
 
 /// The description of a request with these members and its options.
 fn with_options(members: RefOr<Schema>, kind: RequestKind) -> RefOr<Schema> {
@@ -139,9 +162,11 @@ mod tests {
             (BatchRequest::schema(), RequestKind::Batch),
             (BatchItemRequest::schema(), RequestKind::Item),
             (TrialRequest::schema(), RequestKind::Trial),
+            (OpenFrame::schema(), RequestKind::Session),
         ] {
             let mut described: Vec<_> = object(request).properties.into_keys().collect();
-            let mut read = kind.fields().to_vec();
+            // What every frame has is described with them all.
+            let mut read: Vec<_> = kind.fields().iter().copied().filter(|name| *name != "type").collect();
             described.sort_unstable();
             read.sort_unstable();
             assert_eq!(described, read, "{kind:?}");

@@ -1,5 +1,6 @@
 //! `/v1/stream` and `/v1/sessions`: the stream protocol over websockets and NDJSON.
 
+mod frames;
 mod metered;
 mod ndjson;
 mod pause;
@@ -22,6 +23,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tracing::Instrument;
 use utoipa::ToSchema;
 
+pub(super) use self::frames::ClientFrameDocument;
 use super::SharedContext;
 use super::answer::json;
 use super::body::{NoForm, is_ndjson, refuse};
@@ -40,9 +42,10 @@ const CLOSE_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Stream a demonstration over a websocket.
 ///
-/// The subprotocol is `etude.v1+json`; see the description of the protocol in this document's introduction.
+/// The subprotocol is `etude.v1+json`. Each text message of the client is a `ClientFrame`, each of the server a `ServerFrame`. A page cannot
+/// try this as a request; `POST /v1/stream` takes the same frames.
 #[utoipa::path(
-    get, path = "/v1/stream", tag = "streams",
+    get, path = "/v1/stream", tag = "stream protocol",
     responses(
         (status = 101, description = "The websocket is open; the server speaks first"),
         (status = 426, description = "`upgrade-required`: not a websocket request", body = Problem, content_type = "application/problem+json"),
@@ -108,7 +111,8 @@ impl Inlet<'_> {
 
 /// Stream a demonstration as NDJSON, both ways at the same time.
 ///
-/// The same frames as over the websocket, one per line. The answer begins at once and ends when the session is done or
+/// The same frames as over the websocket, one per line: each line that is sent is a `ClientFrame`, each that is answered a `ServerFrame`, as
+/// told under "stream protocol". The answer begins at once and ends when the session is done or
 /// an error ends it; a session that is not done can be resumed. The frames are not compressed.
 #[utoipa::path(
     post, path = "/v1/stream", tag = "streams",
@@ -171,7 +175,8 @@ struct SessionBody {
     weights_version: Option<u64>,
     /// The trial that it explores, if any.
     trial_id: Option<String>,
-    /// `open`, `done` or `expired`.
+    /// What has become of it.
+    #[schema(value_type = SessionStatusName)]
     status: &'static str,
     /// How many observations are durable.
     observations: u32,
@@ -183,6 +188,17 @@ struct SessionBody {
     /// When something last came.
     #[schema(value_type = String, format = DateTime)]
     active_at: Timestamp,
+}
+
+/// What has become of a session.
+#[derive(Serialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(as = SessionStatus)]
+#[expect(dead_code, reason = "what describes the names")]
+enum SessionStatusName {
+    Open,
+    Done,
+    Expired,
 }
 
 impl From<SessionRecord> for SessionBody {

@@ -36,7 +36,7 @@ pub(super) struct TrialBody {
     number: u64,
     /// What has become of it: `active` until it has a reward, `rewarded` then, `learned` once that is folded into the
     /// weights; `failed`; `expired` when its lease is over (a late reward is still accepted).
-    #[schema(value_type = String, example = "active")]
+    #[schema(value_type = TrialStatusName, example = "active")]
     status: &'static str,
     /// The weights as drawn, by attribute of the learner.
     #[schema(value_type = BTreeMap<String, f64>)]
@@ -59,7 +59,7 @@ pub(super) struct TrialBody {
     policy_id: String,
     /// The policy in full; not in lists, nor when a reward is given.
     #[serde(skip_serializing_if = "Option::is_none")]
-    #[schema(value_type = Option<Policy>, required = false)]
+    #[schema(value_type = Policy, required = false)]
     policy: Option<Box<RawValue>>,
 }
 
@@ -82,6 +82,19 @@ impl TrialBody {
             policy,
         }
     }
+}
+
+/// What has become of a trial.
+#[derive(Serialize, ToSchema)]
+#[serde(rename_all = "lowercase")]
+#[schema(as = TrialStatus)]
+#[expect(dead_code, reason = "what describes the names")]
+enum TrialStatusName {
+    Active,
+    Rewarded,
+    Learned,
+    Failed,
+    Expired,
 }
 
 /// What a trial earned.
@@ -146,7 +159,7 @@ pub(super) async fn make_trial(
 #[into_params(parameter_in = Query)]
 pub(super) struct WhichTrials {
     /// Only those with this status: `active`, `rewarded`, `learned`, `failed` or `expired`.
-    #[param(value_type = Option<String>)]
+    #[param(value_type = Option<TrialStatusName>)]
     status: Option<TrialStatus>,
 }
 

@@ -4,6 +4,7 @@ use std::io;
 
 use serde::Serialize;
 use serde_json::Value;
+use utoipa::ToSchema;
 
 use crate::service::SessionPolicy;
 use etude_core::attribute::{ByAttribute, Scalar};
@@ -99,10 +100,11 @@ impl ClientFrame {
 }
 
 /// What the server sends.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
 #[serde(tag = "type", rename_all = "lowercase")]
 pub enum ServerFrame<'f> {
     /// The first frame.
+    #[schema(title = "HelloFrame")]
     Hello {
         /// The protocol's name.
         protocol: &'static str,
@@ -112,12 +114,14 @@ pub enum ServerFrame<'f> {
         limits: HelloLimits,
     },
     /// A session is open, or resumed.
+    #[schema(title = "OpenedFrame")]
     Opened {
         /// Its id, to resume it by.
         session: &'f str,
         /// The trial that it explores, if any.
         trial: Option<&'f str>,
         /// The weights of the distance.
+        #[schema(value_type = BTreeMap<String, f64>)]
         weights: ByAttribute<f64>,
         /// How many observations are durable.
         received: u32,
@@ -125,13 +129,16 @@ pub enum ServerFrame<'f> {
         steps: usize,
     },
     /// That many observations are durable.
+    #[schema(title = "ReceivedFrame")]
     Received {
         /// How many.
         seq: u32,
     },
     /// A step that will not be revised.
+    #[schema(title = "StepFrame")]
     Step(StepFrame<'f>),
     /// The policy of the whole demonstration is stored.
+    #[schema(title = "DoneFrame")]
     Done {
         /// Its id; `None` once it was deleted.
         policy_id: Option<&'f str>,
@@ -141,9 +148,11 @@ pub enum ServerFrame<'f> {
         cost: Cost,
         /// Its actions, in order; `None` where they are left out, as the frame would be too long.
         #[serde(skip_serializing_if = "Option::is_none")]
+        #[schema(value_type = Vec<String>, required = false)]
         actions: Option<&'f [std::sync::Arc<str>]>,
     },
     /// The reward of the explored trial is durable.
+    #[schema(title = "RewardedFrame")]
     Rewarded {
         /// The trial.
         trial: &'f str,
@@ -153,6 +162,7 @@ pub enum ServerFrame<'f> {
         reward_order: Option<u64>,
     },
     /// Something is wrong.
+    #[schema(title = "ErrorFrame")]
     Error {
         /// What.
         problem: StreamProblem,
@@ -228,7 +238,7 @@ fn write_within(frame: &ServerFrame<'_>, max_bytes: usize) -> Result<String, Wri
 }
 
 /// What a server takes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, ToSchema)]
 pub struct HelloLimits {
     /// Largest frame, in bytes.
     pub frame_bytes: usize,
@@ -246,19 +256,30 @@ pub struct HelloLimits {
     pub ping_interval_ms: u64,
 }
 
-/// A committed step.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+/// A committed step, as in a policy.
+#[derive(Clone, Debug, PartialEq, Serialize, ToSchema)]
 pub struct StepFrame<'f> {
+    /// Counted from 0.
     step: u32,
+    /// The observation that the step belongs to, counted from 0.
     observation: u32,
+    /// How it advances.
     #[serde(rename = "move")]
     kind: MoveKind,
+    /// The action taken, if any.
     action: Option<&'f str>,
+    /// The imitator's state after the step.
+    #[schema(value_type = BTreeMap<String, Scalar>)]
     state: &'f ByAttribute<Scalar>,
+    /// Cost of the action.
     action_cost: f64,
+    /// Weighted distance between the observation and the state.
     distance: f64,
+    /// Cost of the steps up to and including this one.
     cost: f64,
+    /// Whether it is part of a cheapest mapping, whatever is still to come, among those that begin with the steps before it.
     proven: bool,
+    /// How many observations had come when it was committed.
     after: u32,
 }
 
@@ -288,7 +309,7 @@ impl<'f> From<&'f SessionPolicy> for ServerFrame<'f> {
 }
 
 /// What is wrong, as in HTTP but for what only HTTP has.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, ToSchema)]
 pub struct StreamProblem {
     /// `/problems/` and what kind of problem it is.
     #[serde(rename = "type")]
@@ -297,6 +318,7 @@ pub struct StreamProblem {
     pub detail: String,
     /// Every fault of the frame, with its place.
     #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schema(required = false)]
     pub errors: Vec<Fault>,
 }
 

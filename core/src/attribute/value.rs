@@ -37,7 +37,6 @@ impl Hash for Value {
 
 /// A value of an attribute, as it is written in JSON: a number, a string (a label, or a category) or a boolean.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(untagged)]
 pub enum Scalar {
     /// A category's boolean.
@@ -65,6 +64,24 @@ impl Scalar {
         }
     }
 }
+
+// Derived, a whole number would be described twice, as an integer and as a number.
+#[cfg(feature = "openapi")]
+impl utoipa::PartialSchema for Scalar {
+    fn schema() -> utoipa::openapi::RefOr<utoipa::openapi::Schema> {
+        use utoipa::openapi::schema::{AnyOfBuilder, ObjectBuilder, Type};
+        let of = |kind: Type, what: &str| ObjectBuilder::new().schema_type(kind).description(Some(what));
+        AnyOfBuilder::new()
+            .description(Some("A value of an attribute: a number, a string (a label, or a category) or a boolean."))
+            .item(of(Type::Boolean, "A category's boolean."))
+            .item(of(Type::Number, "A number; a category's is whole."))
+            .item(of(Type::String, "A label, or a category's string, of at most 1024 bytes."))
+            .into()
+    }
+}
+
+#[cfg(feature = "openapi")]
+impl utoipa::ToSchema for Scalar {}
 
 impl Serialize for Scalar {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {

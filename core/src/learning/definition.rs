@@ -234,7 +234,7 @@ pub struct LearnerDocument {
 #[cfg_attr(feature = "openapi", schema(as = Algorithm))]
 pub enum AlgorithmDocument {
     /// The paper's rule; see `srv` in the README.
-    #[cfg_attr(feature = "openapi", schema(title = "Srv"))]
+    #[cfg_attr(feature = "openapi", schema(title = "SrvAlgorithm"))]
     Srv {
         /// How far a trial moves the means. At least 0; 0.5 if left out.
         #[serde(default, skip_serializing_if = "Option::is_none")]

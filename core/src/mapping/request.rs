@@ -394,6 +394,7 @@ pub struct ObservedDocument(pub Option<Scalar>);
 #[serde(untagged)]
 pub enum StartReference {
     /// The state's index.
+    #[cfg_attr(feature = "openapi", schema(value_type = u32))]
     Index(StateIdx),
     /// Values by attribute name.
     Values(BTreeMap<String, Scalar>),

@@ -82,6 +82,7 @@ impl Serialize for WrittenTransition<'_> {
 /// Listed states and transitions.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[cfg_attr(feature = "openapi", schema(as = TableDynamics))]
 pub struct TableDocument {
     /// Each state's attribute values, in attribute order.
     #[cfg_attr(feature = "openapi", schema(example = json!([[0, "east", "open"], [1, "east", "open"]])))]
@@ -97,13 +98,12 @@ pub struct TableDocument {
     pub start: Option<StartDocument>,
     /// States that must never be entered, in any order.
     #[serde(default, rename = "unsafe")]
+    #[cfg_attr(feature = "openapi", schema(value_type = Vec<u32>))]
     pub unsafe_states: Vec<StateIdx>,
 }
 
 /// `[from, action, to, probability, cost]`, of which the last two may be left out or `null`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[cfg_attr(feature = "openapi", schema(as = TransitionEntry, example = json!([0, "forward", 1])))]
 pub struct TransitionDocument(
     /// The state that it leaves.
     pub StateIdx,
@@ -119,9 +119,47 @@ pub struct TransitionDocument(
     pub Option<f64>,
 );
 
+// Derived, it would be a list of objects.
+#[cfg(feature = "openapi")]
+impl utoipa::PartialSchema for TransitionDocument {
+    fn schema() -> utoipa::openapi::RefOr<utoipa::openapi::Schema> {
+        use utoipa::openapi::schema::{AnyOfBuilder, ArrayBuilder, ObjectBuilder, Schema, SchemaType, Type};
+        let of = |kind: SchemaType, what: &str| ObjectBuilder::new().schema_type(kind).description(Some(what));
+        let index = |what: &str| of(Type::Integer.into(), what).minimum(Some(0)).build();
+        let number = |what: &str| of([Type::Number, Type::Null].into_iter().collect(), what);
+        let text = of(Type::String.into(), "Its name.").build();
+        let action = AnyOfBuilder::new().item(text.clone()).item(index("Its index in `actions`."));
+        let probability = number("How probable that is: above 0, at most 1; 1 if left out or `null`.");
+        let cost = number("What the body pays for it: 0 to 1e150; what the action costs if left out or `null`.");
+        ArrayBuilder::new()
+            .description(Some(
+                "`[from, action, to, probability, cost]`, of which the last two may be left out or `null`.",
+            ))
+            .prefix_items([
+                Schema::Object(index("The state that it leaves, by index.")),
+                Schema::AnyOf(action.description(Some("The action that leads along it.")).build()),
+                Schema::Object(index("The state that it leads to, by index.")),
+                Schema::Object(probability.exclusive_minimum(Some(0)).maximum(Some(1)).build()),
+                Schema::Object(cost.minimum(Some(0)).build()),
+            ])
+            // There are no others, but generators of clients that know no `prefixItems` look here.
+            .items(AnyOfBuilder::new().item(text).item(number("A number.")))
+            .min_items(Some(3))
+            .max_items(Some(5))
+            .examples([serde_json::json!([0, "forward", 1]), serde_json::json!([0, "forward", 1, 0.9, 2.5])])
+            .into()
+    }
+}
+
+#[cfg(feature = "openapi")]
+impl utoipa::ToSchema for TransitionDocument {
+    fn name() -> std::borrow::Cow<'static, str> {
+        "TransitionEntry".into()
+    }
+}
+
 /// An action, by name or index.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(untagged)]
 pub enum ActionReference {
     /// Its name.
@@ -137,7 +175,9 @@ pub enum ActionReference {
 #[cfg_attr(feature = "openapi", schema(as = StartStates))]
 pub enum StartDocument {
     /// In this state.
+    #[cfg_attr(feature = "openapi", schema(value_type = u32))]
     State(StateIdx),
     /// In the one of these that is closest to the first observation.
+    #[cfg_attr(feature = "openapi", schema(value_type = Vec<u32>))]
     Candidates(Vec<StateIdx>),
 }

@@ -203,6 +203,7 @@ fn read_pose(place: &Place<'_, '_>, size: (u16, u16), faults: &mut Faults) -> Op
 /// A cave of the wumpus world.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[cfg_attr(feature = "openapi", schema(as = WumpusDynamics))]
 pub struct WumpusDocument {
     /// Cells from west to east: 1 to 1000.
     #[cfg_attr(feature = "openapi", schema(minimum = 1, maximum = 1000, example = 7))]
@@ -250,9 +251,29 @@ fn one_arrow() -> u8 {
 
 /// A cell, `[x, y]`; x grows east, y north, both from 0.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[cfg_attr(feature = "openapi", schema(as = Cell, example = json!([3, 0])))]
 pub struct CellDocument(pub u16, pub u16);
+
+// Derived, each of its items would have its description and its example.
+#[cfg(feature = "openapi")]
+impl utoipa::PartialSchema for CellDocument {
+    fn schema() -> utoipa::openapi::RefOr<utoipa::openapi::Schema> {
+        use utoipa::openapi::schema::{ArrayBuilder, ObjectBuilder, Type};
+        ArrayBuilder::new()
+            .description(Some("A cell, `[x, y]`; x grows east, y north, both from 0."))
+            .items(ObjectBuilder::new().schema_type(Type::Integer).minimum(Some(0)).maximum(Some(999)))
+            .min_items(Some(2))
+            .max_items(Some(2))
+            .examples([serde_json::json!([3, 0])])
+            .into()
+    }
+}
+
+#[cfg(feature = "openapi")]
+impl utoipa::ToSchema for CellDocument {
+    fn name() -> std::borrow::Cow<'static, str> {
+        "Cell".into()
+    }
+}
 
 /// A cell and a direction.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -264,6 +285,7 @@ pub struct PoseDocument {
     /// Counted from the south.
     pub y: u16,
     /// East if left out.
+    #[cfg_attr(feature = "openapi", schema(required = false))]
     pub heading: Heading,
 }
 
