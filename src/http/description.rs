@@ -4,7 +4,7 @@
 //!
 //! - the problems that any request may meet;
 //! - that an object of a request has no members but those described, and that `null` is the same as a member left out; and that in an
-//!   answer, a member that may be `null` is always there;
+//!   answer, a member that may be `null` is always there, unless it has a default;
 //! - types that are told apart by a member, such as `kind`, as a schema each, with that member as discriminator: what generators of clients
 //!   build a class from. Likewise one object where a type is made of several;
 //! - an example for each operation, and the order in which operations are listed, in which each example works after those before it.
@@ -184,7 +184,7 @@ fn tag(variant: &Value) -> Option<(String, String, String)> {
 }
 
 /// Says which members objects have: those of requests no others than described, which may be `null` where they may be left out; those of
-/// answers always those that may be `null`.
+/// answers always those that may be `null`, unless they have a default.
 fn tell_members(document: &mut Value) {
     /// What a client sends beside bodies.
     const FRAMES: &str = "ClientFrame";
@@ -239,7 +239,8 @@ fn require_nullable(schema: &mut Value) {
     for (name, member) in object.get("properties").and_then(Value::as_mapping).into_iter().flatten() {
         let types = member.get("type").and_then(Value::as_sequence).into_iter().flatten();
         let either = member.get("oneOf").and_then(Value::as_sequence).into_iter().flatten();
-        if types.chain(either.filter_map(|schema| schema.get("type"))).any(|kind| kind == "null") {
+        let is_nullable = types.chain(either.filter_map(|schema| schema.get("type"))).any(|kind| kind == "null");
+        if is_nullable && member.get("default").is_none() {
             nullable.push(name.clone());
         }
     }

@@ -2,6 +2,8 @@
 
 #![allow(dead_code, clippy::allow_attributes, reason = "each test binary uses its part of this module")]
 
+pub(crate) mod client;
+pub(crate) mod contract;
 pub(crate) mod process;
 pub(crate) mod service;
 pub(crate) mod waiting;

@@ -6,12 +6,13 @@ use std::path::Path;
 use clap::Parser;
 use etude::config::ServeConfig;
 use etude::server::Server;
-use reqwest::{Client, Method, Response};
+use reqwest::{Method, Response};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 
+use crate::harness::client::Client;
 use crate::harness::waiting::{LIMIT, until, within};
 
 #[derive(Parser)]
@@ -61,7 +62,7 @@ impl Service {
         let running = tokio::spawn(async move {
             server.run(async { drop(stopped.await) }).await;
         });
-        let client = Client::builder().no_proxy().timeout(LIMIT).build().unwrap();
+        let client = Client::of(reqwest::Client::builder().no_proxy().timeout(LIMIT).build().unwrap());
         Self { address, client, directory, stop, running }
     }
 

@@ -15,6 +15,7 @@ mod oracle;
 mod problems;
 
 mod batch;
+mod contract;
 mod deletion;
 mod front;
 mod http;

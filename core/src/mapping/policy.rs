@@ -37,7 +37,7 @@ pub struct Stamp {
 pub struct Policy {
     /// Under which it is stored; left out of answers if it is not, and `null` in files.
     #[serde(default)]
-    #[cfg_attr(feature = "openapi", schema(example = "01938d3e-5c7a-7cc0-9f6e-1f2a3b4c5d6e"))]
+    #[cfg_attr(feature = "openapi", schema(default = json!(null), example = "01938d3e-5c7a-7cc0-9f6e-1f2a3b4c5d6e"))]
     pub id: Option<String>,
     /// Name of the model.
     #[cfg_attr(feature = "openapi", schema(example = "figure-4"))]

@@ -9,12 +9,15 @@ use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 use tokio_tungstenite::tungstenite::protocol::WebSocketConfig;
 
 use super::slow_readers::narrow;
+use crate::harness::contract::CONTRACT;
 use crate::harness::service::Service;
 use crate::harness::waiting::within;
 
-/// A websocket client.
+/// A websocket client, whose frames and those that it receives are held against the contract.
 pub(crate) struct Client {
     pub(crate) socket: WebSocketStream<TcpStream>,
+    /// The frames without an answer yet, by type, and what is wrong with each by its schema: such a one must be refused.
+    pub(crate) unanswered: Vec<(Value, Option<String>)>,
 }
 
 impl Client {
@@ -40,7 +43,7 @@ impl Client {
         let (socket, response) =
             tokio_tungstenite::client_async_with_config(request, stream, Some(config)).await.unwrap();
         assert_eq!(response.headers()["sec-websocket-protocol"], "etude.v1+json");
-        let mut client = Self { socket };
+        let mut client = Self { socket, unanswered: Vec::new() };
         let hello = client.receive().await;
         assert_eq!((&hello["type"], &hello["protocol"]), (&json!("hello"), &json!("etude.v1+json")));
         assert_eq!(
@@ -51,6 +54,7 @@ impl Client {
     }
 
     pub(crate) async fn send(&mut self, frame: Value) {
+        self.unanswered.push((frame["type"].clone(), CONTRACT.broken_by("ClientFrame", &frame)));
         self.socket.send(Message::text(frame.to_string())).await.unwrap();
     }
 
@@ -60,7 +64,33 @@ impl Client {
 
     pub(crate) async fn receive(&mut self) -> Value {
         let message = self.next().await;
-        serde_json::from_str(message.to_text().unwrap_or_else(|_| panic!("{message:?}"))).unwrap()
+        let frame: Value = serde_json::from_str(message.to_text().unwrap_or_else(|_| panic!("{message:?}"))).unwrap();
+        CONTRACT.check_frame(&frame);
+        self.note_answer(&frame);
+        frame
+    }
+
+    /// Notes which frame this one answers.
+    fn note_answer(&mut self, answer: &Value) {
+        let answered: &[&str] = match answer["type"].as_str().unwrap() {
+            "opened" => &["open", "resume"],
+            "received" => &["observe"],
+            "done" => &["end"],
+            "rewarded" => &["reward"],
+            "error" => {
+                let refused = self.unanswered.iter().position(|(_, broken)| broken.is_some()).unwrap_or(0);
+                if refused < self.unanswered.len() {
+                    self.unanswered.remove(refused);
+                }
+                return;
+            }
+            _ => return,
+        };
+        let is_answered = |(kind, _): &(Value, _)| answered.iter().any(|answered| kind == answered);
+        if let Some(position) = self.unanswered.iter().position(is_answered) {
+            let (_, broken) = self.unanswered.remove(position);
+            assert_eq!(broken, None, "{answer} answers a frame that is not valid");
+        }
     }
 
     /// Receives frames up to one of type `kind`, which comes last.

@@ -444,7 +444,7 @@ async fn the_limits_in_hello_are_those_that_are_kept() {
     let stream = TcpStream::connect(service.address).await.unwrap();
     let (socket, _) =
         tokio_tungstenite::client_async(format!("ws://{}/v1/stream", service.address), stream).await.unwrap();
-    let mut client = Client { socket };
+    let mut client = Client { socket, unanswered: Vec::new() };
     let limits = client.receive().await["limits"].take();
     let expected = json!({
         "frame_bytes": 262_144, "message_bytes": 262_144, "observations": 100_000,
