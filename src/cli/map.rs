@@ -18,7 +18,7 @@ use crate::config::parse_whole;
 use crate::service::hash_of;
 use etude_core::document::{self, Faults, Place};
 use etude_core::interrupt::{Interrupted, Signal, Uninterrupted, time_until_finish};
-use etude_core::mapping::{Mapper, Policy, Request, Stamp};
+use etude_core::mapping::{Mapper, Policy, Request, Stamp, Warning};
 use etude_core::model::{CompileError, Definition, Limits, Model};
 
 #[derive(Args, Debug)]
@@ -93,15 +93,22 @@ impl Map {
             model_hash: hash_of(definition.text()),
             lookahead: asked.lookahead.map(NonZeroU32::get),
             elapsed_us: as_micros(clock.elapsed(started)),
+            warnings: asked.problem.warnings(&document::Path::Member(&document::Path::Root, "demonstration")),
             ..Stamp::default()
         };
         let policy = Policy::new(&stamp, &asked.problem, &mapping)?;
+        let warnings = policy.warnings.iter();
+        let mut warnings =
+            warnings.map(|Warning { pointer, detail }| request.tell(pointer, detail, observations.source(), &spots));
         if self.json {
             serde_json::to_writer(&mut *out, &policy).map_err(io::Error::from)?;
             writeln!(out)?;
+            // Those who read the output by a program see it here.
+            warnings.try_for_each(|warning| writeln!(io::stderr(), "warning: {warning}"))?;
         } else {
             writeln!(out, "{}", render::steps(&policy))?;
             write!(out, "{}", render::totals(&policy))?;
+            warnings.try_for_each(|warning| writeln!(out, "warning   {warning}"))?;
         }
         Ok(())
     }

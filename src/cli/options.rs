@@ -100,26 +100,27 @@ impl FlaggedRequest {
     /// All that is wrong with the request, each fault with the flag, or the place in `source`, that it is about. Of its demonstration, the
     /// observations stood at `spots`.
     pub(super) fn told(&self, faults: &[Fault], n_more: usize, source: &Source, spots: &[Spot]) -> CliError {
-        let tell = |Fault { pointer, detail, .. }: &Fault| {
-            if let Some((index, rest)) = pointer.strip_prefix("/demonstration/").map(split_pointer)
-                && let Some(spot) = index.parse().ok().and_then(|index: usize| spots.get(index))
-            {
-                return spot.tell(rest, detail);
-            }
-            let within = |(place, flag): &(String, String)| {
-                let rest = pointer.strip_prefix(place.as_str())?;
-                (rest.is_empty() || rest.starts_with('/')).then(|| (flag.clone(), rest))
-            };
-            match self.flags.iter().find_map(within) {
-                Some((flag, "")) => format!("{flag}: {detail}"),
-                Some((flag, rest)) => format!("{flag}: {rest}: {detail}"),
-                None => source.tell(
-                    pointer.strip_prefix("/demonstration").filter(|rest| rest.is_empty()).unwrap_or(pointer),
-                    detail,
-                ),
-            }
-        };
+        let tell = |Fault { pointer, detail, .. }: &Fault| self.tell(pointer, detail, source, spots);
         faulty(faults.iter().map(tell).collect(), n_more)
+    }
+
+    /// What is to be said of what `pointer` leads to, with the flag, or the place in `source`, that it is about; likewise.
+    pub(super) fn tell(&self, pointer: &str, detail: &str, source: &Source, spots: &[Spot]) -> String {
+        if let Some((index, rest)) = pointer.strip_prefix("/demonstration/").map(split_pointer)
+            && let Some(spot) = index.parse().ok().and_then(|index: usize| spots.get(index))
+        {
+            return spot.tell(rest, detail);
+        }
+        let within = |(place, flag): &(String, String)| {
+            let rest = pointer.strip_prefix(place.as_str())?;
+            (rest.is_empty() || rest.starts_with('/')).then(|| (flag.clone(), rest))
+        };
+        match self.flags.iter().find_map(within) {
+            Some((flag, "")) => format!("{flag}: {detail}"),
+            Some((flag, rest)) => format!("{flag}: {rest}: {detail}"),
+            None => source
+                .tell(pointer.strip_prefix("/demonstration").filter(|rest| rest.is_empty()).unwrap_or(pointer), detail),
+        }
     }
 
     /// The same, of faults that were found here.

@@ -5,13 +5,13 @@ use tokio_util::bytes::Bytes;
 
 use super::learners::LearnerState;
 use super::repeats::{IdempotencyKey, Repeat};
-use super::requests::{Named, SentRequest, base_weights, check_request};
+use super::requests::{DEMONSTRATION, Named, SentRequest, base_weights, check_request};
 use super::search::{Extent, MAX_INLINE_BYTES, Means, Searched, follow, is_quick, max_quick_observations};
 use super::{Caller, Etude, Kind, PoolError, ServiceError};
 use crate::memory::Held;
 use crate::store::{Deletion, KeyTaken, Links, Needed, NewRequestKey, Page};
 use etude_core::attribute::Weights;
-use etude_core::document::{Faults, Object, Path};
+use etude_core::document::{Faults, Object};
 use etude_core::interrupt::{Cancelled, Interrupt};
 use etude_core::mapping::{Demonstration, RequestKind, Stamp};
 use etude_core::model::Model;
@@ -189,7 +189,6 @@ fn search_sent<T>(
     means: Means<'_>,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Result<Option<(Searched, T)>, ServiceError>, Cancelled> {
-    const DEMONSTRATION: Path<'static> = Path::Member(&Path::Root, "demonstration");
     let Named { mapper, learner, .. } = named;
     let (demonstration, _held) = match demonstration {
         Some(demonstration) => (demonstration, None),

@@ -18,7 +18,7 @@ use tokio::sync::Notify;
 use tokio_util::sync::CancellationToken;
 
 use super::refined::RefinedRequest;
-use super::requests::most_demonstration_bytes;
+use super::requests::{DEMONSTRATION, most_demonstration_bytes};
 use super::search::{PolicyText, as_micros, report, take_for_search};
 use super::{Etude, Kind, PoolError, ServiceError};
 use crate::clock::Clock;
@@ -257,7 +257,8 @@ fn optimum(
     let started = clock.instant();
     let settings = Settings { upper_bound: Some(local_cost), ..request.settings };
     let mapping = mapper.map(&request.problem, settings, interrupt)?;
-    let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), ..stamp };
+    let warnings = request.problem.warnings(&DEMONSTRATION);
+    let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), warnings, ..stamp };
     report(&stamp, &mapping);
     if mapping.status != Status::Optimal || Policy::check_steps(mapper.model(), &mapping).is_err() {
         return Ok(Ok(None));

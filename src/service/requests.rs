@@ -25,6 +25,9 @@ use etude_core::interrupt::{Interrupt, time_until_finish};
 use etude_core::mapping::{Demonstration, Mapper, Options, Policy, Request, RequestKind, Stamp, WellFormed};
 use etude_core::model::Model;
 
+/// Where a request has its demonstration.
+pub(super) const DEMONSTRATION: Path<'static> = Path::Member(&Path::Root, "demonstration");
+
 /// Text up to this size takes little once it is parsed, whatever is in it: some 300 KiB.
 const MAX_UNCOUNTED_TEXT_BYTES: usize = 4096;
 

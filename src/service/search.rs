@@ -125,6 +125,7 @@ pub(super) fn follow(
     let stamp = Stamp {
         lookahead: request.lookahead.map(NonZeroU32::get),
         elapsed_us: as_micros(clock.elapsed(started)),
+        warnings: request.problem.warnings(path),
         ..stamp
     };
     report(&stamp, &mapping);

@@ -252,3 +252,33 @@ async fn a_fault_at_every_observation_is_told_once_with_how_often() {
     assert_eq!(pointers(&frames[2]["problem"]["errors"]), ["/states/2/gold", "/states/2/x"], "{frames:?}");
     service.stop().await;
 }
+
+#[tokio::test]
+async fn policies_warn_of_what_can_hardly_be_meant_and_keep_it() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/line", &line()).await;
+    service.put("/v1/learners/l", &json!({"attributes": ["x"]})).await;
+    let odd = json!([{"x": 0, "door": "Open"}, {"x": 2, "door": "shut"}]);
+    let request = json!({"model": "line", "demonstration": odd});
+    let at = |pointer: &str| {
+        json!([{
+            "pointer": pointer,
+            "detail": "no state has \"Open\": it differs from all of them alike; is \"open\" meant? (in 1 observation)",
+        }])
+    };
+    let (status, policy) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, &policy["warnings"]), (201, &at("/demonstration/0/door")), "{policy}");
+    let (_, read) = service.get(&format!("/v1/policies/{}", policy["id"].as_str().unwrap())).await;
+    assert_eq!(read, policy);
+    let (_, trial) = service.post("/v1/learners/l/trials", &request).await;
+    assert_eq!(trial["policy"]["warnings"], at("/demonstration/0/door"), "{trial}");
+    let right = json!([{"x": 0, "door": "open"}]);
+    let batch = json!({"model": "line", "items": [{"demonstration": right}, {"demonstration": odd}]});
+    let (_, answers) = service.post("/v1/policies:batch", &batch).await;
+    let warnings: Vec<_> = answers["items"].as_array().unwrap().iter().map(|item| &item["warnings"]).collect();
+    assert_eq!(warnings, [&json!([]), &at("/items/1/demonstration/0/door")], "{answers}");
+    // The answer is the same as if nothing had been said.
+    let told_of = json!({"model": "line", "demonstration": [{"x": 0, "door": "ajar"}, {"x": 2, "door": "shut"}]});
+    assert_eq!(service.post("/v1/policies", &told_of).await.1["steps"], policy["steps"]);
+    service.stop().await;
+}

@@ -64,6 +64,7 @@ mod recurrence;
 mod request;
 mod search;
 mod searchable;
+mod warnings;
 mod written;
 
 pub use budget::{Budget, StoppedBy};
@@ -77,4 +78,5 @@ pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, Too
 pub use problem::Problem;
 pub use request::{ObservationDocument, ObservedDocument, Options, Request, RequestKind, StartReference};
 pub use search::{Move, MoveKind};
+pub use warnings::{Warning, Watch};
 pub use written::{ShortSteps, WriteError, WrittenPolicy};

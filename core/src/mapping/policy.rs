@@ -5,7 +5,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::cost::{Cost, CostSum};
-use super::{Demonstration, Mapping, Move, MoveKind, Status, StoppedBy};
+use super::{Demonstration, Mapping, Move, MoveKind, Status, StoppedBy, Warning};
 use crate::attribute::{ByAttribute, Scalar};
 use crate::document::{Faults, Place};
 use crate::model::{Model, States};
@@ -29,6 +29,8 @@ pub struct Stamp {
     pub weights_version: Option<u64>,
     /// Wall-clock time of the search, in microseconds.
     pub elapsed_us: u64,
+    /// What the request says and can hardly mean.
+    pub warnings: Vec<Warning>,
 }
 
 /// What the imitator executes: the mapping's steps and costs, stamped with what produced it.
@@ -59,6 +61,8 @@ pub struct Policy {
     pub cost: Cost,
     /// No mapping costs less. `null` if nothing is known.
     pub lower_bound: Option<f64>,
+    /// What the request says and can hardly mean, each kind once for an attribute; they change nothing.
+    pub warnings: Vec<Warning>,
     /// The actions to execute, in order.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<String>, example = json!(["turn_left", "forward"])))]
     pub actions: Vec<Arc<str>>,
@@ -101,6 +105,8 @@ pub struct PolicySummary<'p> {
     pub cost: Cost,
     /// No mapping costs less. `null` if nothing is known.
     pub lower_bound: Option<f64>,
+    /// What the request says and can hardly mean.
+    pub warnings: &'p [Warning],
     /// How much of the demonstration was met exactly.
     pub coverage: Coverage,
     /// What the search took.

@@ -85,6 +85,7 @@ impl<'a> WrittenPolicy<'a> {
             status: mapping.status,
             cost: mapping.cost,
             lower_bound: mapping.lower_bound,
+            warnings: &stamp.warnings,
             coverage,
             search,
             refines: stamp.refines.as_deref(),

@@ -3,10 +3,11 @@
 use std::sync::{Arc, OnceLock};
 
 use super::explored::{Explored, Unexplored};
+use super::reach::Reach;
 use super::{
     Action, ActionIdx, Graph, Implicit, Limits, Operator, Outcome, Space, Start, StateIdx, States, Transition, Whole,
 };
-use crate::attribute::{ByAttribute, Scalar, Schema};
+use crate::attribute::{ByAttribute, Scalar, Schema, Value};
 use crate::interrupt::{Interrupt, Interrupted, Meter};
 
 /// A body in its world, ready to be searched.
@@ -34,6 +35,8 @@ pub struct Model {
     pub(super) unexplored: Option<Arc<dyn Unexplored>>,
     /// See [`Self::state_bytes`].
     pub(super) state_bytes: OnceLock<usize>,
+    /// Which values the states have, by attribute.
+    pub(super) reaches: OnceLock<Box<[Reach]>>,
 }
 
 impl Model {
@@ -57,6 +60,7 @@ impl Model {
             n_unsafe: 0,
             unexplored: None,
             state_bytes: OnceLock::new(),
+            reaches: OnceLock::new(),
         }
     }
 
@@ -168,6 +172,28 @@ impl Model {
         self.graph.successors(state).iter().enumerate().map(move |(n, Transition { action, to })| {
             let probability = probabilities.get(n).copied().unwrap_or(1.0);
             (*action, Outcome { to: *to, probability, cost: costs.get(n).and_then(|cost| cost.get()) })
+        })
+    }
+
+    /// Whether a state has this `value` of a category or of labels, the attribute at `attribute`. `O(1)` after the first call.
+    pub(crate) fn has_value(&self, attribute: usize, value: &Value) -> bool {
+        self.reaches()[attribute].has(value, self.states.domain(attribute))
+    }
+
+    /// From where to where the states' values go, if the attribute at `attribute` is a number. `O(1)` after the first call.
+    #[inline]
+    pub(crate) fn range(&self, attribute: usize) -> Option<(f64, f64)> {
+        match self.reaches()[attribute] {
+            Reach::Numbers { least, greatest } => Some((least, greatest)),
+            Reach::Few | Reach::Many { .. } => None,
+        }
+    }
+
+    #[inline]
+    fn reaches(&self) -> &[Reach] {
+        self.reaches.get_or_init(|| {
+            let attributes = self.schema.attributes().iter().enumerate();
+            attributes.map(|(at, attribute)| Reach::of(&attribute.kind, self.states.domain(at))).collect()
         })
     }
 

@@ -18,7 +18,7 @@
 //! | `action`, `room`, `states`, `rows`, `graph`, `operator`, `limits` | the parts |
 //! | `space` | states and transitions as a search sees them |
 //! | `implicit`, `explored` | rules by which states follow from one another; what was found by them |
-//! | `compiled`, `origin` | the model; where a request says that the imitator starts |
+//! | `reach`, `compiled`, `origin` | which values states have; the model; where a request says that the imitator starts |
 //! | `dynamics` | the seam: what every kind of dynamics is to the rest |
 //! | `table`, `wumpus` | the kinds, a folder each |
 //! | `kinds` | the list of kinds |
@@ -38,6 +38,7 @@ mod kinds;
 mod limits;
 mod operator;
 mod origin;
+mod reach;
 mod reading;
 mod room;
 mod rows;

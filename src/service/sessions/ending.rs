@@ -12,6 +12,7 @@ use crate::clock::Clock;
 use crate::memory::{Memory, NoRoom};
 use crate::service::ServiceError;
 use crate::service::refined::RefinedRequest;
+use crate::service::requests::DEMONSTRATION;
 use crate::service::search::{PolicyText, as_micros, report};
 use crate::store::NewRefinement;
 
@@ -89,7 +90,8 @@ pub(super) fn conclude(
     Policy::check_steps(mapper.model(), &mapping)?;
     let demonstration = read_stored(mapper, texts, (id, n_observations))?;
     let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
-    let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), ..stamp };
+    let warnings = problem.warnings(&DEMONSTRATION);
+    let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), warnings, ..stamp };
     report(&stamp, &mapping);
     let policy = SessionPolicy::of(stamp.id.clone(), mapper.model(), &mapping);
     let written = WrittenPolicy::new(&stamp, &problem, &mapping).map_err(ServiceError::from)?;
