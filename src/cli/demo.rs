@@ -70,7 +70,7 @@ async fn show(address: SocketAddr, out: &mut impl Write) -> Result<(), CliError>
 
     write!(out, "{}", render::cave(&model, &demonstration, &policy))?;
     writeln!(out, "    o demonstrator   x imitator   S start   W wumpus   G gold\n")?;
-    writeln!(out, "{}", render::steps(&policy))?;
+    writeln!(out, "{}", render::steps(&policy, render::width()))?;
     write!(out, "{}", render::totals(&policy))?;
 
     writeln!(

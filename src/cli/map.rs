@@ -106,7 +106,7 @@ impl Map {
             // Those who read the output by a program see it here.
             warnings.try_for_each(|warning| writeln!(io::stderr(), "warning: {warning}"))?;
         } else {
-            writeln!(out, "{}", render::steps(&policy))?;
+            writeln!(out, "{}", render::steps(&policy, render::width()))?;
             write!(out, "{}", render::totals(&policy))?;
             warnings.try_for_each(|warning| writeln!(out, "warning   {warning}"))?;
         }

@@ -8,32 +8,109 @@ use serde_json::Value;
 use etude_core::attribute::{ByAttribute, Scalar};
 use etude_core::mapping::{Cost, MoveKind, Policy, Step};
 
-/// The steps of a policy as a table: observation, move, action, state, distance, cost. Of a state, the attributes that
-/// have weight.
-pub(super) fn steps(policy: &Policy) -> Table {
+/// How wide what is printed may be: as the terminal, or [`WIDTH`] where there is none.
+pub(super) fn width() -> usize {
+    /// Less is of no use to a table.
+    const LEAST: u16 = 40;
+    match terminal_size::terminal_size_of(std::io::stdout()) {
+        Some((terminal_size::Width(width), _)) => width.max(LEAST).into(),
+        None => WIDTH,
+    }
+}
+
+/// Width of what is printed to a file or a pipe, so that it is the same wherever it is made.
+pub(super) const WIDTH: usize = 100;
+
+/// A column of a table.
+struct Column {
+    header: &'static str,
+    alignment: CellAlignment,
+    cells: Vec<String>,
+}
+
+impl Column {
+    fn new(header: &'static str, alignment: CellAlignment, cells: impl Iterator<Item = String>) -> Self {
+        Self { header, alignment, cells: cells.collect() }
+    }
+
+    /// How wide it is.
+    fn width(&self) -> usize {
+        let lines = self.cells.iter().flat_map(|cell| cell.lines());
+        lines.chain([self.header]).map(|line| line.chars().count()).max().unwrap_or(0)
+    }
+
+    /// Breaks its lines between words, so that it is no wider than `width`, but for words that are.
+    fn wrap(&mut self, width: usize) {
+        self.cells.iter_mut().for_each(|cell| *cell = wrapped(cell, width).join("\n"));
+    }
+}
+
+/// The steps of a policy as a table that is no wider than `width`, but for words that are: of the first step the whole state, of the
+/// others what changes, and where the state differs from what was observed. Only attributes that have weight are shown.
+pub(super) fn steps(policy: &Policy, width: usize) -> String {
+    /// Where the table is too wide, columns are left out in this order.
+    const OPTIONAL: [&str; 4] = ["differs in", "distance", "observation", "move"];
+    /// Between columns.
+    const GAP: usize = 2;
+    const STATE: &str = "state";
+    /// Widths that the states have at least, while there are columns to be left out: so many words fit, and long ones as far as that.
+    const LEAST: usize = 24;
+    const LEAST_OF_LONG_WORDS: usize = 40;
+    /// A list of attributes is not made wider for the longest that there is.
+    const MAX_DIFFERING: usize = 24;
+    use CellAlignment::{Left, Right};
+
+    let steps = &policy.steps;
+    let before = std::iter::once(None).chain(steps.iter().map(|step| Some(&step.state)));
+    let states = before.zip(steps).map(|(before, step)| changes(Some(&policy.weights), before, &step.state));
+    let differing = |step: &Step| {
+        let names: Vec<_> = step.distance_by_attribute.iter().map(|(name, _)| name).collect();
+        names.join(" ")
+    };
+    let action = |step: &Step| step.action.as_deref().unwrap_or("-").to_owned();
+    let mut columns = vec![
+        Column::new("step", Right, steps.iter().map(|step| step.step.to_string())),
+        Column::new("observation", Right, steps.iter().map(|step| step.observation.to_string())),
+        Column::new("move", Left, steps.iter().map(|step| name(step.kind).to_owned())),
+        Column::new("action", Left, steps.iter().map(action)),
+        Column::new(STATE, Left, states),
+        Column::new("distance", Right, steps.iter().map(|step| decimal(step.distance))),
+        Column::new("differs in", Left, steps.iter().map(differing)),
+        Column::new("cost", Right, steps.iter().map(|step| decimal(step.cost))),
+    ];
+    columns[6].wrap(MAX_DIFFERING);
+    let words = columns[4].cells.iter().flat_map(|state| state.split(' '));
+    let longest_word = words.map(|word| word.chars().count()).max().unwrap_or(0);
+    let least = longest_word.clamp(LEAST, LEAST_OF_LONG_WORDS);
+    let mut optional = OPTIONAL.into_iter();
+    let room = loop {
+        let others = columns.iter().filter(|column| column.header != STATE).map(|column| column.width() + GAP);
+        let room = width.saturating_sub(others.sum());
+        match optional.next().filter(|_| room < least) {
+            Some(left_out) => columns.retain(|column| column.header != left_out),
+            None => break room,
+        }
+    };
+    columns.iter_mut().filter(|column| column.header == STATE).for_each(|column| column.wrap(room.max(1)));
+    table(&columns, GAP)
+}
+
+/// The columns side by side.
+fn table(columns: &[Column], gap: usize) -> String {
     let mut table = Table::new();
     table.load_preset(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
-    for line in [TableComponent::HeaderLines, TableComponent::MiddleHeaderIntersections] {
-        table.set_style(line, '─');
+    table.set_style(TableComponent::HeaderLines, '─').remove_style(TableComponent::VerticalLines);
+    table.set_header(columns.iter().map(|column| column.header));
+    let n_rows = columns.first().map_or(0, |column| column.cells.len());
+    for row in 0..n_rows {
+        table.add_row(columns.iter().map(|column| &column.cells[row]));
     }
-    table.set_header(["step", "observation", "move", "action", "state", "distance", "cost"]);
-    for step in &policy.steps {
-        table.add_row([
-            step.step.to_string(),
-            step.observation.to_string(),
-            name(step.kind).to_owned(),
-            step.action.as_deref().unwrap_or("-").to_owned(),
-            state(Some(&policy.weights), &step.state),
-            decimal(step.distance),
-            decimal(step.cost),
-        ]);
+    let gap = u16::try_from(gap).unwrap_or(u16::MAX);
+    for (n, (column, laid_out)) in columns.iter().zip(table.column_iter_mut()).enumerate() {
+        laid_out.set_cell_alignment(column.alignment);
+        laid_out.set_padding((0, if n + 1 < columns.len() { gap } else { 0 }));
     }
-    for column in [0, 1, 5, 6] {
-        if let Some(column) = table.column_mut(column) {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
-    }
-    table
+    table.trim_fmt()
 }
 
 /// What a policy costs, what was proven of it, and what it took.
@@ -70,11 +147,31 @@ pub(super) fn name(kind: MoveKind) -> &'static str {
     }
 }
 
-/// The attributes of a state that have weight; all, if weights are not known.
-pub(super) fn state(weights: Option<&ByAttribute<f64>>, state: &ByAttribute<Scalar>) -> String {
+/// The attributes of a state that are others than `before`, all where that is not known; only those that have weight, if that is known.
+pub(super) fn changes(
+    weights: Option<&ByAttribute<f64>>,
+    before: Option<&ByAttribute<Scalar>>,
+    state: &ByAttribute<Scalar>,
+) -> String {
     let weighs = |name: &str| weights.is_none_or(|weights| weights.get(name).is_some_and(|weight| *weight > 0.0));
-    let shown = state.iter().filter(|(name, _)| weighs(name));
+    let is_other = |name: &str, value: &Scalar| before.and_then(|before| before.get(name)) != Some(value);
+    let shown = state.iter().filter(|(name, value)| weighs(name) && is_other(name, value));
     shown.map(|(name, value)| format!("{name}={value}")).collect::<Vec<_>>().join(" ")
+}
+
+/// The words of `text` on lines of at most `width` characters; a word that is longer stands alone.
+pub(super) fn wrapped(text: &str, width: usize) -> Vec<String> {
+    let mut lines: Vec<String> = Vec::new();
+    for word in text.split(' ') {
+        match lines.last_mut().filter(|line| line.chars().count() + 1 + word.chars().count() <= width) {
+            Some(line) => {
+                line.push(' ');
+                line.push_str(word);
+            }
+            None => lines.push(word.to_owned()),
+        }
+    }
+    lines
 }
 
 /// A cost with one decimal at least and six at most.
@@ -143,4 +240,49 @@ pub(super) fn cave(model: &Value, demonstration: &Value, policy: &Policy) -> Str
     }
     text.push('\n');
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const POLICY: &str = include_str!("../../examples/figure-4/policy.json");
+
+    fn widest(table: &str) -> usize {
+        table.lines().map(|line| line.chars().count()).max().unwrap()
+    }
+
+    #[test]
+    fn a_table_of_steps_shows_what_changes_and_where_the_state_differs() {
+        let policy: Policy = serde_json::from_str(POLICY).unwrap();
+        let table = steps(&policy, 100);
+        let lines: Vec<Vec<&str>> = table.lines().map(|line| line.split_whitespace().collect()).collect();
+        for line in [
+            "step observation move action state distance differs in cost",
+            "0 0 start - x=0 y=0 heading=east gold=0 0.0 0.0",
+            "arrows=1 outside=false",
+            "1 0 extra turn_left heading=north 1.0 heading 1.3",
+            "12 7 match grab gold=1 1.0 arrows 24.6",
+        ] {
+            let line: Vec<&str> = line.split(' ').collect();
+            assert!(lines.contains(&line), "{line:?}\n{table}");
+        }
+    }
+
+    #[test]
+    fn a_table_is_no_wider_than_what_it_is_shown_on() {
+        let policy: Policy = serde_json::from_str(POLICY).unwrap();
+        for width in (40..140).chain([200]) {
+            let table = steps(&policy, width);
+            assert!(widest(&table) <= width, "{width}\n{table}");
+            assert!(table.contains("action") && table.contains("state") && table.contains("cost"), "{table}");
+        }
+        assert_eq!(steps(&policy, 200).lines().count(), policy.steps.len() + 2);
+    }
+
+    #[test]
+    fn lines_are_broken_between_words() {
+        assert_eq!(wrapped("a bc defghi j k", 4), ["a bc", "defghi", "j k"]);
+        assert_eq!(wrapped("", 4), [""]);
+    }
 }

@@ -31,7 +31,7 @@ pub(super) async fn stream(
     let mut sides = Sides { out, left: String::new() };
     sides.left("observed")?;
     sides.right("committed")?;
-    let mut weights = None;
+    let (mut weights, mut last) = (None, None);
     while let Some(text) = answers.receive().await? {
         match serde_json::from_str(&text).map_err(io)? {
             Frame::Hello => {}
@@ -45,12 +45,15 @@ pub(super) async fn stream(
                 sides.left(&format!(
                     "{:>2} {}",
                     seen - 1,
-                    changed(weights.as_ref(), before, &observations[seen - 1])
+                    render::changes(weights.as_ref(), before, &observations[seen - 1])
                 ))?;
                 // What this observation commits is on its way before the next one is answered.
                 observe(seen).await;
             }
-            Frame::Step(step) => sides.right(&committed(weights.as_ref(), &step))?,
+            Frame::Step(step) => {
+                sides.right(&committed(weights.as_ref(), last.as_ref(), &step))?;
+                last = Some(step.state);
+            }
             Frame::Done { status, cost, .. } => {
                 sides.flush()?;
                 writeln!(out, "{}status    {}", render::cost(&cost), status.name())?;
@@ -101,22 +104,8 @@ impl<W: Write> Sides<'_, W> {
     }
 }
 
-/// What is other than in the observation before, of what has weight.
-fn changed(
-    weights: Option<&ByAttribute<f64>>,
-    before: Option<&ByAttribute<Scalar>>,
-    observation: &ByAttribute<Scalar>,
-) -> String {
-    let weighty = weights.into_iter().flat_map(ByAttribute::iter).filter(|(_, weight)| **weight > 0.0);
-    let changes = weighty.filter_map(|(name, _)| {
-        let value = observation.get(name)?;
-        let was = before.and_then(|before| before.get(name));
-        (was != Some(value)).then(|| format!("{name}={value}"))
-    });
-    changes.collect::<Vec<_>>().join(" ")
-}
-
-fn committed(weights: Option<&ByAttribute<f64>>, step: &StepFrame) -> String {
+/// A step as it is shown, with what it changes of the state `before`.
+fn committed(weights: Option<&ByAttribute<f64>>, before: Option<&ByAttribute<Scalar>>, step: &StepFrame) -> String {
     let how = if step.proven { "proven" } else { "lookahead" };
     format!(
         "{:>2} {:<5} {:>2} {:<10} {how:<9} {}",
@@ -124,6 +113,6 @@ fn committed(weights: Option<&ByAttribute<f64>>, step: &StepFrame) -> String {
         render::name(step.kind),
         step.observation,
         step.action.as_deref().unwrap_or("-"),
-        render::state(weights, &step.state),
+        render::changes(weights, before, &step.state),
     )
 }

@@ -39,11 +39,11 @@ fn the_demo_shows_the_cave_the_steps_and_the_totals() {
     for expected in [
         "  1 |  x  |  x  |  x  |  x  |  x  |  x  |     |",
         "  0 | oxS | ox  | ox  | o W | ox  | oxG |     |",
-        "12             7   match   grab         x=5 y=0 heading=east gold=1 arrows=1 outside=false         1.0   24.6",
+        "  12            7  match  grab        gold=1                            1.0  arrows            24.6",
         "cost      48.2 = actions 7.2 + distance 41.0",
         "status    optimal, lower bound 48.2",
-        "\n   8 heading=north       1 extra  0 turn_left  lookahead x=0 y=0 heading=north",
-        "\n  10 x=4                 5 match  3 forward    proven    x=2 y=1 heading=east",
+        "\n   8 heading=north       1 extra  0 turn_left  lookahead heading=north\n",
+        "\n  10 x=4                 5 match  3 forward    proven    x=2\n",
         "Weights after 31 trials, all 1 at first; their means give a policy with reward 974:",
         "  gold      6.05  ████",
     ] {

@@ -1,4 +1,4 @@
-//! `etude stream` on a terminal, where a progress line stands below the steps, and in a pipe, where none does.
+//! `etude stream` on a terminal, where a progress line stands below the steps, and in a pipe, where none does; tables that fit.
 
 use std::fs::File;
 use std::io::{Read, Write};
@@ -11,12 +11,10 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Winsize, tcsetwinsize};
 use serde_json::Value;
 
-/// Wide enough for every line.
-const N_COLUMNS: u16 = 200;
-
 /// A terminal, with what is shown on it.
 struct Terminal {
     controller: File,
+    n_columns: u16,
     lines: Vec<String>,
     /// Row and column of the cursor.
     cursor: (usize, usize),
@@ -26,15 +24,15 @@ struct Terminal {
 
 impl Terminal {
     /// Opens a terminal. Gives the side that a program has.
-    fn open() -> (Self, OwnedFd) {
+    fn open(n_columns: u16) -> (Self, OwnedFd) {
         let controller = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
         grantpt(&controller).unwrap();
         unlockpt(&controller).unwrap();
         let name = ptsname(&controller, Vec::new()).unwrap();
         let side = rustix::fs::open(name, OFlags::RDWR | OFlags::NOCTTY, Mode::empty()).unwrap();
-        tcsetwinsize(&side, Winsize { ws_row: 50, ws_col: N_COLUMNS, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
+        tcsetwinsize(&side, Winsize { ws_row: 50, ws_col: n_columns, ws_xpixel: 0, ws_ypixel: 0 }).unwrap();
         let controller = File::from(controller);
-        (Self { controller, lines: vec![String::new()], cursor: (0, 0), rest: Vec::new() }, side)
+        (Self { controller, n_columns, lines: vec![String::new()], cursor: (0, 0), rest: Vec::new() }, side)
     }
 
     /// Shows what comes next; gives whether something came.
@@ -70,7 +68,7 @@ impl Terminal {
                     line[column] = shown;
                     self.lines[row] = line.into_iter().collect();
                     self.cursor.1 += 1;
-                    assert!(self.cursor.1 <= N_COLUMNS.into(), "{:?}", self.lines[row]);
+                    assert!(self.cursor.1 <= self.n_columns.into(), "{:?}", self.lines[row]);
                 }
             }
         }
@@ -120,13 +118,13 @@ fn a_terminal_has_a_progress_line_below_the_steps_and_a_pipe_has_the_same_steps_
     assert!(!output.contains(['\x1b', '\r']), "{output:?}");
     let lines: Vec<&str> = output.lines().collect();
 
-    let (mut terminal, side) = Terminal::open();
+    let (mut terminal, side) = Terminal::open(100);
     let (mut child, mut input, _shown) = stream(side.try_clone().unwrap(), side);
     writeln!(input, "{}", observations[0]).unwrap();
     let progress = |lines: &[String]| lines.last().unwrap().trim_end().to_owned();
-    // Below the header and the start.
-    terminal.show_until(|lines| lines.len() == 3 && progress(lines).ends_with("1 observations in, 1 steps committed"));
-    assert_eq!(terminal.lines[..2], lines[..2]);
+    // Below the header and the start, whose state takes two lines.
+    terminal.show_until(|lines| lines.len() == 4 && progress(lines).ends_with("1 observations in, 1 steps committed"));
+    assert_eq!(terminal.lines[..3], lines[..3]);
     for observation in &observations[1..] {
         writeln!(input, "{observation}").unwrap();
     }
@@ -140,4 +138,28 @@ fn a_terminal_has_a_progress_line_below_the_steps_and_a_pipe_has_the_same_steps_
     // The progress is gone.
     assert_eq!(terminal.lines.pop().as_deref(), Some(""));
     assert_eq!(terminal.lines, lines);
+}
+
+#[test]
+fn a_table_fits_the_terminal_and_has_one_width_without_one() {
+    let arguments =
+        ["map", "--model", "examples/figure-4/model.json", "--demonstration", "examples/figure-4/demonstration.json"];
+    let etude = |output: Stdio| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
+        command.args(arguments).stdout(output).spawn().unwrap()
+    };
+    for (n_columns, least) in [(60, 50), (150, 110)] {
+        let (mut terminal, side) = Terminal::open(n_columns);
+        let mut child = etude(side.into());
+        let _watched = Watchdog::watch(child.id());
+        while terminal.show_more() {}
+        assert!(child.wait().unwrap().success());
+        let widest = terminal.lines.iter().map(|line| line.chars().count()).max().unwrap();
+        assert!((least..=n_columns.into()).contains(&widest), "{:#?}", terminal.lines);
+    }
+    let piped = etude(Stdio::piped()).wait_with_output().unwrap();
+    let output = std::str::from_utf8(&piped.stdout).unwrap();
+    let widest = output.lines().map(|line| line.chars().count()).max().unwrap();
+    assert!((90..=100).contains(&widest), "{output}");
+    assert!(!output.contains('\x1b'), "{output:?}");
 }

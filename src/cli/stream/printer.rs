@@ -8,7 +8,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use super::frames::{Frame, Problem, StepFrame};
 use crate::cli::{CliError, render};
-use etude_core::attribute::ByAttribute;
+use etude_core::attribute::{ByAttribute, Scalar};
 
 /// What a frame was, once it was printed.
 pub(super) enum Answer {
@@ -28,8 +28,32 @@ pub(super) struct Printer<'o, W> {
     /// Of the attributes. Those that weigh nothing are not shown.
     pub(super) weights: Option<ByAttribute<f64>>,
     n_steps: u64,
-    /// Widths of the columns of actions and states, which grow with what was seen.
-    widths: (usize, usize),
+    /// The state that the last step led to.
+    state: Option<ByAttribute<Scalar>>,
+    columns: Columns,
+}
+
+/// How the columns are laid out.
+#[derive(Clone, Copy)]
+struct Columns {
+    /// Grows with the names that were seen.
+    action_width: usize,
+    state_width: usize,
+    /// Whether there is room for when a step was committed, and whether it was proven.
+    with_proof: bool,
+}
+
+impl Columns {
+    /// Columns that are no wider than `width`, if that is not very narrow.
+    fn within(width: usize) -> Self {
+        /// Of the columns that always stand there, with two spaces between them and an action of common length.
+        const OTHERS: usize = 56;
+        const PROOF: usize = 15;
+        const LEAST: usize = 16;
+        let with_proof = OTHERS + PROOF + LEAST <= width;
+        let others = if with_proof { OTHERS + PROOF } else { OTHERS };
+        Self { action_width: 10, state_width: width.saturating_sub(others).clamp(LEAST, 60), with_proof }
+    }
 }
 
 impl<'o, W: Write> Printer<'o, W> {
@@ -40,7 +64,15 @@ impl<'o, W: Write> Printer<'o, W> {
             progress.set_style(style);
         }
         progress.set_message("0");
-        Self { out, is_json, progress, weights: None, n_steps: 0, widths: (10, 20) }
+        Self {
+            out,
+            is_json,
+            progress,
+            weights: None,
+            n_steps: 0,
+            state: None,
+            columns: Columns::within(render::width()),
+        }
     }
 
     pub(super) fn received(&self, n_observations: u32) {
@@ -60,17 +92,11 @@ impl<'o, W: Write> Printer<'o, W> {
                 self.n_steps += 1;
                 self.progress.set_message(self.n_steps.to_string());
                 if !self.is_json && self.n_steps == 1 {
-                    let state = render::state(self.weights.as_ref(), &step.state);
-                    // Room for what other states will take.
-                    self.widths.1 = state.chars().count() + 3;
-                    let (action_width, state_width) = self.widths;
-                    let header = format!(
-                        "step  observation  move   {:<action_width$}  {:<state_width$}  distance    cost  proven  after",
-                        "action", "state",
-                    );
+                    let header = self
+                        .row(["step", "observation", "move", "action", "distance", "cost", "proven", "after"], "state");
                     self.line(&header)?;
                 }
-                let line = if self.is_json { text.to_owned() } else { self.readable(&step) };
+                let line = if self.is_json { text.to_owned() } else { self.readable(step) };
                 self.line(&line)?;
                 Answer::Step
             }
@@ -98,21 +124,38 @@ impl<'o, W: Write> Printer<'o, W> {
         self.progress.println(text);
     }
 
-    fn readable(&mut self, step: &StepFrame) -> String {
-        let state = render::state(self.weights.as_ref(), &step.state);
+    fn readable(&mut self, step: StepFrame) -> String {
+        let state = render::changes(self.weights.as_ref(), self.state.as_ref(), &step.state);
         let action = step.action.as_deref().unwrap_or("-");
-        self.widths = (self.widths.0.max(action.len()), self.widths.1.max(state.chars().count()));
-        let (action_width, state_width) = self.widths;
-        format!(
-            "{:>4}  {:>11}  {:<5}  {action:<action_width$}  {state:<state_width$}  {:>8}  {:>6}  {:<6}  {:>5}",
-            step.step,
-            step.observation,
+        self.columns.action_width = self.columns.action_width.max(action.chars().count());
+        let cells = [
+            &*step.step.to_string(),
+            &step.observation.to_string(),
             render::name(step.kind),
-            render::decimal(step.distance),
-            render::decimal(step.cost),
+            action,
+            &render::decimal(step.distance),
+            &render::decimal(step.cost),
             if step.proven { "yes" } else { "no" },
-            step.after,
-        )
+            &step.after.to_string(),
+        ];
+        let row = self.row(cells, &state);
+        self.state = Some(step.state);
+        row
+    }
+
+    /// A row of the table, with the state between its fourth and fifth cell, on as many lines as that takes.
+    fn row(&self, [step, observation, kind, action, distance, cost, proven, after]: [&str; 8], state: &str) -> String {
+        let Columns { action_width, state_width, with_proof } = self.columns;
+        let begin = format!("{step:>4}  {observation:>11}  {kind:<5}  {action:<action_width$}");
+        let mut lines = render::wrapped(state, state_width).into_iter();
+        let mut row = format!("{begin}  {:<state_width$}  {distance:>8}  {cost:>6}", lines.next().unwrap_or_default());
+        if with_proof {
+            row += &format!("  {proven:<6}  {after:>5}");
+        }
+        for line in lines {
+            row += &format!("\n{:width$}  {line}", "", width = begin.chars().count());
+        }
+        row
     }
 
     /// Writes a line at once, above the progress line.
