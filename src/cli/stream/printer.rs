@@ -2,6 +2,7 @@
 //!
 //! Its columns are written by hand, as a table of comfy-table is laid out once all its rows are known: here each is shown at once.
 
+use std::fmt::Write as _;
 use std::io::Write;
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
@@ -150,10 +151,10 @@ impl<'o, W: Write> Printer<'o, W> {
         let mut lines = render::wrapped(state, state_width).into_iter();
         let mut row = format!("{begin}  {:<state_width$}  {distance:>8}  {cost:>6}", lines.next().unwrap_or_default());
         if with_proof {
-            row += &format!("  {proven:<6}  {after:>5}");
+            let _ = write!(row, "  {proven:<6}  {after:>5}");
         }
         for line in lines {
-            row += &format!("\n{:width$}  {line}", "", width = begin.chars().count());
+            let _ = write!(row, "\n{:width$}  {line}", "", width = begin.chars().count());
         }
         row
     }
