@@ -282,3 +282,68 @@ async fn policies_warn_of_what_can_hardly_be_meant_and_keep_it() {
     assert_eq!(service.post("/v1/policies", &told_of).await.1["steps"], policy["steps"]);
     service.stop().await;
 }
+
+#[tokio::test]
+async fn names_and_texts_that_differ_by_normalization_alone_are_equal() {
+    let service = Service::start(&[]).await;
+    /// Each letter with an accent as one, and as the letter and the accent.
+    fn forms(text: &str) -> [String; 2] {
+        [text.replace("o\u{308}", "\u{f6}").replace("u\u{308}", "\u{fc}"), text.to_owned()]
+    }
+    let model = |form: usize| {
+        let text = json!({
+            "attributes": [
+                {"name": "gro\u{308}\u{df}e", "kind": "number"}, {"name": "tu\u{308}r", "kind": "category"},
+                {"name": "richtung", "kind": "cyclic", "labels": ["su\u{308}d", "nord"]},
+            ],
+            "actions": [{"name": "o\u{308}ffnen", "cost": 0.3}],
+            "dynamics": {
+                "kind": "table", "states": [[0, "zu", "nord"], [0, "geo\u{308}ffnet", "su\u{308}d"]],
+                "transitions": [[0, "o\u{308}ffnen", 1]], "start": 0,
+            },
+        });
+        forms(&text.to_string())[form].clone()
+    };
+    let (status, composed) = send_text(&service, Method::PUT, "/v1/models/m", model(0)).await;
+    assert_eq!((status, &composed["attributes"][0]["name"]), (201, &json!("gr\u{f6}\u{df}e")), "{composed}");
+    let (status, same) = send_text(&service, Method::PUT, "/v1/models/m", model(1)).await;
+    assert_eq!((status, &same["hash"]), (200, &composed["hash"]));
+    // In ASCII, as some programs write it.
+    let (status, _) = send_text(&service, Method::PUT, "/v1/models/m", model(1).replace('\u{308}', "\\u0308")).await;
+    assert_eq!(status, 200);
+    let request = json!({
+        "model": "m", "weights": {"gro\u{308}\u{df}e": 2}, "start": {"tu\u{308}r": "zu"},
+        "demonstration": [{"tu\u{308}r": "zu"}, {"tu\u{308}r": "geo\u{308}ffnet", "richtung": "su\u{308}d"}, [0, "geo\u{308}ffnet", "su\u{308}d"]],
+    });
+    for form in forms(&request.to_string()) {
+        let (status, policy) = send_text(&service, Method::POST, "/v1/policies", form).await;
+        assert_eq!((status, &policy["cost"]["total"], &policy["warnings"]), (201, &json!(0.3), &json!([])), "{policy}");
+        assert_eq!(policy["weights"]["gr\u{f6}\u{df}e"], 2.0, "{policy}");
+    }
+    let learner = json!({"attributes": ["gro\u{308}\u{df}e"], "mean": {"gr\u{f6}\u{df}e": 3}});
+    assert_eq!(service.put("/v1/learners/l", &learner).await.0, 201);
+    let (status, trial) = service.post("/v1/learners/l/trials", &json!({"model": "m", "demonstration": [{}]})).await;
+    assert_eq!(status, 201, "{trial}");
+    // Both at once are one twice.
+    let twice = json!({
+        "model": "m", "weights": {"gro\u{308}\u{df}e": 2, "gr\u{f6}\u{df}e": 2},
+        "demonstration": [{"gro\u{308}\u{df}e": 2, "gr\u{f6}\u{df}e": 2}],
+    });
+    let (status, problem) = service.post("/v1/policies", &twice).await;
+    assert_eq!(
+        (status, pointers(&problem["errors"])),
+        (422, vec!["/demonstration/0/gr\u{f6}\u{df}e", "/weights/gr\u{f6}\u{df}e"])
+    );
+    let alike = json!([{"name": "o\u{308}", "kind": "number"}, {"name": "\u{f6}", "kind": "number"}]);
+    let mut model: Value = serde_json::from_str(&model(0)).unwrap();
+    model["attributes"] = alike;
+    model["actions"] = json!([{"name": "o\u{308}"}, {"name": "\u{f6}"}]);
+    let (_, problem) = service.put("/v1/models/alike", &model).await;
+    let twice = problem["errors"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .filter(|error| error["detail"].as_str().unwrap().contains("already"));
+    assert_eq!(twice.map(|error| &error["pointer"]).collect::<Vec<_>>(), ["/attributes/1/name", "/actions/1/name"]);
+    service.stop().await;
+}

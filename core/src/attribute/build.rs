@@ -181,9 +181,7 @@ impl Attribute {
             (Kind::Cyclic { cycle: Cycle::Labels(labels), .. }, Scalar::Text(text)) => {
                 labels.position(text).map(Value::Label)
             }
-            (Kind::Category, Scalar::Text(text)) => {
-                (text.len() <= Self::MAX_TEXT_BYTES).then(|| Value::Text(text.clone()))
-            }
+            (Kind::Category, Scalar::Text(text)) => Self::text(text).map(|text| Value::Text(text.into())),
             (Kind::Category, Scalar::Integer(integer)) => Some(Value::Integer(*integer)),
             (Kind::Category, Scalar::Boolean(flag)) => Some(Value::Boolean(*flag)),
             _ => None,

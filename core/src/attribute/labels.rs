@@ -3,6 +3,8 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
+use crate::document::normal;
+
 /// The labels of a cyclic attribute, in order around the circle. At least 1, all different.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Labels {
@@ -33,9 +35,9 @@ impl Labels {
         &self.names
     }
 
-    /// Where the label `name` stands, from 0. `O(1)`.
+    /// Where the label `name` stands, from 0, however it is [normalized](normal). `O(1)`.
     #[must_use]
     pub fn position(&self, name: &str) -> Option<u32> {
-        self.positions.get(name).copied()
+        self.positions.get(name).or_else(|| self.positions.get(normal(name).as_ref())).copied()
     }
 }

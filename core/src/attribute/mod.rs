@@ -18,6 +18,8 @@ mod schema;
 mod value;
 mod weights;
 
+use std::borrow::Cow;
+
 use serde::Serialize;
 
 pub use build::BuildError;
@@ -29,7 +31,7 @@ pub use schema::{AttributeDocument, KindName, Schema};
 pub use value::{Scalar, Value};
 pub use weights::Weights;
 
-use crate::document::{Faults, Place, Range, list_known, whole};
+use crate::document::{Faults, Place, Range, list_known, normal, whole};
 
 /// Largest cost of an action, and largest term of a distance; dimensionless. Keeps every sum along a path finite: even a
 /// hundred million of them stay below the largest float.
@@ -131,6 +133,13 @@ impl Attribute {
         if weight == 0.0 || delta == 0.0 { 0.0 } else { (weight * delta * delta).min(MAX_COST) }
     }
 
+    /// A label, or a string of a category, in the form in which it is compared; `None` if it is too long.
+    pub(crate) fn text(text: &str) -> Option<Cow<'_, str>> {
+        // Of what is longer, no more may have been kept.
+        let text = (text.len() <= Self::MAX_TEXT_BYTES).then(|| normal(text))?;
+        (text.len() <= Self::MAX_TEXT_BYTES).then_some(text)
+    }
+
     /// What its values are, as a fault says it.
     pub(crate) fn expected(&self) -> String {
         match &self.kind {
@@ -206,13 +215,9 @@ pub(crate) enum WrittenValue<'v> {
 }
 
 /// Reads a label, or a string of a category.
-fn read_text<'v>(place: &Place<'v, '_>, faults: &mut Faults) -> Option<&'v str> {
-    let text = place.string(faults)?;
-    if text.len() <= Attribute::MAX_TEXT_BYTES {
-        Some(text)
-    } else {
-        place.mismatch(&format!("a string of at most {} bytes", Attribute::MAX_TEXT_BYTES), faults)
-    }
+fn read_text<'v>(place: &Place<'v, '_>, faults: &mut Faults) -> Option<Cow<'v, str>> {
+    let text = Attribute::text(place.string(faults)?);
+    text.or_else(|| place.mismatch(&format!("a string of at most {} bytes", Attribute::MAX_TEXT_BYTES), faults))
 }
 
 #[cfg(test)]

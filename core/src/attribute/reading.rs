@@ -61,7 +61,7 @@ impl Visitor<'_> for ValueSeed<'_> {
 
     fn visit_str<E: Error>(self, text: &str) -> Result<Self::Value, E> {
         let read = match &self.0.kind {
-            Kind::Category => (text.len() <= Attribute::MAX_TEXT_BYTES).then(|| Value::Text(text.into())),
+            Kind::Category => Attribute::text(text).map(|text| Value::Text(text.into())),
             Kind::Cyclic { cycle: Cycle::Labels(labels), .. } => labels.position(text).map(Value::Label),
             Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. } => None,
         };

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::{Attribute, ByAttribute, Cycle, Kind, Labels, Value, Weights, read_text};
-use crate::document::{Faults, Path, Place, Quoted, Range, list_known};
+use crate::document::{Faults, Path, Place, Quoted, Range, TWICE, list_known, normal};
 
 /// The attributes of a model, in order. Names are unique.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,10 +47,10 @@ impl Schema {
         self.attributes.is_empty()
     }
 
-    /// The position of the attribute called `name`.
+    /// The position of the attribute called `name`, however that is [normalized](crate::document::normal).
     #[must_use]
     pub fn position(&self, name: &str) -> Option<usize> {
-        self.positions.get(name).copied()
+        self.positions.get(name).or_else(|| self.positions.get(normal(name).as_ref())).copied()
     }
 
     /// Names `items`, one per attribute.
@@ -82,10 +82,11 @@ impl Schema {
     /// Reads weights by attribute name: positions and weights of those that are named.
     pub fn read_named_weights(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<(usize, f64)>> {
         let object = place.open_object(faults)?;
-        let mut named = Vec::new();
+        let mut named: Vec<(usize, f64)> = Vec::new();
         for (name, member) in object.iter() {
             let weight = member.number(Range::NonNegative, faults);
             match (self.position(name), weight) {
+                (Some(position), _) if named.iter().any(|(known, _)| *known == position) => faults.note(&member, TWICE),
                 (Some(position), Some(weight)) => named.push((position, weight)),
                 (None, _) => self.note_unknown(name, &member, faults),
                 (Some(_), None) => {}
@@ -114,8 +115,19 @@ impl Schema {
                 return None;
             }
             Json::Object(_) => {
+                let mut seen: Vec<usize> = Vec::new();
                 for (name, member) in place.open_object(faults)?.iter() {
-                    match self.position(name) {
+                    let position = self.position(name);
+                    // Names that are written in the same way were told apart already.
+                    if !name.is_ascii()
+                        && let Some(position) = position
+                    {
+                        if seen.contains(&position) {
+                            faults.note(&member, TWICE);
+                        }
+                        seen.push(position);
+                    }
+                    match position {
                         Some(_) if member.value.is_null() => {}
                         Some(position) => {
                             observation[position] = self.attributes[position].read_value(&member, faults);
@@ -148,7 +160,7 @@ impl Schema {
             let item = place.item(n, item);
             let attribute = read_attribute(&item, faults);
             if let Some(name) = item.value.get("name").and_then(serde_json::Value::as_str)
-                && !names.insert(name)
+                && !names.insert(normal(name))
             {
                 let detail = format!("another attribute is called {} already", Quoted(name));
                 faults.note_at(&Path::Member(&item.path, "name"), detail);
@@ -204,9 +216,9 @@ fn read_attribute(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Attribut
 }
 
 fn read_name(place: &Place<'_, '_>, faults: &mut Faults) -> Option<String> {
-    let name = place.string(faults)?;
+    let name = normal(place.string(faults)?);
     if (1..=Attribute::MAX_NAME_CHARS).contains(&name.chars().count()) {
-        Some(name.to_owned())
+        Some(name.into_owned())
     } else {
         place.mismatch(&format!("a name of 1 to {} characters", Attribute::MAX_NAME_CHARS), faults)
     }
@@ -222,10 +234,10 @@ fn read_labels(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Labels> {
     for (n, item) in items.iter().enumerate() {
         let item = place.item(n, item);
         let Some(label) = read_text(&item, faults) else { continue };
-        if seen.insert(label) {
+        if seen.insert(label.clone()) {
             labels.push(label);
         } else {
-            faults.note(&item, format!("the label {} stands twice", Quoted(label)));
+            faults.note(&item, format!("the label {} stands twice", Quoted(&label)));
         }
     }
     (labels.len() == items.len()).then(|| Labels::new(labels.into_iter()))

@@ -15,6 +15,7 @@
 
 mod fault;
 mod members;
+mod normal;
 mod parsing;
 mod path;
 mod place;
@@ -24,6 +25,7 @@ mod size;
 
 pub use fault::{Fault, Faults};
 pub use members::Members;
+pub use normal::normal;
 pub(crate) use parsing::{BEYOND_FLOATS, BYTE_ORDER_MARK, TWICE};
 pub use parsing::{ParseError, parse};
 pub use path::Path;

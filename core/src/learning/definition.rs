@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Algorithm, Distribution, Learner};
 use crate::attribute::{Attribute, MAX_COST};
-use crate::document::{Faults, Object, Path, Place, Quoted, Range, list_known};
+use crate::document::{Faults, Object, Path, Place, Quoted, Range, list_known, normal};
 
 const DEFAULT_ALPHA: f64 = 0.5;
 const DEFAULT_BETA: f64 = 0.1;
@@ -121,12 +121,12 @@ fn read_attributes(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Arc
     let mut names: Vec<Arc<str>> = Vec::with_capacity(items.len());
     for (n, item) in items.iter().enumerate() {
         let item = place.item(n, item);
-        let Some(name) = item.string(faults) else { continue };
+        let Some(name) = item.string(faults).map(normal) else { continue };
         if !(1..=Attribute::MAX_NAME_CHARS).contains(&name.chars().count()) {
             item.mismatch::<()>(&format!("a name of 1 to {} characters", Attribute::MAX_NAME_CHARS), faults);
         }
         if names.iter().any(|other| **other == *name) {
-            faults.note(&item, format!("the attribute {} stands twice", Quoted(name)));
+            faults.note(&item, format!("the attribute {} stands twice", Quoted(&name)));
         }
         names.push(name.into());
     }
@@ -168,7 +168,7 @@ fn read_per_attribute(
     for (name, member) in place.open_object(faults)?.iter() {
         let number = member.number(Range::UpTo(MAX_COST), faults);
         let Some(names) = names else { continue };
-        if let Some(position) = names.iter().position(|other| **other == *name) {
+        if let Some(position) = names.iter().position(|other| **other == *normal(name)) {
             numbers[position] = number.unwrap_or(default);
         } else {
             let detail = format!("unknown attribute {}; the learner has {}", Quoted(name), list_known(names));

@@ -1,5 +1,6 @@
 //! Actions: what a body can do, and what it pays for it.
 
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::collections::hash_map::Entry;
 use std::sync::Arc;
@@ -7,7 +8,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use crate::attribute::MAX_COST;
-use crate::document::{Faults, Path, Place, Quoted, Range, list_known};
+use crate::document::{Faults, Path, Place, Quoted, Range, list_known, normal};
 
 /// Index of an action in its model.
 pub type ActionIdx = u16;
@@ -54,7 +55,7 @@ pub(super) struct ReadActions<'v> {
     /// `None` for each that is faulty, so that transitions can still be checked against the others.
     actions: Vec<Option<Action>>,
     /// The index of each name that could be read, faulty actions' too. Hashed with a seed, as clients choose the names.
-    positions: HashMap<&'v str, ActionIdx>,
+    positions: HashMap<Cow<'v, str>, ActionIdx>,
     /// Whether every action's name could be read.
     is_named: bool,
 }
@@ -73,7 +74,7 @@ impl<'v> ReadActions<'v> {
             read.actions.push(read_action(&place, default_cost, faults));
             match item.get("name").and_then(serde_json::Value::as_str) {
                 None => read.is_named = false,
-                Some(name) => match read.positions.entry(name) {
+                Some(name) => match read.positions.entry(normal(name)) {
                     Entry::Vacant(entry) => drop(entry.insert(index)),
                     Entry::Occupied(_) => {
                         let detail = format!("another action is called {} already", Quoted(name));
@@ -92,7 +93,7 @@ impl<'v> ReadActions<'v> {
             let index = place.index(self.actions.len(), "action", faults)?;
             return ActionIdx::try_from(index).ok();
         };
-        let position = self.positions.get(name).copied();
+        let position = self.positions.get(normal(name).as_ref()).copied();
         if position.is_none() && self.is_named {
             let names = self.actions.iter().flatten().map(|action| &action.name);
             return place.mismatch(&format!("one of the actions {}", list_known(names)), faults);
@@ -118,7 +119,7 @@ fn read_action(place: &Place<'_, '_>, default_cost: f64, faults: &mut Faults) ->
         None => Some(default_cost),
     };
     let place = object.required("name", faults)?;
-    let name = place.string(faults)?;
+    let name = normal(place.string(faults)?);
     if !(1..=Action::MAX_NAME_CHARS).contains(&name.chars().count()) {
         return place.mismatch(&format!("a name of 1 to {} characters", Action::MAX_NAME_CHARS), faults);
     }
