@@ -21,7 +21,7 @@ use axum::extract::WebSocketUpgrade;
 use axum::routing::get;
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{Mapper, OnlineMapping};
+use etude_core::mapping::{Conditions, Mapper, OnlineMapping};
 use etude_core::model::{Definition, Limits, Model};
 use futures_util::{SinkExt, StreamExt};
 use serde_json::{Value, json};
@@ -91,13 +91,13 @@ fn observe(world: &World, lookahead: Option<NonZeroU32>) -> Result<(), Failure> 
     let there = states.iter().map(read).collect::<Result<Vec<_>, _>>()?;
     // Back and forth, so that it never jumps.
     let period: Vec<_> = there.iter().chain(there.iter().rev()).collect();
-    let mut online = OnlineMapping::new(&mapper, schema.weights(), None, lookahead);
+    let mut online = OnlineMapping::new(&mapper, schema.weights(), Conditions::default(), lookahead);
     let marks = [10, 100, 10_000];
     let half = 9;
     let mut windows: [Vec<Duration>; 3] = Default::default();
     for (n, observation) in period.iter().cycle().take(marks[2] + half).enumerate() {
         let started = Instant::now();
-        std::hint::black_box(online.observe(observation, &mut Uninterrupted).map_err(|_| "nothing interrupts")?);
+        std::hint::black_box(online.observe(observation, None, &mut Uninterrupted).map_err(|_| "nothing interrupts")?);
         let taken = started.elapsed();
         for (mark, window) in marks.iter().zip(&mut windows) {
             if n.abs_diff(*mark) <= half {
@@ -344,11 +344,11 @@ fn observations_per_second(mapper: &Arc<Mapper>, states: &[Value]) -> Result<f64
     let schema = mapper.model().schema();
     let read = |state| schema.read_observation(&Place::root(state), &mut Faults::default()).ok_or("faults");
     let observations = states.iter().map(read).collect::<Result<Vec<_>, _>>()?;
-    let mut online = OnlineMapping::new(mapper, schema.weights(), None, NonZeroU32::new(8));
+    let mut online = OnlineMapping::new(mapper, schema.weights(), Conditions::default(), NonZeroU32::new(8));
     let started = Instant::now();
     let mut n_mapped = 0_u32;
     for observation in observations.iter().cycle() {
-        std::hint::black_box(online.observe(observation, &mut Uninterrupted).map_err(|_| "nothing interrupts")?);
+        std::hint::black_box(online.observe(observation, None, &mut Uninterrupted).map_err(|_| "nothing interrupts")?);
         n_mapped += 1;
         if n_mapped.is_multiple_of(64) && started.elapsed() >= ROUND / 2 {
             break;

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{Demonstration, Mapper, Problem, Settings};
+use etude_core::mapping::{Conditions, Demonstration, Mapper, Problem, Settings};
 use etude_core::model::{Definition, Format, Limits, Model, Origin};
 use serde_json::{Value, json};
 
@@ -90,7 +90,7 @@ fn problem(mapper: &Mapper, n_observations: u64) -> Problem<'_> {
     let mut faults = Faults::default();
     let read = Demonstration::read(model.schema(), &Place::root(&demonstration), &mut faults);
     let demonstration = faults.check(read).expect("the demonstration is of the belt");
-    Problem::new(model, demonstration, model.schema().weights(), Some(Origin::State(0)))
+    Problem::new(model, demonstration, model.schema().weights(), Conditions::starting_at(Origin::State(0)))
 }
 
 /// Writes the belt as it is read.

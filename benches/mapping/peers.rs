@@ -43,7 +43,7 @@ impl<'m> Peer<'m> {
             terms.collect()
         });
         let action_costs = model.actions().iter().map(|action| micro(action.cost)).collect();
-        Self { model, start: problem.start(), terms: terms.collect(), action_costs, n_expanded: Cell::new(0) }
+        Self { model, start: problem.closest_start(), terms: terms.collect(), action_costs, n_expanded: Cell::new(0) }
     }
 
     fn last(&self) -> u32 {

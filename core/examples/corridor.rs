@@ -6,7 +6,7 @@
 
 use etude_core::attribute::{Attribute, BuildError, Schema};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{Demonstration, Mapper, Problem, Settings};
+use etude_core::mapping::{Conditions, Demonstration, Mapper, Problem, Settings};
 use etude_core::model::ModelBuilder;
 
 fn main() -> Result<(), BuildError> {
@@ -25,7 +25,7 @@ fn main() -> Result<(), BuildError> {
 
     // What was seen: where the demonstrator was. Its door was never looked at.
     let demonstration = Demonstration::new(&schema, (0..4).map(|x| [Some(x.into()), None]))?;
-    let problem = Problem::new(mapper.model(), demonstration, schema.weights(), None);
+    let problem = Problem::new(mapper.model(), demonstration, schema.weights(), Conditions::default());
     let mapping = mapper.map(&problem, Settings::default(), &mut Uninterrupted).expect("nothing interrupts it");
     for step in &mapping.moves {
         let action = step.action.map_or("-".into(), |action| mapper.model().action_name(action));

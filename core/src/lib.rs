@@ -31,7 +31,7 @@
 //! ```
 //! use etude_core::attribute::{Attribute, Schema};
 //! use etude_core::interrupt::Uninterrupted;
-//! use etude_core::mapping::{Demonstration, Mapper, Problem, Settings};
+//! use etude_core::mapping::{Conditions, Demonstration, Mapper, Problem, Settings};
 //! use etude_core::model::ModelBuilder;
 //!
 //! let schema = Schema::new([Attribute::number("x")])?;
@@ -43,7 +43,7 @@
 //! let mapper = Mapper::new(body.build()?, &mut Uninterrupted)?;
 //!
 //! let demonstration = Demonstration::new(&schema, (0..3).map(|x| [Some(x.into())]))?;
-//! let problem = Problem::new(mapper.model(), demonstration, schema.weights(), None);
+//! let problem = Problem::new(mapper.model(), demonstration, schema.weights(), Conditions::default());
 //! let mapping = mapper.map(&problem, Settings::default(), &mut Uninterrupted)?;
 //! assert_eq!((mapping.moves.len(), mapping.cost.actions), (3, 0.6));
 //! # Ok::<(), Box<dyn std::error::Error>>(())

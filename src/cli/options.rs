@@ -17,9 +17,24 @@ pub(super) struct OptionFlags {
     /// Weight of an attribute; may be given for several.
     #[arg(long = "weight", value_name = "ATTRIBUTE=WEIGHT", value_parser = parse_weight)]
     weights: Vec<(String, f64)>,
-    /// Where the imitator starts: a state's index, or a JSON object of attribute values.
+    /// Where the imitator may start: a state's index, a JSON object of attribute values, or a JSON array of these.
     #[arg(long, value_name = "STATE", value_parser = parse_start)]
     start: Option<Value>,
+    /// What the distance to each observation counts, in order: a JSON array of numbers; 1 where it is null.
+    #[arg(long, value_name = "WEIGHTS", value_parser = parse_json)]
+    observation_weights: Option<Value>,
+    /// The part of the distance, 0 to 1, that an action pays that does not meet the next observation; 1 unless said.
+    #[arg(long, value_name = "PART")]
+    extra_weight: Option<f64>,
+    /// What the distance between the last state and the last observation costs once more; 0 unless said.
+    #[arg(long, value_name = "WEIGHT")]
+    end_weight: Option<f64>,
+    /// An action that the body lacks; may be given for several.
+    #[arg(long, value_name = "ACTION")]
+    without: Vec<String>,
+    /// What an action costs instead of what the model says; may be given for several.
+    #[arg(long = "action-cost", value_name = "ACTION=COST", value_parser = parse_action_cost)]
+    action_costs: Vec<(String, f64)>,
 }
 
 impl OptionFlags {
@@ -28,7 +43,16 @@ impl OptionFlags {
         for (attribute, weight) in &self.weights {
             request.set(&format!("--weight {attribute}={weight}"), &["weights", attribute], json!(weight))?;
         }
-        request.set_some("--start", "start", self.start.clone())
+        request.set_some("--start", "start", self.start.clone())?;
+        request.set_some("--observation-weights", "observation_weights", self.observation_weights.clone())?;
+        request.set_some("--extra-weight", "extra_weight", self.extra_weight.map(|weight| json!(weight)))?;
+        request.set_some("--end-weight", "end_weight", self.end_weight.map(|weight| json!(weight)))?;
+        let without = (!self.without.is_empty()).then(|| json!(self.without));
+        request.set_some("--without", "without", without)?;
+        for (action, cost) in &self.action_costs {
+            request.set(&format!("--action-cost {action}={cost}"), &["action_costs", action], json!(cost))?;
+        }
+        Ok(())
     }
 }
 
@@ -179,7 +203,15 @@ fn parse_start(text: &str) -> Result<Value, String> {
 }
 
 fn parse_weight(text: &str) -> Result<(String, f64), String> {
-    let (attribute, weight) = text.rsplit_once('=').ok_or("expected ATTRIBUTE=WEIGHT, such as x=2")?;
-    let weight: f64 = weight.parse().map_err(|_| format!("expected a number, found {weight:?}"))?;
-    if weight.is_finite() { Ok((attribute.to_owned(), weight)) } else { Err("expected a finite number".to_owned()) }
+    parse_named_number(text, "expected ATTRIBUTE=WEIGHT, such as x=2")
+}
+
+fn parse_action_cost(text: &str) -> Result<(String, f64), String> {
+    parse_named_number(text, "expected ACTION=COST, such as forward=2")
+}
+
+fn parse_named_number(text: &str, expected: &str) -> Result<(String, f64), String> {
+    let (name, number) = text.rsplit_once('=').ok_or(expected)?;
+    let number: f64 = number.parse().map_err(|_| format!("expected a number, found {number:?}"))?;
+    if number.is_finite() { Ok((name.to_owned(), number)) } else { Err("expected a finite number".to_owned()) }
 }

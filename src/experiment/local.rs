@@ -7,7 +7,7 @@ use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Interrupted, Uninterrupted};
 use etude_core::learning::{Distribution, Learner, LearnerDocument, MissingAttributes};
-use etude_core::mapping::{Demonstration, Mapper, Mapping, Problem, Settings};
+use etude_core::mapping::{Conditions, Demonstration, Mapper, Mapping, Problem, Settings};
 use etude_core::model::{CompileError, Definition, Limits, Model};
 
 /// Why a laboratory in this process could not do as asked.
@@ -130,7 +130,7 @@ fn follow(mapper: &Mapper, scene: &Scene, weights: Weights) -> Result<Followed, 
     let model = mapper.model();
     let mut faults = Faults::default();
     let demonstration = Demonstration::read(model.schema(), &Place::root(scene.demonstration()), &mut faults);
-    let problem = Problem::new(model, faults.check(demonstration)?, weights, None);
+    let problem = Problem::new(model, faults.check(demonstration)?, weights, Conditions::default());
     let Mapping { moves, cost, .. } = mapper.map(&problem, Settings::default(), &mut Uninterrupted)?;
     let actions = moves.iter().filter_map(|step| step.action).map(|action| model.action(action).name.to_string());
     Ok(Followed { actions: actions.collect(), cost: cost.total })

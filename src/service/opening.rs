@@ -6,8 +6,7 @@ use super::learners::LearnerState;
 use super::requests::{Names, base_weights};
 use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Object, Path};
-use etude_core::mapping::{Demonstration, Mapper, Options};
-use etude_core::model::Origin;
+use etude_core::mapping::{Conditions, Demonstration, Mapper, Options};
 
 /// Lookahead of a session that names none.
 const DEFAULT_LOOKAHEAD: u32 = 8;
@@ -47,7 +46,7 @@ pub(super) fn read_general(object: &Object<'_, '_>, faults: &mut Faults) -> Opti
 /// What a session is opened with.
 pub(super) struct SessionOptions {
     pub(super) weights: Weights,
-    pub(super) start: Option<u32>,
+    pub(super) conditions: Conditions,
     pub(super) lookahead: Option<NonZeroU32>,
 }
 
@@ -74,7 +73,7 @@ pub(super) fn read(
     }
     Some(SessionOptions {
         weights: options.weights_over(weights?),
-        start: options.start.and_then(Origin::state),
+        conditions: options.conditions(),
         lookahead: options.lookahead,
     })
 }

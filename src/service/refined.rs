@@ -8,8 +8,8 @@ use serde_json::value::RawValue;
 use super::ServiceError;
 use crate::store::NewRefinement;
 use etude_core::attribute::ByAttribute;
-use etude_core::mapping::{Cost, Problem, Stamp};
-use etude_core::model::{Model, StateIdx};
+use etude_core::mapping::{Conditions, Cost, Problem, Stamp};
+use etude_core::model::Model;
 
 /// What is to be refined: the problem that a finite lookahead has decided. As it waits in the store, JSON.
 #[derive(Debug, Serialize, Deserialize)]
@@ -17,7 +17,8 @@ pub(super) struct RefinedRequest<'t> {
     #[serde(borrow)]
     pub(super) model: Cow<'t, str>,
     pub(super) weights: ByAttribute<f64>,
-    pub(super) start: StateIdx,
+    #[serde(default, skip_serializing_if = "Conditions::are_default")]
+    pub(super) conditions: Conditions,
     /// What the policy costs.
     pub(super) cost: f64,
     /// What was observed, unless a session has it.
@@ -31,7 +32,7 @@ impl<'t> RefinedRequest<'t> {
         Self {
             model: model.into(),
             weights: problem.named_weights(),
-            start: problem.start(),
+            conditions: problem.conditions().clone(),
             cost: cost.total,
             demonstration: None,
         }

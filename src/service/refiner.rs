@@ -27,7 +27,6 @@ use crate::store::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreErr
 use etude_core::attribute::Weights;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
 use etude_core::mapping::{Demonstration, Mapper, Policy, Problem, Request, Settings, Stamp, Status, WrittenPolicy};
-use etude_core::model::{Model, Origin, StateIdx};
 
 /// The first pause after a refinement that did not come to its end.
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
@@ -194,7 +193,7 @@ impl Etude {
             }
             (None, None) => (Vec::new(), None),
         };
-        let RefinedRequest { model, weights, start, cost, .. } = refined;
+        let RefinedRequest { model, weights, conditions, cost, .. } = refined;
         let stamp = Stamp {
             id: Some(self.ids.next().to_string()),
             model: model.into_owned(),
@@ -209,12 +208,12 @@ impl Etude {
             let corrupt = |error| ServiceError::unreadable("refinements", "request", policy_id, error);
             let schema = mapper.model().schema();
             let weights = schema.attributes().iter().map(|attribute| weights.get(&attribute.name).copied());
-            let demonstration = Demonstration::read_again(schema, &texts, 0);
+            let demonstration = Demonstration::read_stored(schema, &texts, 0);
             let problem = match (demonstration, weights.collect::<Option<Vec<f64>>>()) {
                 (Err(error), _) => return Ok(Err(corrupt(error.to_string()))),
-                (Ok(Some(demonstration)), Some(weights)) if has_state(mapper.model(), start) => {
-                    let start = Some(Origin::State(start));
-                    Problem::new(mapper.model(), demonstration, Weights::of(weights), start)
+                // What each observation counts is among the conditions.
+                (Ok(Some((demonstration, _))), Some(weights)) if conditions.fit(mapper.model()) => {
+                    Problem::new(mapper.model(), demonstration, Weights::of(weights), conditions)
                 }
                 _ => return Ok(Err(corrupt("it does not fit its model".to_owned()))),
             };
@@ -225,11 +224,6 @@ impl Etude {
         };
         self.pool.run_to_spare(job).await?
     }
-}
-
-/// Whether a model, which was registered anew perhaps, has this state.
-fn has_state(model: &Model, state: StateIdx) -> bool {
-    !model.is_lazy() && state < model.states().len()
 }
 
 /// Whether what has failed may go through later: nothing is wrong with the refinement itself.

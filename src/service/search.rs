@@ -13,6 +13,7 @@ use super::refined::RefinedRequest;
 use crate::clock::Clock;
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
 use crate::store::{NewPolicy, NewRefinement, pack_steps};
+use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Path};
 use etude_core::interrupt::{Cancelled, Interrupt};
 use etude_core::mapping::{Demonstration, Mapper, Mapping, Policy, Request, Stamp, Status, WrittenPolicy};
@@ -79,6 +80,8 @@ pub(super) struct Searched {
     pub(super) policy: String,
     /// `None` if it is not to be stored.
     pub(super) row: Option<PolicyText>,
+    /// The weights of the distance, those that the request names among them.
+    pub(super) weights: Weights,
     /// What is to be done about the policy, if it is local and to be stored.
     pub(super) refinement: Option<NewRefinement>,
     /// For all of this, if it is much.
@@ -154,7 +157,8 @@ pub(super) fn follow(
         let row = stamp.id.is_some().then(|| PolicyText::of(stamp, written)).transpose()?;
         // What was estimated may have been too little.
         memory.hold(&mut held, N_COPIES * policy.len() + n_refined_bytes)?;
-        Ok(Searched { policy, row, refinement, held })
+        let weights = request.problem.weights().clone();
+        Ok(Searched { policy, row, weights, refinement, held })
     });
     Ok(written)
 }

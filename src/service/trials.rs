@@ -124,11 +124,14 @@ impl Etude {
                 let number = numbers.take();
                 let drawn = learner.draw(&weights.distribution, number);
                 let all = learner.weights_for(model.schema(), &drawn).ok()?;
-                Some((all, (number, write(&learner.by_attribute(drawn)))))
+                // Where what was drawn stands among all, of which the request may have pinned some.
+                let positions = learner.attributes().iter().filter_map(|name| model.schema().position(name)).collect();
+                Some((all, (number, positions)))
             }
         };
         let searched = self.search(RequestKind::Trial, &body, stamp, caller, draw).await?;
-        let Some((searched, (number, weights))) = searched else {
+        let Some((searched, (number, positions))) = searched else {
+            let learner = Arc::clone(&learner);
             let check = move |object: &Object<'_, '_>, model: &Model, _: Option<&LearnerState>, faults: &mut Faults| {
                 let weights = |faults: &mut Faults| {
                     check_attributes(&learner, model, faults);
@@ -139,8 +142,10 @@ impl Etude {
             return Err(Box::pin(self.explain(RequestKind::Trial, body, caller, check)).await);
         };
         drop(body);
-        let Searched { policy, row, refinement, held } = searched;
-        let weights = weights?;
+        let Searched { policy, row, refinement, held, weights } = searched;
+        let positions: Vec<usize> = positions;
+        let weights = positions.into_iter().map(|position| weights.as_slice()[position]);
+        let weights = write(&learner.by_attribute(weights))?;
 
         let now = as_stored(caller.now);
         let lease_expires_at = now.checked_add(Duration::from_secs(lease_s)).unwrap_or(Timestamp::MAX);

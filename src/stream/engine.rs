@@ -213,7 +213,12 @@ impl Connection<'_> {
             (ClientFrame::Observe { seq, frame }, Some(session)) => {
                 let root = Place::root(&frame);
                 let states = Place { value: &frame["states"], path: document::Path::Member(&root.path, "states") };
-                let received = match session.receive(self.etude, seq, &states, now).await {
+                let weights = root.value.get("observation_weights").filter(|weights| !weights.is_null());
+                let weights = weights.map(|value| {
+                    let path = document::Path::Member(&root.path, "observation_weights");
+                    Place { value, path }
+                });
+                let received = match session.receive(self.etude, seq, &states, weights.as_ref(), now).await {
                     Ok(received) => received,
                     Err(error) => return self.go_on_or_end(&error).await,
                 };

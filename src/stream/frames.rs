@@ -9,7 +9,7 @@ use utoipa::ToSchema;
 use crate::service::SessionPolicy;
 use etude_core::attribute::{ByAttribute, Scalar};
 use etude_core::document::{Fault, Faults, Place};
-use etude_core::mapping::{CommittedStep, Cost, MoveKind, Status, Step};
+use etude_core::mapping::{CommittedStep, Cost, MoveKind, PolicyEnd, Status, Step};
 
 /// What a client sends.
 #[derive(Clone, Debug, PartialEq)]
@@ -70,7 +70,7 @@ impl ClientFrame {
         match kind.string(faults)? {
             "open" => Some(Self::Open(Value::Null)),
             "observe" => {
-                root.object(&["type", "seq", "states"], faults)?;
+                root.object(&["type", "seq", "states", "observation_weights"], faults)?;
                 let states = object.required("states", faults).and_then(|place| place.array(faults).map(drop));
                 let seq = count("seq", faults);
                 states?;
@@ -146,6 +146,8 @@ pub enum ServerFrame<'f> {
         status: Status,
         /// What it costs.
         cost: Cost,
+        /// How it ends: whether it succeeded.
+        end: &'f PolicyEnd,
         /// Its actions, in order; `None` where they are left out, as the frame would be too long.
         #[serde(skip_serializing_if = "Option::is_none")]
         #[schema(value_type = Vec<String>, required = false)]
@@ -189,8 +191,8 @@ impl ServerFrame<'_> {
     pub fn text_within(&self, max_bytes: usize) -> Result<String, WriteError> {
         let written = write_within(self, max_bytes);
         match (self, written) {
-            (Self::Done { actions: Some(_), policy_id, status, cost }, Err(WriteError::TooLong)) => {
-                let shorter = Self::Done { actions: None, policy_id: *policy_id, status: *status, cost: *cost };
+            (Self::Done { actions: Some(_), policy_id, status, cost, end }, Err(WriteError::TooLong)) => {
+                let shorter = Self::Done { actions: None, policy_id: *policy_id, status: *status, cost: *cost, end };
                 write_within(&shorter, max_bytes)
             }
             (Self::Error { problem }, Err(WriteError::TooLong)) if !problem.errors.is_empty() => {
@@ -303,8 +305,8 @@ impl<'f> From<&'f CommittedStep> for StepFrame<'f> {
 
 impl<'f> From<&'f SessionPolicy> for ServerFrame<'f> {
     fn from(policy: &'f SessionPolicy) -> Self {
-        let SessionPolicy { id, status, cost, actions } = policy;
-        Self::Done { policy_id: id.as_deref(), status: *status, cost: *cost, actions: Some(actions) }
+        let SessionPolicy { id, status, cost, end, actions } = policy;
+        Self::Done { policy_id: id.as_deref(), status: *status, cost: *cost, end, actions: Some(actions) }
     }
 }
 
@@ -349,8 +351,10 @@ mod tests {
     #[test]
     fn a_frame_that_would_be_too_long_leaves_out_what_can_be_had_otherwise() {
         let actions: Vec<Arc<str>> = vec!["forward".into(); 100];
-        let cost = Cost { total: 0.0, actions: 0.0, distance: 0.0 };
-        let done = |actions| ServerFrame::Done { policy_id: Some("7"), status: Status::Local, cost, actions };
+        let cost = Cost { total: 0.0, actions: 0.0, distance: 0.0, end: 0.0 };
+        let end = PolicyEnd { distance: 1.0, distance_by_attribute: [("x".into(), 1.0)].into_iter().collect() };
+        let done =
+            |actions| ServerFrame::Done { policy_id: Some("7"), status: Status::Local, cost, end: &end, actions };
         let (done, without) = (done(Some(&actions[..])), done(None));
         let whole = serde_json::to_string(&done).unwrap();
         assert_eq!(done.text_within(whole.len()).unwrap(), whole);

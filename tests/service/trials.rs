@@ -325,11 +325,11 @@ async fn bad_input_gets_a_clear_answer_and_changes_nothing() {
     assert_eq!(kind(&service.post("/v1/policies", &request).await), (404, "/problems/unknown-learner"));
 
     // Requests with faults take no number.
-    let faulty = json!({"model": "figure-6", "demonstration": [{"color": 1}], "start": -1, "weights": {}});
+    let faulty = json!({"model": "figure-6", "demonstration": [{"color": 1}], "start": -1, "learner": "gold"});
     let (status, problem) = service.post("/v1/learners/gold/trials", &faulty).await;
     let mut found = pointers(&problem);
     found.sort_unstable();
-    assert_eq!((status, found), (422, vec!["/demonstration/0/color", "/start", "/weights"]));
+    assert_eq!((status, found), (422, vec!["/demonstration/0/color", "/learner", "/start"]));
     assert_eq!(
         kind(&service.post("/v1/learners/nobody/trials", &trial_request()).await).1,
         "/problems/unknown-learner"

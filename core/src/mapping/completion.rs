@@ -47,7 +47,7 @@ impl<'i> Allowance<'i> {
 }
 
 /// Extends `path` to the last observation, each time by the move of least cost plus estimate; where `allowance` is used
-/// up, by skipping on. Takes `O(n_observations * (1 + extras))` looks at a state's successors.
+/// up, by skipping on. There, extra actions may follow that save more of what ending costs. Takes `O(n_observations * (1 + extras))` looks at a state's successors.
 ///
 /// # Errors
 ///
@@ -60,21 +60,21 @@ pub(super) fn complete<S: Space, H: Heuristic>(
     mut path: Vec<Move>,
     allowance: &mut Allowance<'_>,
 ) -> Result<Vec<Move>, Cancelled> {
-    let end = path.last().copied().filter(|end| (end.observation as usize) < problem.last());
-    let Some(end) = end else { return Ok(path) };
+    let Some(end) = path.last().copied() else { return Ok(path) };
     let (mut i, mut state) = (end.observation as usize, end.state);
     let mut seen = vec![state];
-    while i < problem.last() {
+    let may_linger = |seen: &[StateIdx]| extras == Extras::Allowed && seen.len() <= MAX_EXTRAS;
+    while i < problem.last() || (problem.end.is_some() && may_linger(&seen)) {
         space.explore(state);
         let n_looks = 1 + 2 * space.successors(state).len() as u64;
         if !allowance.spend(n_looks * heuristic.work(i))? {
-            i += 1;
-            path.push(skip_to(i, state));
-            continue;
+            let skipped = i + 1..=problem.last();
+            path.extend(skipped.map(|i| skip_to(i, state)));
+            break;
         }
-        let may_linger = extras == Extras::Allowed && seen.len() <= MAX_EXTRAS;
-        let (step, next) = best_move(problem, space, heuristic, i, state, may_linger.then_some(&seen));
-        i = next;
+        let seen_here = may_linger(&seen).then_some(seen.as_slice());
+        let Some(step) = best_move(problem, space, heuristic, i, state, seen_here) else { break };
+        i = step.observation as usize;
         state = step.state;
         if step.kind != MoveKind::Extra {
             seen.clear();
@@ -91,37 +91,46 @@ fn skip_to(i: usize, state: StateIdx) -> Move {
     Move { kind: MoveKind::Skip, action: None, observation, state }
 }
 
-/// The move out of `(i, state)` of least cost plus estimate, the first found among equals, and the observation it leads
-/// to. Extra actions are looked at if `seen` is given, and may not lead to the states in it.
+/// The move out of `(i, state)` of least cost plus estimate, the first found among equals; `None` if it is best to end there. Extra actions
+/// are looked at if `seen` is given, and may not lead to the states in it.
 fn best_move<S: Space, H: Heuristic>(
     problem: &Problem<'_>,
     space: &S,
     heuristic: &H,
     i: usize,
     state: StateIdx,
-    seen: Option<&Vec<StateIdx>>,
-) -> (Move, usize) {
+    seen: Option<&[StateIdx]>,
+) -> Option<Move> {
+    let recurrence = problem.recurrence();
     let estimate = |kind: MoveKind, i: usize, state, cost: f64| {
         let row = space.row(state);
-        kind.arrive(cost, problem.distances.distance(i, row)) + heuristic.cost_to_go(i, row)
+        // The cost of ending here, as an estimate may say that an action saves some of it that does not.
+        let to_go = if i < problem.last() { heuristic.cost_to_go(i, row) } else { problem.end_cost(row) };
+        recurrence.arrive(kind, cost, problem.distances.distance(i, row)) + to_go
     };
     #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
-    let step = |kind, action, i: usize, state| Move { kind, action, observation: i as u32, state };
+    let step = |kind, action, i: usize, state| Move { kind, action: Some(action), observation: i as u32, state };
 
-    let mut best = (estimate(MoveKind::Skip, i + 1, state, 0.0), skip_to(i + 1, state), i + 1);
-    for transition in space.successors(state) {
+    let may_advance = i < problem.last();
+    let mut best = if may_advance {
+        (estimate(MoveKind::Skip, i + 1, state, 0.0), Some(skip_to(i + 1, state)))
+    } else {
+        (problem.end_cost(space.row(state)), None)
+    };
+    for (transition, cost) in problem.body.ways(space, state) {
         let (action, to) = (transition.action, transition.to);
-        let cost = problem.model.action(action).cost;
-        let advanced = estimate(MoveKind::Match, i + 1, to, cost);
-        if advanced < best.0 {
-            best = (advanced, step(MoveKind::Match, Some(action), i + 1, to), i + 1);
+        if may_advance {
+            let advanced = estimate(MoveKind::Match, i + 1, to, cost);
+            if advanced < best.0 {
+                best = (advanced, Some(step(MoveKind::Match, action, i + 1, to)));
+            }
         }
         if seen.is_some_and(|seen| !seen.contains(&to)) {
             let lingered = estimate(MoveKind::Extra, i, to, cost);
             if lingered < best.0 {
-                best = (lingered, step(MoveKind::Extra, Some(action), i, to), i);
+                best = (lingered, Some(step(MoveKind::Extra, action, i, to)));
             }
         }
     }
-    (best.1, best.2)
+    best.1
 }

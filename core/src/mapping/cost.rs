@@ -9,11 +9,11 @@ use crate::model::Space;
 /// rounding.
 pub(super) const SLACK: f64 = 1e-9;
 
-/// What a mapping costs: `C = C_a + C_s`. Dimensionless; finite, at least 0.
+/// What a mapping costs: `C = C_a + C_s`, and what its end costs. Dimensionless; finite, at least 0.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct Cost {
-    /// The whole, `actions + distance`.
+    /// The whole, `actions + distance + end`.
     #[cfg_attr(feature = "openapi", schema(example = 48.2))]
     pub total: f64,
     /// Costs of the actions taken, `C_a`.
@@ -22,6 +22,9 @@ pub struct Cost {
     /// Weighted distances between observed and own states, one per step, `C_s`.
     #[cfg_attr(feature = "openapi", schema(example = 41.0))]
     pub distance: f64,
+    /// What the weighted distance of the last state to the last observation costs once more: times the `end_weight` of the request.
+    #[cfg_attr(feature = "openapi", schema(example = 0.0))]
+    pub end: f64,
 }
 
 /// Sums the cost of a mapping step by step: exactly, to within an ulp, and then to the 15 significant digits that a float
@@ -30,7 +33,9 @@ pub struct Cost {
 pub(super) struct CostSum {
     actions: CompensatedSum,
     distance: CompensatedSum,
+    /// Of all steps, and of the end once that was added.
     total: CompensatedSum,
+    end: f64,
 }
 
 impl CostSum {
@@ -42,12 +47,19 @@ impl CostSum {
         self.total.add(distance);
     }
 
-    /// The sums so far.
-    pub(super) fn cost(&self) -> Cost {
-        Cost { total: self.total(), actions: as_decimal(self.actions), distance: as_decimal(self.distance) }
+    /// Adds what ending costs, after all steps.
+    pub(super) fn end(&mut self, cost: f64) {
+        self.end = cost;
+        self.total.add(cost);
     }
 
-    /// What all steps cost so far.
+    /// The sums so far.
+    pub(super) fn cost(&self) -> Cost {
+        let (actions, distance) = (as_decimal(self.actions), as_decimal(self.distance));
+        Cost { total: self.total(), actions, distance, end: self.end }
+    }
+
+    /// What all is that was added so far.
     pub(super) fn total(&self) -> f64 {
         as_decimal(self.total)
     }
@@ -65,14 +77,27 @@ pub(super) fn rounding_of_sums(n_observations: usize) -> f64 {
     f64::EPSILON * (8.0 + n_steps / 16.0)
 }
 
-/// The cost of `moves` in `space`.
-pub(super) fn cost_of(problem: &Problem<'_>, space: &impl Space, moves: &[Move]) -> Cost {
-    let mut sum = CostSum::default();
-    for step in moves {
-        let action_cost = step.action.map_or(0.0, |action| problem.model.action(action).cost);
-        let distance = problem.distances.distance(step.observation as usize, space.row(step.state));
-        sum.add(action_cost, step.kind.paid(distance));
+/// What the action of each of `moves` costs in `space`; 0 without one.
+pub(super) fn action_costs(problem: &Problem<'_>, space: &impl Space, moves: &[Move]) -> Vec<f64> {
+    let mut from = 0;
+    let costs = moves.iter().map(|step| {
+        let from = std::mem::replace(&mut from, step.state);
+        step.action.map_or(0.0, |action| problem.body.step_cost(space, from, action, step.state))
+    });
+    costs.collect()
+}
+
+/// The cost of `moves` in `space`, whose actions cost so much.
+pub(super) fn cost_of(problem: &Problem<'_>, space: &impl Space, moves: &[Move], action_costs: &[f64]) -> Cost {
+    let (mut sum, recurrence) = (CostSum::default(), problem.recurrence());
+    for (step, action_cost) in moves.iter().zip(action_costs) {
+        let terms = problem.distances.terms(step.observation as usize, space.row(step.state));
+        // As a step's terms are told: what it pays is their sum.
+        let distance = terms.fold(0.0, |sum, (_, term)| sum + recurrence.paid(step.kind, term));
+        sum.add(*action_cost, distance);
     }
+    let end = moves.last().map_or(0.0, |step| problem.end_cost(space.row(step.state)));
+    sum.end(end);
     sum.cost()
 }
 
@@ -130,7 +155,8 @@ mod tests {
         for n in 1..=100_u32 {
             sum.add(0.3, 2.1);
             let decimal = |tenths: u32| f64::from(tenths) / 10.0;
-            let expected = Cost { total: decimal(24 * n), actions: decimal(3 * n), distance: decimal(21 * n) };
+            let expected =
+                Cost { total: decimal(24 * n), actions: decimal(3 * n), distance: decimal(21 * n), end: 0.0 };
             assert_eq!(sum.cost(), expected, "after {n} steps");
         }
         assert_eq!(sum.cost().actions, 30.0);

@@ -82,22 +82,29 @@ impl Demonstration {
         Some(observations)
     }
 
-    /// Reads observations that were read without faults before: arrays of them, one after the other, `n_observations` in all. `None` if
-    /// there are none.
+    /// Reads observations that were read without faults before: arrays of them, one after the other, `n_observations` in all. A number
+    /// before one is what it counts. Gives them with what they count, as far as that is told of any. `None` if there are none.
     ///
     /// # Errors
     ///
     /// If they are something else.
-    pub fn read_again(
+    pub fn read_stored(
         schema: &Schema,
         texts: &[String],
         n_observations: usize,
-    ) -> Result<Option<Self>, serde_json::Error> {
+    ) -> Result<Option<(Self, Vec<Option<f64>>)>, serde_json::Error> {
         let mut values = Vec::with_capacity(n_observations * schema.len());
+        let mut weights = Vec::new();
         for text in texts {
-            values.extend(WellFormed::in_text(schema, text.len()).read(text)?.values);
+            let first = values.len() / schema.len();
+            let (read, of_text) = WellFormed::in_text(schema, text.len()).read_weighted(text)?;
+            values.extend(read.values);
+            if !of_text.is_empty() {
+                weights.resize(first, None);
+                weights.extend(of_text);
+            }
         }
-        Ok((!values.is_empty()).then_some(Self { values, n_attributes: schema.len() }))
+        Ok((!values.is_empty()).then_some((Self { values, n_attributes: schema.len() }, weights)))
     }
 
     /// About how many bytes a demonstration of so many observations takes, with what is looked up of them: little of it may be in the

@@ -2,16 +2,16 @@
 
 use rustc_hash::FxHashMap;
 
-use super::Demonstration;
-use crate::attribute::{Attribute, Schema, Value, Weights};
+use super::{Conditions, Demonstration};
+use crate::attribute::{Attribute, MAX_COST, Schema, Value, Weights};
 use crate::interrupt::{Meter, Signal};
 use crate::model::{Model, StateIdx, States};
 
-/// Weighted terms of the distance for one demonstration. Attributes without weight, and those that were never observed,
+/// Weighted terms of the distance for one demonstration, `e_i D(o_i, s)`. Attributes without weight, and those that were never observed,
 /// take no part.
 ///
-/// What an attribute adds depends only on the observed and the state's value, of which there are few: its terms are
-/// computed once per pair of distinct values.
+/// What an attribute adds depends only on the observed value, the observation's weight and the state's value, of which there are few: its
+/// terms are computed once for each of them.
 #[derive(Debug)]
 pub(crate) struct Distances<'m> {
     /// In schema order, in which distances are summed.
@@ -24,14 +24,20 @@ pub(crate) struct ActiveAttribute<'m> {
     position: usize,
     attribute: &'m Attribute,
     weight: f64,
-    /// By observation: the number of the value that it saw, from 1 on; 0 if it did not see the attribute. Shape
+    /// By observation: the number of the value that it saw, from 1 on; 0 if it did not see the attribute, or counts nothing. Shape
     /// `[n_observations]`.
     rows: Vec<u32>,
     domain: &'m [Value],
     /// Terms by number and domain index. Shape `[1 + n_observed, domain.len()]`, the first row zero; empty if it would be too large.
     table: Vec<f64>,
-    /// The observed values in the order of their numbers, if there is no table.
-    untabled: Vec<Value>,
+    /// The observed values and their observations' weights, in the order of their numbers, if there is no table.
+    untabled: Vec<(Value, f64)>,
+}
+
+/// What `term` of a distance is where the distance counts `weight`. Finite: at most [`MAX_COST`].
+#[inline]
+fn counted(weight: f64, term: f64) -> f64 {
+    (weight * term).min(MAX_COST)
 }
 
 /// Most entries of all tables together: 2 MB, which take a millisecond to fill. Values of larger domains are compared one by one.
@@ -43,6 +49,7 @@ impl<'m> Distances<'m> {
         states: &'m States,
         demonstration: &Demonstration,
         weights: &Weights,
+        conditions: &Conditions,
     ) -> Self {
         let mut n_entries_left = MAX_TABLE_ENTRIES;
         let weighted = schema.attributes().iter().zip(weights.as_slice()).enumerate();
@@ -50,7 +57,7 @@ impl<'m> Distances<'m> {
         let mut active = Vec::new();
         for (position, (attribute, weight)) in weighted.filter(|(_, (_, weight))| **weight > 0.0) {
             let domain = states.domain(position);
-            let rows = observed.number(demonstration, position);
+            let rows = observed.number(demonstration, conditions, position);
             let values = &observed.values;
             if values.is_empty() {
                 continue;
@@ -61,25 +68,25 @@ impl<'m> Distances<'m> {
                 n_entries_left -= n_entries;
                 table.reserve_exact(n_entries);
                 table.resize(domain.len(), 0.0);
-                table.extend(
-                    values.iter().flat_map(|value| domain.iter().map(|own| attribute.term(*weight, value, own))),
-                );
+                table.extend(values.iter().flat_map(|(value, counts)| {
+                    domain.iter().map(|own| counted(*counts, attribute.term(*weight, value, own)))
+                }));
             } else {
-                untabled.extend(values.iter().copied().cloned());
+                untabled.extend(values.iter().map(|(value, counts)| ((*value).clone(), *counts)));
             }
             active.push(ActiveAttribute { position, attribute, weight: *weight, rows, domain, table, untabled });
         }
         Self { active }
     }
 
-    /// `D(o_i, s)`, given the row of `s`. Finite, at least 0.
+    /// `e_i D(o_i, s)`, given the row of `s`. Finite, at least 0.
     #[inline]
     pub(crate) fn distance(&self, observation: usize, row: &[u32]) -> f64 {
         // Not `sum`, of which nothing is -0.
         self.active.iter().fold(0.0, |sum, active| sum + active.term(observation, row[active.position]))
     }
 
-    /// `D(o_i, s)` of all states, in the order of their numbers.
+    /// `e_i D(o_i, s)` of all states, in the order of their numbers.
     ///
     /// # Errors
     ///
@@ -104,7 +111,7 @@ impl<'m> Distances<'m> {
         Ok(())
     }
 
-    /// The terms of `D(o_i, s)`, given the row of `s`, in schema order; attributes that take no part are left out.
+    /// The terms of `e_i D(o_i, s)`, given the row of `s`, in schema order; attributes that take no part are left out.
     pub(crate) fn terms(&self, observation: usize, row: &[u32]) -> impl Iterator<Item = (usize, f64)> {
         self.active.iter().map(move |active| (active.position, active.term(observation, row[active.position])))
     }
@@ -134,13 +141,74 @@ impl ActiveAttribute<'_> {
         match self.table.get(row * self.domain.len() + value) {
             Some(term) => *term,
             None if row == 0 => 0.0,
-            None => self.attribute.term(self.weight, &self.untabled[row - 1], &self.domain[value]),
+            None => {
+                let (seen, counts) = &self.untabled[row - 1];
+                counted(*counts, self.attribute.term(self.weight, seen, &self.domain[value]))
+            }
         }
     }
 }
 
-/// The distance to a single observation, looked up in tables, or computed once these were dropped.
+/// What ending costs: the terms of `D(o_n, s)`, each counted with the weight of the end.
 #[derive(Debug)]
+pub(crate) struct EndDistances {
+    /// By attribute that was observed and weighs something: its position, and its terms by the state's value. In schema order.
+    attributes: Vec<(usize, Vec<f64>)>,
+}
+
+impl EndDistances {
+    /// For the observation `last`. Shape `[n_attributes]`.
+    pub(crate) fn new(
+        schema: &Schema,
+        states: &States,
+        last: &[Option<Value>],
+        weights: &Weights,
+        end_weight: f64,
+    ) -> Self {
+        let weighted = schema.attributes().iter().zip(weights.as_slice()).zip(last).enumerate();
+        let attributes = weighted.filter_map(|(position, ((attribute, weight), seen))| {
+            let seen = seen.as_ref().filter(|_| *weight > 0.0)?;
+            let term = |own| counted(end_weight, attribute.term(*weight, seen, own));
+            Some((position, states.domain(position).iter().map(term).collect()))
+        });
+        Self { attributes: attributes.collect() }
+    }
+
+    /// Whether the attribute at `position` takes part.
+    pub(crate) fn has(&self, position: usize) -> bool {
+        self.attributes.iter().any(|(at, _)| *at == position)
+    }
+
+    /// What ending costs in a state with this row. Finite, at least 0.
+    #[inline]
+    pub(crate) fn cost(&self, row: &[u32]) -> f64 {
+        self.attributes.iter().fold(0.0, |sum, (position, terms)| sum + terms[row[*position] as usize])
+    }
+
+    /// What the attribute at `position` adds to that, for the value at `value` of its domain.
+    pub(crate) fn term(&self, position: usize, value: u32) -> f64 {
+        let terms = self.attributes.iter().find(|(at, _)| *at == position);
+        terms.map_or(0.0, |(_, terms)| terms[value as usize])
+    }
+}
+
+/// The terms of `D(o, s)`, by position, given the row of `s`; attributes that weigh nothing or were not observed are left out.
+pub(crate) fn plain_terms<'d>(
+    schema: &'d Schema,
+    states: &'d States,
+    observation: &'d [Option<Value>],
+    weights: &'d Weights,
+    row: &'d [u32],
+) -> impl Iterator<Item = (usize, f64)> + 'd {
+    let weighted = schema.attributes().iter().zip(weights.as_slice()).zip(observation).enumerate();
+    weighted.filter_map(move |(position, ((attribute, weight), seen))| {
+        let seen = seen.as_ref().filter(|_| *weight > 0.0)?;
+        Some((position, attribute.term(*weight, seen, &states.domain(position)[row[position] as usize])))
+    })
+}
+
+/// The distance to a single observation, looked up in tables, or computed once these were dropped.
+#[derive(Debug, Default)]
 pub(crate) struct ObservedDistances {
     /// Those that were observed and weigh something, in schema order.
     attributes: Vec<ObservedAttribute>,
@@ -153,16 +221,19 @@ struct ObservedAttribute {
     position: usize,
     weight: f64,
     value: Value,
+    /// The observation's weight, `e`.
+    counts: f64,
     /// Terms by the state's value. Shape `[domain size]`; empty if there is no table.
     table: Vec<f64>,
 }
 
 impl ObservedDistances {
-    /// With tables.
-    pub(crate) fn new(model: &Model, observation: &[Option<Value>], weights: &Weights) -> Self {
-        let weighted = weights.as_slice().iter().zip(observation).enumerate().filter(|(_, (weight, _))| **weight > 0.0);
+    /// With tables. The observation counts `counts`: nothing is observed if that is 0.
+    pub(crate) fn new(model: &Model, observation: &[Option<Value>], weights: &Weights, counts: f64) -> Self {
+        let weighted = weights.as_slice().iter().zip(observation).enumerate();
+        let weighted = weighted.filter(|(_, (weight, _))| counts > 0.0 && **weight > 0.0);
         let attributes = weighted.filter_map(|(position, (weight, value))| {
-            Some(ObservedAttribute { position, weight: *weight, value: value.clone()?, table: Vec::new() })
+            Some(ObservedAttribute { position, weight: *weight, value: value.clone()?, counts, table: Vec::new() })
         });
         let mut distances = Self { attributes: attributes.collect(), size_bytes: 0 };
         distances.fill_tables(model);
@@ -172,10 +243,10 @@ impl ObservedDistances {
     /// Makes the tables, unless they are there.
     pub(crate) fn fill_tables(&mut self, model: &Model) {
         for attribute in self.attributes.iter_mut().filter(|attribute| attribute.table.is_empty()) {
-            let ObservedAttribute { position, weight, value, table } = attribute;
+            let ObservedAttribute { position, weight, value, counts, table } = attribute;
             let domain = model.states().domain(*position);
             let attribute = &model.schema().attributes()[*position];
-            *table = domain.iter().map(|own| attribute.term(*weight, value, own)).collect();
+            *table = domain.iter().map(|own| counted(*counts, attribute.term(*weight, value, own))).collect();
         }
         self.measure();
     }
@@ -201,14 +272,14 @@ impl ObservedDistances {
         self.size_bytes
     }
 
-    /// `D(o, s)`: the same float as [`Distances::distance`] gives.
+    /// `e D(o, s)`: the same float as [`Distances::distance`] gives.
     #[inline]
     pub(crate) fn distance(&self, model: &Model, state: StateIdx) -> f64 {
         let row = model.states().row(state);
         self.attributes.iter().fold(0.0, |sum, attribute| sum + attribute.term(model, row[attribute.position]))
     }
 
-    /// The terms of `D(o, s)`, in schema order; attributes that take no part are left out.
+    /// The terms of `e D(o, s)`, in schema order; attributes that take no part are left out.
     pub(crate) fn terms(&self, model: &Model, state: StateIdx) -> impl Iterator<Item = (usize, f64)> {
         let row = model.states().row(state);
         self.attributes
@@ -224,17 +295,17 @@ impl ObservedAttribute {
             return *term;
         }
         let own = &model.states().domain(self.position)[value as usize];
-        model.schema().attributes()[self.position].term(self.weight, &self.value, own)
+        counted(self.counts, model.schema().attributes()[self.position].term(self.weight, &self.value, own))
     }
 }
 
-/// The distinct values that a demonstration shows of an attribute.
+/// The distinct values that a demonstration shows of an attribute, each with the weight of its observation.
 #[derive(Default)]
 struct DistinctValues<'d> {
     /// In the order in which they come.
-    values: Vec<&'d Value>,
-    /// Their numbers, from 1 on, once they are more than [`FEW`](Self::FEW).
-    numbers: FxHashMap<&'d Value, u32>,
+    values: Vec<(&'d Value, f64)>,
+    /// Their numbers, from 1 on, once they are more than [`FEW`](Self::FEW); of weights, the bits.
+    numbers: FxHashMap<(&'d Value, u64), u32>,
 }
 
 impl<'d> DistinctValues<'d> {
@@ -242,26 +313,30 @@ impl<'d> DistinctValues<'d> {
     const FEW: usize = 16;
 
     /// Forgets the values, and numbers those of the attribute at `position`. Gives the number of each observation's, or 0 if it
-    /// did not see the attribute.
-    fn number(&mut self, demonstration: &'d Demonstration, position: usize) -> Vec<u32> {
+    /// did not see the attribute or counts nothing.
+    fn number(&mut self, demonstration: &'d Demonstration, conditions: &Conditions, position: usize) -> Vec<u32> {
         self.values.clear();
         self.numbers.clear();
-        let seen = demonstration.iter().map(|observation| observation[position].as_ref());
+        let seen = demonstration.iter().enumerate().map(|(i, observation)| {
+            let counts = conditions.observation_weight(i);
+            observation[position].as_ref().filter(|_| counts > 0.0).map(|value| (value, counts))
+        });
         seen.map(|value| value.map_or(0, |value| self.number_of(value))).collect()
     }
 
     #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
-    fn number_of(&mut self, value: &'d Value) -> u32 {
+    fn number_of(&mut self, value: (&'d Value, f64)) -> u32 {
+        let key = |(value, counts): (&'d Value, f64)| (value, counts.to_bits());
         let known = if self.values.len() <= Self::FEW {
             self.values.iter().position(|known| *known == value).map(|n| n as u32 + 1)
         } else {
-            self.numbers.get(value).copied()
+            self.numbers.get(&key(value)).copied()
         };
         known.unwrap_or_else(|| {
             self.values.push(value);
             if self.values.len() > Self::FEW {
                 let first = self.numbers.len();
-                self.numbers.extend(self.values[first..].iter().copied().zip(first as u32 + 1..));
+                self.numbers.extend(self.values[first..].iter().copied().map(key).zip(first as u32 + 1..));
             }
             self.values.len() as u32
         })
@@ -281,17 +356,17 @@ mod tests {
         });
         let mut observed = DistinctValues::default();
         for demonstration in &demonstrations {
-            let rows = observed.number(demonstration, 1);
+            let rows = observed.number(demonstration, &Conditions::default(), 1);
             let mut known = Vec::new();
             for (observation, row) in demonstration.iter().zip(rows) {
                 let Some(value) = &observation[1] else {
                     assert_eq!(row, 0);
                     continue;
                 };
-                if !known.contains(&value) {
-                    known.push(value);
+                if !known.contains(&(value, 1.0)) {
+                    known.push((value, 1.0));
                 }
-                assert_eq!(known[row as usize - 1], value);
+                assert_eq!(known[row as usize - 1], (value, 1.0));
             }
             assert_eq!(observed.values, known);
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use serde::{Deserialize, Serialize};
 
 use super::cost::{Cost, CostSum};
-use super::{Demonstration, Mapping, Move, MoveKind, Status, StoppedBy, Warning};
+use super::{Demonstration, Mapping, Move, MoveKind, PolicyEnd, Status, StoppedBy, Warning};
 use crate::attribute::{ByAttribute, Scalar};
 use crate::document::{Faults, Place};
 use crate::model::{Model, States};
@@ -61,6 +61,8 @@ pub struct Policy {
     pub cost: Cost,
     /// No mapping costs less. `null` if nothing is known.
     pub lower_bound: Option<f64>,
+    /// How it ends: whether it succeeded.
+    pub end: PolicyEnd,
     /// What the request says and can hardly mean, each kind once for an attribute; they change nothing.
     pub warnings: Vec<Warning>,
     /// The actions to execute, in order.
@@ -105,6 +107,8 @@ pub struct PolicySummary<'p> {
     pub cost: Cost,
     /// No mapping costs less. `null` if nothing is known.
     pub lower_bound: Option<f64>,
+    /// How it ends: whether it succeeded.
+    pub end: &'p PolicyEnd,
     /// What the request says and can hardly mean.
     pub warnings: &'p [Warning],
     /// How much of the demonstration was met exactly.
@@ -139,12 +143,13 @@ pub struct Step {
     pub state_index: u32,
     /// Cost of the action.
     pub action_cost: f64,
-    /// Weighted distance between the observation and the state.
+    /// The weighted distance between the observation and the state, as far as the step pays it: times the observation's weight, and times
+    /// `extra_weight` if the step is extra.
     pub distance: f64,
     /// The distance's terms by attribute; those that are 0 are left out.
     #[cfg_attr(feature = "openapi", schema(value_type = BTreeMap<String, f64>))]
     pub distance_by_attribute: ByAttribute<f64>,
-    /// Cost of the steps up to and including this one.
+    /// Cost of the steps up to and including this one, without that of the end.
     pub cost: f64,
 }
 
@@ -256,16 +261,16 @@ pub(super) struct StepWriter {
 }
 
 impl StepWriter {
-    /// The next step, given the terms of its distance; `states` are those that it is numbered in.
+    /// The next step, given what its action costs and the terms of the distance that it pays; `states` are those that it is numbered in.
     pub(super) fn write(
         &mut self,
         model: &Model,
         states: &States,
         step: &Move,
+        action_cost: f64,
         terms: impl Iterator<Item = (usize, f64)>,
     ) -> Step {
         let schema = model.schema();
-        let action_cost = step.action.map_or(0.0, |action| model.action(action).cost);
         let mut distance = 0.0;
         let mut by_attribute = vec![None; schema.len()];
         for (position, term) in terms.filter(|(_, term)| *term > 0.0) {
@@ -288,8 +293,9 @@ impl StepWriter {
         }
     }
 
-    /// What the steps cost so far.
-    pub(super) fn cost(&self) -> Cost {
+    /// What the steps cost if they end here, where ending costs `end`.
+    pub(super) fn cost_with_end(mut self, end: f64) -> Cost {
+        self.sum.end(end);
         self.sum.cost()
     }
 }
@@ -313,7 +319,9 @@ mod tests {
         let check = |n_steps| {
             let mapping = Mapping {
                 moves: vec![step; n_steps],
+                action_costs: vec![0.0; n_steps],
                 cost: Cost::default(),
+                end: PolicyEnd::at(&model, &[0], &[None], &model.schema().weights()),
                 status: Status::Optimal,
                 lower_bound: None,
                 stopped_by: None,

@@ -1,41 +1,42 @@
 //! What a search is asked.
 
-use super::Demonstration;
-use super::distances::Distances;
+use super::conditions::Body;
+use super::distances::{Distances, EndDistances, plain_terms};
+use super::recurrence::Recurrence;
+use super::{Conditions, Demonstration, Move};
 use crate::attribute::{ByAttribute, Weights};
-use crate::model::{Model, Origin, Start, StateIdx};
+use crate::model::{Model, Origin, Start, StateIdx, States};
 
-/// A demonstration to be followed by a body, under given weights, from a given start.
+/// A demonstration to be followed by a body, under given weights and conditions.
 #[derive(Debug)]
 pub struct Problem<'m> {
     pub(crate) model: &'m Model,
     pub(crate) demonstration: Demonstration,
     pub(crate) weights: Weights,
-    /// `s_0`: its number in a search of this problem.
-    pub(crate) start: StateIdx,
-    /// The row of `s_0`. Shape `[n_attributes]`.
-    pub(crate) start_row: Vec<u32>,
+    pub(crate) conditions: Conditions,
+    pub(crate) starts: Starts,
     pub(crate) distances: Distances<'m>,
+    /// What ending costs; `None` if it is free.
+    pub(crate) end: Option<EndDistances>,
+    pub(super) body: Body,
 }
 
 impl<'m> Problem<'m> {
-    /// A problem. `start` overrides the model's; without either, `s_0` is the candidate closest to `o_0`, the lowest
-    /// index among equals.
+    /// A problem.
+    ///
+    /// # Panics
+    ///
+    /// If the conditions name states or actions that the model does not have.
     #[must_use]
-    pub fn new(model: &'m Model, demonstration: Demonstration, weights: Weights, start: Option<Origin>) -> Self {
-        let distances = Distances::new(model.schema(), model.states(), &demonstration, &weights);
-        let row_of = |state| model.states().row(state).to_vec();
-        let (state, start_row) = match start {
-            None => {
-                let state = choose_start(model, |state| distances.distance(0, model.states().row(state)));
-                (state, row_of(state))
-            }
-            Some(Origin::State(state)) => (state, row_of(state)),
-            Some(Origin::Row(row)) => (0, row.0.to_vec()),
-        };
-        // A search that finds its states numbers them from the start on.
-        let start = if model.is_lazy() { 0 } else { state };
-        Self { model, demonstration, weights, start, start_row, distances }
+    pub fn new(model: &'m Model, demonstration: Demonstration, weights: Weights, conditions: Conditions) -> Self {
+        let starts = Starts::of(model, conditions.starts.as_deref());
+        let body = conditions.body(model);
+        let (schema, states) = (model.schema(), model.states());
+        let distances = Distances::new(schema, states, &demonstration, &weights, &conditions);
+        let last = demonstration.observation(demonstration.len() - 1);
+        let end = (conditions.end_weight > 0.0)
+            .then(|| EndDistances::new(schema, states, last, &weights, conditions.end_weight));
+        Self { model, demonstration, weights, conditions, starts, distances, end, body }
     }
 
     /// The weights of the distance, by attribute.
@@ -56,10 +57,18 @@ impl<'m> Problem<'m> {
         &self.weights
     }
 
-    /// Where the imitator starts, `s_0`; always 0 if the model is searched lazily.
+    /// The conditions.
     #[must_use]
-    pub fn start(&self) -> StateIdx {
-        self.start
+    pub fn conditions(&self) -> &Conditions {
+        &self.conditions
+    }
+
+    /// The start state that is closest to the first observation, the first among equals: its number in a search of this problem.
+    #[must_use]
+    pub fn closest_start(&self) -> StateIdx {
+        let distances = self.starts.iter(self.model).map(|(state, row)| (self.distances.distance(0, row), state));
+        let closest = distances.min_by(|(distance, _), (other, _)| distance.total_cmp(other));
+        closest.map_or(0, |(_, state)| state)
     }
 
     /// Index of the last observation, `n`.
@@ -67,24 +76,102 @@ impl<'m> Problem<'m> {
         self.demonstration.len() - 1
     }
 
-    /// The least cost of an action; 0 if the body has none.
-    pub(crate) fn least_action_cost(&self) -> f64 {
-        self.model.actions().iter().map(|action| action.cost).reduce(f64::min).unwrap_or(0.0)
+    /// What moves cost.
+    pub(super) fn recurrence(&self) -> Recurrence {
+        self.conditions.recurrence()
+    }
+
+    /// Whether the attribute at `position` adds to some distance, or to what ending costs.
+    pub(super) fn depends_on(&self, position: usize) -> bool {
+        self.distances.is_active(position) || self.end.as_ref().is_some_and(|end| end.has(position))
+    }
+
+    /// Whether a step pays something of whatever distance there is.
+    pub(super) fn pays_at(&self, step: &Move) -> bool {
+        let counts = self.conditions.observation_weight(step.observation as usize) > 0.0;
+        counts && self.recurrence().paid(step.kind, 1.0) > 0.0
+    }
+
+    /// Whether a state with this row, of `states`, is what was observed, so far as attributes weigh something.
+    pub(super) fn is_met(&self, observation: usize, states: &States, row: &[u32]) -> bool {
+        let seen = self.demonstration.observation(observation);
+        plain_terms(self.model.schema(), states, seen, &self.weights, row).all(|(_, term)| term == 0.0)
+    }
+
+    /// What ending costs in a state with this row.
+    #[inline]
+    pub(super) fn end_cost(&self, row: &[u32]) -> f64 {
+        self.end.as_ref().map_or(0.0, |end| end.cost(row))
     }
 }
 
-/// `s_0` where the request names none, given the distances to `o_0`.
-pub(super) fn choose_start(model: &Model, distance: impl Fn(StateIdx) -> f64) -> StateIdx {
+/// The start states, at least one, each once. Searches number them as [`Self::iter`] does.
+#[derive(Debug)]
+pub(crate) struct Starts {
+    /// In the order of their numbers; if the model is searched lazily, these are 0, 1, ..
+    states: Vec<StateIdx>,
+    /// Their rows, if the model is searched lazily, one after the other.
+    rows: Vec<Vec<u32>>,
+}
+
+impl Starts {
+    /// The start states of `model` that are listed, or all that it has.
+    pub(super) fn of(model: &Model, listed: Option<&[Origin]>) -> Self {
+        let mut states = Vec::new();
+        let mut rows: Vec<Vec<u32>> = Vec::new();
+        match listed {
+            Some(origins) => {
+                for origin in origins {
+                    match origin {
+                        Origin::State(state) => states.push(*state),
+                        Origin::Row(row) => rows.push(row.0.to_vec()),
+                    }
+                }
+            }
+            None => states = start_states(model),
+        }
+        if model.is_lazy() {
+            // A search that finds its states numbers them from the start states on.
+            rows.extend(states.drain(..).map(|state| model.states().row(state).to_vec()));
+            let mut seen = std::collections::HashSet::new();
+            rows.retain(|row| seen.insert(row.clone()));
+            states.extend((0..).take(rows.len()));
+        } else {
+            states.sort_unstable();
+            states.dedup();
+        }
+        Self { states, rows }
+    }
+
+    /// Each start state with its row.
+    pub(crate) fn iter<'s>(&'s self, model: &'s Model) -> impl Iterator<Item = (StateIdx, &'s [u32])> + Clone {
+        let row = |number: usize, state| self.rows.get(number).map_or_else(|| model.states().row(state), Vec::as_slice);
+        self.states.iter().enumerate().map(move |(number, state)| (*state, row(number, *state)))
+    }
+
+    /// Their numbers.
+    pub(crate) fn states(&self) -> &[StateIdx] {
+        &self.states
+    }
+
+    /// Their rows, if the model is searched lazily.
+    pub(crate) fn rows(&self) -> &[Vec<u32>] {
+        &self.rows
+    }
+
+    /// The value that all of them have of the attribute at `position`, if it is one.
+    pub(crate) fn common_value(&self, model: &Model, position: usize) -> Option<u32> {
+        let mut values = self.iter(model).map(|(_, row)| row[position]);
+        let first = values.next()?;
+        values.all(|value| value == first).then_some(first)
+    }
+}
+
+/// The states that a model says may be started in.
+fn start_states(model: &Model) -> Vec<StateIdx> {
     match model.start() {
-        Start::State(state) => *state,
-        Start::Candidates(candidates) => closest(candidates.iter().copied(), distance),
-        Start::Any => closest((0..model.states().len()).filter(|state| !model.is_unsafe(*state)), distance),
+        Start::State(state) => vec![*state],
+        Start::Candidates(candidates) => candidates.clone(),
+        Start::Any => (0..model.states().len()).filter(|state| !model.is_unsafe(*state)).collect(),
     }
-}
-
-fn closest(candidates: impl Iterator<Item = StateIdx>, distance: impl Fn(StateIdx) -> f64) -> StateIdx {
-    let measured = candidates.map(|state| (distance(state), state));
-    let closest = measured.min_by(|(d, state), (other_d, other)| d.total_cmp(other_d).then(state.cmp(other)));
-    // Readers of models see to it that there is a candidate.
-    closest.map_or(0, |(_, state)| state)
 }

@@ -296,13 +296,18 @@ impl Problem<'_> {
 
     /// Warns of actions that cost more than all distances together could shrink by: to stay at the start is then always cheapest.
     fn dear_actions(&self, path: &Path<'_>) -> Option<Warning> {
-        let least = self.least_action_cost();
-        if self.model.actions().is_empty() || least <= 0.0 {
+        let least = self.body.least_cost();
+        if least <= 0.0 || self.model.graph().has_own_costs() {
             return None;
         }
-        let mut gain = 0.0;
+        // Whichever start it is of: what does not stay there pays an action, and the least distances at least.
+        let row = self.starts.iter(self.model).find(|(state, _)| *state == self.closest_start())?.1;
+        let end_weight = self.conditions.end_weight;
+        let mut gain =
+            self.end_cost(row) - end_weight * self.least_distance(self.demonstration.observation(self.last()));
         for (index, observation) in self.demonstration.iter().enumerate() {
-            gain += self.distances.distance(index, &self.start_row) - self.least_distance(observation);
+            let counts = self.conditions.observation_weight(index);
+            gain += self.distances.distance(index, row) - counts * self.least_distance(observation);
             if gain >= least {
                 return None;
             }

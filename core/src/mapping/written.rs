@@ -15,6 +15,7 @@
 use std::borrow::Cow;
 use std::ops::Range;
 
+use rustc_hash::FxHashMap;
 use serde::de::Error as _;
 use serde::{Deserialize, Serialize};
 
@@ -66,8 +67,7 @@ impl<'a> WrittenPolicy<'a> {
         const SUMMARY_BYTES: usize = 512;
         const WEIGHT_BYTES: usize = 24;
         let weights = problem.named_weights();
-        let short = ShortSteps::of(problem, mapping)?;
-        let coverage = short.coverage(problem.demonstration.len());
+        let (short, coverage) = ShortSteps::of(problem, mapping)?;
         let search = SearchReport {
             expanded: mapping.n_expanded,
             generated: mapping.n_generated,
@@ -85,6 +85,7 @@ impl<'a> WrittenPolicy<'a> {
             status: mapping.status,
             cost: mapping.cost,
             lower_bound: mapping.lower_bound,
+            end: &mapping.end,
             warnings: &stamp.warnings,
             coverage,
             search,
@@ -239,7 +240,7 @@ pub enum WriteError {
 /// There to be serialized, in whatever format, and to be read as a [`WrittenPolicy`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ShortSteps<'a> {
-    /// Names and costs of the actions that are taken.
+    /// Names and costs of the actions that are taken: an action has one entry for each cost of its transitions.
     #[serde(borrow)]
     actions: Vec<(&'a str, f64)>,
     steps: Vec<ShortStep>,
@@ -267,8 +268,9 @@ struct ShortStep {
 }
 
 impl<'a> ShortSteps<'a> {
-    fn of(problem: &Problem<'a>, mapping: &Mapping) -> Result<Self, WriteError> {
-        let model = problem.model;
+    /// The steps of `mapping`, and how much of the demonstration they meet.
+    fn of(problem: &Problem<'a>, mapping: &Mapping) -> Result<(Self, Coverage), WriteError> {
+        let (model, recurrence) = (problem.model, problem.recurrence());
         let attributes = model.schema().attributes();
         let states = mapping.states.as_ref().unwrap_or(model.states());
         let n_steps = mapping.moves.len();
@@ -283,9 +285,11 @@ impl<'a> ShortSteps<'a> {
         };
         let mut values = Vec::with_capacity(n_changed * VALUE_BYTES);
         let mut sum = CostSum::default();
+        let mut is_exact = vec![false; problem.demonstration.len()];
+        let mut places = FxHashMap::default();
         // Of the step before: its row, and where its terms stand.
         let (mut row, mut terms): (&[u32], _) = (&[], 0..0);
-        for step in &mapping.moves {
+        for (step, action_cost) in mapping.moves.iter().zip(&mapping.action_costs) {
             let before = std::mem::replace(&mut row, states.row(step.state));
             let n_before = short.changed.len();
             for (position, (attribute, value)) in attributes.iter().zip(row).enumerate() {
@@ -297,10 +301,13 @@ impl<'a> ShortSteps<'a> {
                 }
             }
             let from = short.terms.len();
-            let own_terms = problem.distances.terms(step.observation as usize, row);
-            short
-                .terms
-                .extend(own_terms.filter(|(_, term)| *term > 0.0).map(|(position, term)| (count(position), term)));
+            let i = step.observation as usize;
+            let own_terms = problem.distances.terms(i, row).map(|(position, term)| {
+                let paid = recurrence.paid(step.kind, term);
+                (count(position), paid)
+            });
+            short.terms.extend(own_terms.filter(|(_, term)| *term > 0.0));
+            is_exact[i] |= short.terms.len() == from && (problem.pays_at(step) || problem.is_met(i, states, row));
             let n_terms = if short.terms[from..] == short.terms[terms.clone()] {
                 short.terms.truncate(from);
                 None
@@ -308,10 +315,13 @@ impl<'a> ShortSteps<'a> {
                 terms = from..short.terms.len();
                 Some(count(terms.len()))
             };
-            let action = step.action.map(|action| model.action(action));
-            let action_cost = action.map_or(0.0, |action| action.cost);
-            sum.add(action_cost, distance(&short.terms[terms.clone()]));
-            let action = action.map(|action| short.place_of(&action.name, action_cost));
+            sum.add(*action_cost, distance(&short.terms[terms.clone()]));
+            let action = step.action.map(|action| {
+                *places.entry((action, action_cost.to_bits())).or_insert_with(|| {
+                    short.actions.push((&model.action(action).name, *action_cost));
+                    count(short.actions.len() - 1)
+                })
+            });
             short.steps.push(ShortStep {
                 observation: step.observation,
                 action,
@@ -322,19 +332,8 @@ impl<'a> ShortSteps<'a> {
             });
         }
         short.values = String::from_utf8(values).map_err(serde_json::Error::custom)?;
-        Ok(short)
-    }
-
-    /// How many of so many observations they meet exactly.
-    fn coverage(&self, n_observations: usize) -> Coverage {
-        let mut is_exact = vec![false; n_observations];
-        let mut n_terms = 0;
-        for step in &self.steps {
-            n_terms = step.n_terms.unwrap_or(n_terms);
-            is_exact[step.observation as usize] |= n_terms == 0;
-        }
         let n_exact = is_exact.iter().filter(|is_exact| **is_exact).count();
-        Coverage { observed: count(n_observations), exact: count(n_exact) }
+        Ok((short, Coverage { observed: count(is_exact.len()), exact: count(n_exact) }))
     }
 
     /// About how many bytes they take in a format in which small numbers take one.
@@ -349,15 +348,6 @@ impl<'a> ShortSteps<'a> {
             + self.values.len()
             + self.terms.len() * 9
             + STEP_BYTES
-    }
-
-    /// The place of the action called `name`.
-    fn place_of(&mut self, name: &'a str, cost: f64) -> u32 {
-        let known = self.actions.iter().position(|(known, _)| *known == name);
-        count(known.unwrap_or_else(|| {
-            self.actions.push((name, cost));
-            self.actions.len() - 1
-        }))
     }
 }
 

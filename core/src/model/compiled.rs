@@ -132,15 +132,15 @@ impl Model {
         self.unexplored.is_some()
     }
 
-    /// For a model that is searched lazily: the state with this row, numbered 0, from which a search finds the others. `None` if the model
-    /// lists its states.
+    /// For a model that is searched lazily: the states with these rows, numbered from 0 on, from which a search finds the others. `None` if
+    /// the model lists its states.
     ///
     /// # Panics
     ///
     /// If there is no such state; those that [`Self::read_start`] gives are there.
-    pub(crate) fn explore_from(&self, row: &[u32]) -> Option<Explored<'_>> {
+    pub(crate) fn explore_from(&self, rows: &[Vec<u32>]) -> Option<Explored<'_>> {
         let unexplored = self.unexplored.as_ref()?;
-        Some(unexplored.explore_from(row).expect("a search starts in a state of its model"))
+        Some(unexplored.explore_from(rows).expect("a search starts in a state of its model"))
     }
 
     /// For a model that is searched lazily: every way in which its actions change attributes. `None` if the model lists its transitions.

@@ -223,8 +223,8 @@ pub(crate) trait Unexplored: Debug + Send + Sync {
     /// Only the start states, in their order, none of them explored.
     fn explore_from_start(&self) -> Explored<'_>;
 
-    /// Only the state with this row, which is numbered 0, not explored. `None` if there is no such state.
-    fn explore_from(&self, row: &[u32]) -> Option<Explored<'_>>;
+    /// Only the states with these rows, numbered in their order, none of them explored. `None` if there is no such state.
+    fn explore_from(&self, rows: &[Vec<u32>]) -> Option<Explored<'_>>;
 
     /// The whole row of the state with this one, as [`Implicit::state_of`].
     fn complete_row(&self, row: &[Option<u32>]) -> Option<Vec<u32>>;
@@ -241,9 +241,10 @@ impl<D: Implicit> Unexplored for D {
         Explored::new(self, self.start_states())
     }
 
-    fn explore_from(&self, row: &[u32]) -> Option<Explored<'_>> {
-        let row: Vec<Option<u32>> = row.iter().copied().map(Some).collect();
-        Some(Explored::new(self, [self.state_of(&row)?]))
+    fn explore_from(&self, rows: &[Vec<u32>]) -> Option<Explored<'_>> {
+        let state_of = |row: &Vec<u32>| self.state_of(&row.iter().copied().map(Some).collect::<Vec<_>>());
+        let states: Option<Vec<D::State>> = rows.iter().map(state_of).collect();
+        Some(Explored::new(self, states?))
     }
 
     fn complete_row(&self, row: &[Option<u32>]) -> Option<Vec<u32>> {

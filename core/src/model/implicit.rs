@@ -89,7 +89,7 @@ impl<S> Outcome<S> {
 ///     }
 ///
 ///     fn operators(&self) -> impl Iterator<Item = Operator> {
-///         let step = |n| Operator { action: 0, kept: vec![], changed: vec![(0, n, (n + 1) % self.0)] };
+///         let step = |n| Operator { action: 0, cost: None, kept: vec![], changed: vec![(0, n, (n + 1) % self.0)] };
 ///         (0..self.0).map(step)
 ///     }
 /// }

@@ -6,10 +6,12 @@ use super::ActionIdx;
 ///
 /// The operators of a model allow all that its transitions do, and may allow more: every transition has an operator of its action that
 /// changes the same attributes from and to the same values, and that keeps nothing but what the transition keeps.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Operator {
     /// The action.
     pub action: ActionIdx,
+    /// What its transitions cost at least, if they have costs of their own; `None`: what the action costs.
+    pub cost: Option<f64>,
     /// Positions of attributes, and the values that they must have and keep.
     pub kept: Vec<(usize, u32)>,
     /// Positions of attributes, and the values from and to which they change. Not empty.

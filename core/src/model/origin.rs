@@ -1,14 +1,17 @@
 //! Where a request says that the imitator starts.
 
-use std::sync::Arc;
+use std::collections::HashMap;
+
+use serde::{Deserialize, Serialize};
 
 use super::explored::Unexplored;
-use super::{Model, StateIdx};
-use crate::attribute::Value;
-use crate::document::{Faults, Place, Quoted};
+use super::{ActionIdx, Model, StateIdx};
+use crate::attribute::{MAX_COST, Value};
+use crate::document::{Faults, Path, Place, Quoted, Range, list_known};
 
-/// The state that a request says the imitator starts in.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// A state that a request says the imitator may start in.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
 pub enum Origin {
     /// This state.
     State(StateIdx),
@@ -18,21 +21,79 @@ pub enum Origin {
 }
 
 /// The row of a state that is there. Shape `[n_attributes]`.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct OriginRow(pub(crate) Arc<[u32]>);
-
-impl Origin {
-    /// The state, if it has a number in its model.
-    #[must_use]
-    pub fn state(self) -> Option<StateIdx> {
-        match self {
-            Self::State(state) => Some(state),
-            Self::Row(_) => None,
-        }
-    }
-}
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct OriginRow(pub(crate) Vec<u32>);
 
 impl Model {
+    /// Reads the start of a request: one [state](Self::read_start), or a list of states, at least one.
+    pub fn read_starts(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Origin>> {
+        let Some(items) = place.value.as_array() else {
+            return self.read_start(place, faults).map(|start| vec![start]);
+        };
+        let most = Self::MAX_STARTS.max(self.states.len() as usize);
+        if items.is_empty() || items.len() > most {
+            faults.note(place, format!("expected 1 to {most} states, found {}", items.len()));
+            return None;
+        }
+        let starts: Vec<Option<Origin>> =
+            items.iter().enumerate().map(|(n, item)| self.read_start(&place.item(n, item), faults)).collect();
+        starts.into_iter().collect()
+    }
+
+    /// Most start states of a request, unless the model lists more.
+    const MAX_STARTS: usize = 10_000;
+
+    /// Reads names of actions: an array.
+    pub fn read_action_names(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<ActionIdx>> {
+        let items = place.array(faults)?;
+        let known = self.actions_by_name();
+        let mut read = Vec::with_capacity(items.len().min(self.actions.len()));
+        let n_before = faults.count();
+        for (n, item) in items.iter().enumerate() {
+            let place = place.item(n, item);
+            if let Some(name) = place.string(faults) {
+                read.extend(self.find_action(&known, name, &place.path, faults));
+            }
+        }
+        read.sort_unstable();
+        read.dedup();
+        (faults.count() == n_before).then_some(read)
+    }
+
+    /// Reads costs of actions, 0 to 1e150: an object by action name. A transition that has its own cost keeps that.
+    pub fn read_action_costs(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<(ActionIdx, f64)>> {
+        let object = place.open_object(faults)?;
+        let known = self.actions_by_name();
+        let mut read = Vec::new();
+        let n_before = faults.count();
+        for (name, place) in object.iter() {
+            let action = self.find_action(&known, name, &place.path, faults);
+            let cost = place.number(Range::UpTo(MAX_COST), faults);
+            read.extend(action.zip(cost));
+        }
+        (faults.count() == n_before).then_some(read)
+    }
+
+    /// Hashed with a seed, as clients choose the names.
+    fn actions_by_name(&self) -> HashMap<&str, ActionIdx> {
+        self.actions.iter().map(|action| &*action.name).zip(0..).collect()
+    }
+
+    fn find_action(
+        &self,
+        known: &HashMap<&str, ActionIdx>,
+        name: &str,
+        path: &Path<'_>,
+        faults: &mut Faults,
+    ) -> Option<ActionIdx> {
+        let action = known.get(name).copied();
+        if action.is_none() {
+            let names = list_known(self.actions.iter().map(|action| &action.name));
+            faults.note_at(path, format!("unknown action {}; the model has {names}", Quoted(name)));
+        }
+        action
+    }
+
     /// Reads the start of a request: a state's index, or an object of attribute values that exactly one state has. Of a model that is
     /// searched lazily, only the start states have an index, and an object must give all attributes but those that follow from others.
     pub fn read_start(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Origin> {
@@ -40,7 +101,7 @@ impl Model {
             None => self.read_known(place, faults).map(Origin::State),
             Some(unexplored) if place.value.is_object() => {
                 let row = self.read_row(&**unexplored, place, faults)?;
-                Some(Origin::Row(OriginRow(row.into())))
+                Some(Origin::Row(OriginRow(row)))
             }
             Some(_) => {
                 let index = place.whole().and_then(|index| StateIdx::try_from(index).ok());

@@ -68,6 +68,18 @@ impl<T: Copy> Rows<T> {
         Ok(Self { offsets, items })
     }
 
+    /// Rows of what `map` makes of the items, without those of which it makes nothing.
+    pub(crate) fn filter_map<U>(&self, mut map: impl FnMut(&T) -> Option<U>) -> Rows<U> {
+        let (mut offsets, mut items) = (Vec::with_capacity(self.offsets.len()), Vec::new());
+        offsets.push(0);
+        for row in self.iter() {
+            items.extend(row.iter().filter_map(&mut map));
+            #[expect(clippy::cast_possible_truncation, reason = "no more than there were")]
+            offsets.push(items.len() as u32);
+        }
+        Rows { offsets, items }
+    }
+
     /// Rows of the same lengths.
     pub(crate) fn map<U>(&self, map: impl FnMut(&T) -> U) -> Rows<U> {
         Rows { offsets: self.offsets.clone(), items: self.items.iter().map(map).collect() }

@@ -12,7 +12,6 @@ pub(crate) trait Space {
 
     /// What the body pays itself for each of the [`successors`](Self::successors) of `state`, in their order. May be empty if none of them
     /// has a cost of its own.
-    #[expect(dead_code, reason = "searches will ask for it")]
     fn own_costs(&self, state: StateIdx) -> &[OwnCost];
 
     /// The row of `state`: per attribute, the index of its value in the domain. Shape `[n_attributes]`.

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use etude_core::attribute::{Attribute, Schema, Value};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{Demonstration, Mapper, Problem, Settings, Status};
+use etude_core::mapping::{Conditions, Demonstration, Mapper, Problem, Settings, Status};
 use etude_core::model::{Action, ActionIdx, Implicit, Limits, Model, Operator, Outcome};
 
 const N: u32 = 12;
@@ -49,8 +49,12 @@ impl Implicit for Dial {
 
     fn operators(&self) -> impl Iterator<Item = Operator> {
         let every = Self::STEPS.into_iter().flat_map(|step| (0..N).map(move |from| (step, from)));
-        let operator =
-            |((action, step), from)| Operator { action, kept: Vec::new(), changed: vec![(0, from, (from + step) % N)] };
+        let operator = |((action, step), from)| Operator {
+            action,
+            cost: None,
+            kept: Vec::new(),
+            changed: vec![(0, from, (from + step) % N)],
+        };
         every.map(operator)
     }
 }
@@ -68,7 +72,7 @@ fn mapper(max_states: usize) -> Mapper {
 fn solved(mapper: &Mapper, seen: &[u32]) -> (f64, Vec<Option<ActionIdx>>, bool) {
     let schema = mapper.model().schema();
     let demonstration = Demonstration::new(schema, seen.iter().map(|n| [Some(i64::from(*n).into())])).unwrap();
-    let problem = Problem::new(mapper.model(), demonstration, schema.weights(), None);
+    let problem = Problem::new(mapper.model(), demonstration, schema.weights(), Conditions::default());
     let mapping = mapper.map(&problem, Settings::default(), &mut Uninterrupted).unwrap();
     let actions = mapping.moves.iter().map(|step| step.action).collect();
     (mapping.cost.total, actions, mapping.status == Status::Optimal)

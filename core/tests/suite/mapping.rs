@@ -9,39 +9,48 @@ use crate::problems::{cave, close, example, mapper, mapper_within, problem, solv
 use etude_core::attribute::Scalar;
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
-use etude_core::mapping::{Budget, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status, StoppedBy};
+use etude_core::mapping::{
+    Budget, Mapper, Mapping, MoveKind, Policy, Request, Settings, Stamp, Status, Step, StoppedBy,
+};
 use etude_core::model::Limits;
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
-/// Checks everything that a policy promises about itself, against the model's JSON (`table` dynamics).
-fn check_policy(model: &Value, demonstration: &Value, weights: &Value, policy: &Policy) {
-    let dynamics = &model["dynamics"];
-    let actions: HashMap<&str, f64> = model["actions"]
+/// Checks everything that a policy promises about itself, against the model's JSON (`table` dynamics) and the request.
+fn check_policy(model: &Value, request: &Value, policy: &Policy) {
+    let (dynamics, demonstration, weights) = (&model["dynamics"], &request["demonstration"], &request["weights"]);
+    let costs: HashMap<&str, f64> = model["actions"]
         .as_array()
         .unwrap()
         .iter()
         .map(|action| (action["name"].as_str().unwrap(), action["cost"].as_f64().unwrap()))
         .collect();
-    let is_transition = |from: u32, action: &str, to: u32| {
+    let action_cost = |from: u32, action: &str, to: u32| {
         let mut transitions = dynamics["transitions"].as_array().unwrap().iter();
-        transitions.any(|t| t[0] == from && t[1] == action && t[2] == to)
+        let taken = transitions.find(|t| t[0] == from && t[1] == action && t[2] == to);
+        let lacks = request["without"].as_array().is_some_and(|without| without.contains(&json!(action)));
+        let of_action = request["action_costs"][action].as_f64().unwrap_or(costs[action]);
+        taken.filter(|_| !lacks).map(|taken| taken[4].as_f64().unwrap_or(of_action))
     };
     let is_unsafe = |state: u32| dynamics["unsafe"].as_array().is_some_and(|listed| listed.contains(&json!(state)));
+    let distance = |step: &Step| {
+        let state = &dynamics["states"][step.state_index as usize];
+        oracle::distance(model, weights, &demonstration[step.observation as usize], state)
+    };
 
     let steps = &policy.steps;
     let mut total = 0.0;
     for (n, step) in steps.iter().enumerate() {
         assert_eq!(step.step as usize, n);
         assert!(!is_unsafe(step.state_index), "step {n} enters an unsafe state");
-        let observation = &demonstration[step.observation as usize];
-        let state = &dynamics["states"][step.state_index as usize];
-        let d = oracle::distance(model, weights, observation, state);
+        let part = if step.kind == MoveKind::Extra { request["extra_weight"].as_f64().unwrap_or(1.0) } else { 1.0 };
+        let d = part * oracle::observation_weight(request, step.observation as usize) * distance(step);
         assert!(close(step.distance, d), "step {n}: distance {} is {d} by definition", step.distance);
         let explained: f64 = step.distance_by_attribute.iter().map(|(_, term)| term).sum();
         assert!(close(explained, d), "step {n}: the terms add up to {explained}, not {d}");
         if n == 0 {
             assert_eq!((step.kind, step.observation, &step.action), (MoveKind::Start, 0, &None));
+            assert!(oracle::starts(model, request).contains(&(step.state_index as usize)));
         } else {
             let before = &steps[n - 1];
             let advance = step.observation - before.observation;
@@ -51,8 +60,8 @@ fn check_policy(model: &Value, demonstration: &Value, weights: &Value, policy: &
                 }
                 kind => {
                     let action = step.action.as_deref().unwrap();
-                    assert!(is_transition(before.state_index, action, step.state_index), "step {n} is not legal");
-                    assert!(close(step.action_cost, actions[action]));
+                    let cost = action_cost(before.state_index, action, step.state_index);
+                    assert!(cost.is_some_and(|cost| close(step.action_cost, cost)), "step {n} is not legal");
                     assert_eq!(advance, u32::from(kind == MoveKind::Match));
                     assert_ne!(kind, MoveKind::Start);
                 }
@@ -64,10 +73,16 @@ fn check_policy(model: &Value, demonstration: &Value, weights: &Value, policy: &
     let last = steps.last().unwrap();
     let n_observations = demonstration.as_array().unwrap().len();
     assert_eq!(last.observation as usize, n_observations - 1, "the mapping ends at the last observation");
-    assert_eq!(last.cost.to_bits(), policy.cost.total.to_bits());
-    assert!(close(policy.cost.actions + policy.cost.distance, policy.cost.total));
+    assert!(close(policy.end.distance, distance(last)), "{:?}", policy.end);
+    let explained: f64 = policy.end.distance_by_attribute.iter().map(|(_, term)| term).sum();
+    assert!(close(explained, policy.end.distance));
+    let end = oracle::end_weight(request) * distance(last);
+    assert!(close(policy.cost.end, end), "the end costs {}, not {end}", policy.cost.end);
+    assert!(close(last.cost + end, policy.cost.total));
+    assert!(end > 0.0 || last.cost.to_bits() == policy.cost.total.to_bits());
+    assert!(close(policy.cost.actions + policy.cost.distance + policy.cost.end, policy.cost.total));
     let exact: std::collections::BTreeSet<u32> =
-        steps.iter().filter(|step| step.distance == 0.0).map(|step| step.observation).collect();
+        steps.iter().filter(|step| distance(step) == 0.0).map(|step| step.observation).collect();
     assert_eq!(policy.coverage.exact as usize, exact.len());
     assert_eq!(policy.coverage.observed as usize, n_observations);
     let taken: Vec<&str> = steps.iter().filter_map(|step| step.action.as_deref()).collect();
@@ -78,34 +93,30 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 3000, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn costs_equal_the_independent_solvers((model, demonstration, weights, start) in problem()) {
-        let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
+    fn costs_equal_the_independent_solvers((model, mut request) in problem()) {
+        let optimum = oracle::optimal_cost(&model, &request);
         let mapper = mapper(&model);
         for heuristic in ["default", "none"] {
-            let request = json!({
-                "model": "m", "demonstration": demonstration, "weights": weights, "start": start, "heuristic": heuristic,
-            });
+            request["heuristic"] = heuristic.into();
             let policy = solve(&mapper, &request);
             prop_assert!(close(policy.cost.total, optimum), "{heuristic}: {} against {optimum}", policy.cost.total);
             prop_assert_eq!(policy.status, Status::Optimal);
-            check_policy(&model, &demonstration, &weights, &policy);
+            check_policy(&model, &request, &policy);
         }
     }
 
     #[test]
     fn a_budget_and_the_papers_heuristic_still_give_legal_mappings_and_true_bounds(
-        (model, demonstration, weights, start) in problem(),
+        (model, mut request) in problem(),
         max_expansions in 0u64..12,
         heuristic in prop_oneof![Just("default"), Just("none"), Just("paper")],
     ) {
-        let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
+        let optimum = oracle::optimal_cost(&model, &request);
         let mapper = mapper(&model);
-        let request = json!({
-            "model": "m", "demonstration": demonstration, "weights": weights, "start": start,
-            "heuristic": heuristic, "max_expansions": max_expansions,
-        });
+        request["heuristic"] = heuristic.into();
+        request["max_expansions"] = max_expansions.into();
         let policy = solve(&mapper, &request);
-        check_policy(&model, &demonstration, &weights, &policy);
+        check_policy(&model, &request, &policy);
         let bound = policy.lower_bound.unwrap();
         prop_assert!(bound <= optimum + 1e-9 * (1.0 + optimum), "bound {bound} above the optimum {optimum}");
         prop_assert!(optimum <= policy.cost.total + 1e-9 * (1.0 + optimum));
@@ -131,11 +142,12 @@ proptest! {
         prop_assert!((0..a.states().len()).all(|state| a.describe(state) == b.describe(state)));
 
         let demonstration = walked(&model, &walk);
-        let optimum = oracle::optimal_cost(&table, &demonstration, &json!({}), None);
-        let policy = solve(&cave_mapper, &json!({"model": "m", "demonstration": demonstration}));
+        let request = json!({"model": "m", "demonstration": demonstration});
+        let optimum = oracle::optimal_cost(&table, &request);
+        let policy = solve(&cave_mapper, &request);
         prop_assert!(close(policy.cost.total, optimum), "{} against {optimum}", policy.cost.total);
         prop_assert_eq!(policy.status, Status::Optimal);
-        check_policy(&table, &demonstration, &json!({}), &policy);
+        check_policy(&table, &request, &policy);
     }
 }
 
@@ -175,8 +187,8 @@ fn example_policy(model: &str, demonstration: &str, weights: &Value) -> Policy {
     let request = json!({"model": "m", "demonstration": demonstration, "weights": weights});
     let policy = solve(&mapper(&model), &request);
     let table = if model["dynamics"]["kind"] == "wumpus" { oracle::wumpus::as_table(&model) } else { model };
-    check_policy(&table, &demonstration, weights, &policy);
-    assert!(close(policy.cost.total, oracle::optimal_cost(&table, &demonstration, weights, None)));
+    check_policy(&table, &request, &policy);
+    assert!(close(policy.cost.total, oracle::optimal_cost(&table, &request)));
     policy
 }
 

@@ -7,28 +7,26 @@ use crate::oracle;
 use crate::problems::{close, example, mapper, problem};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
-use etude_core::mapping::{CommittedStep, Mapper, Mapping, OnlineMapping, Policy, Request, Stamp, Status, StoppedBy};
+use etude_core::mapping::{
+    CommittedStep, Conditions, Mapper, Mapping, OnlineMapping, Options, Policy, Request, Stamp, Status, StoppedBy,
+};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
-/// Feeds a demonstration, and gives what was committed and the mapping.
-fn follow(
-    mapper: &Arc<Mapper>,
-    demonstration: &Value,
-    weights: &Value,
-    start: Option<usize>,
-    lookahead: Option<u32>,
-) -> (Vec<CommittedStep>, Mapping) {
+/// Feeds the demonstration of a request, and gives what was committed and the mapping.
+fn follow(mapper: &Arc<Mapper>, request: &Value, lookahead: Option<u32>) -> (Vec<CommittedStep>, Mapping) {
     let schema = mapper.model().schema();
     let mut faults = Faults::default();
-    let weights = schema.read_weights(&Place::root(weights), &mut faults).unwrap();
-    let start = start.map(|state| state as u32);
+    let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
+    let options = Options::read(&object, mapper.model(), &Options::default(), &mut faults);
+    let options = faults.check(options).unwrap();
     let lookahead = lookahead.and_then(NonZeroU32::new);
-    let mut online = OnlineMapping::new(mapper, weights, start, lookahead);
+    let weights = options.weights_over(schema.weights());
+    let mut online = OnlineMapping::new(mapper, weights, options.conditions(), lookahead);
     let mut committed = Vec::new();
-    for observation in demonstration.as_array().unwrap() {
-        let observation = schema.read_observation(&Place::root(observation), &mut faults).unwrap();
-        committed.extend(online.observe(&observation, &mut Uninterrupted).unwrap());
+    for observation in request["demonstration"].as_array().unwrap() {
+        let observation = schema.read_observation(&Place::root(observation), &mut Faults::default()).unwrap();
+        committed.extend(online.observe(&observation, None, &mut Uninterrupted).unwrap());
     }
     let (rest, mapping) = online.end().unwrap();
     committed.extend(rest);
@@ -40,16 +38,24 @@ fn node(step: &CommittedStep) -> (usize, usize) {
     (step.step.observation as usize, step.step.state_index as usize)
 }
 
-/// A demonstration that begins with the first `n` observations and goes on otherwise.
-fn another_end(demonstration: &Value, n: usize, turn: usize) -> Value {
-    let observations = demonstration.as_array().unwrap();
-    let mut other = observations[..n].to_vec();
-    other.extend(observations.iter().cycle().skip(turn).step_by(2).take(4).cloned());
-    other.into()
+/// The same request with a demonstration that begins with the first `n` observations and goes on otherwise.
+fn another_end(request: &Value, n: usize, turn: usize) -> Value {
+    let other = |values: &Vec<Value>| {
+        let mut other = values[..n].to_vec();
+        other.extend(values.iter().cycle().skip(turn).step_by(2).take(4).cloned());
+        Value::from(other)
+    };
+    let mut request = request.clone();
+    for name in ["demonstration", "observation_weights"] {
+        if let Some(values) = request[name].as_array() {
+            request[name] = other(values);
+        }
+    }
+    request
 }
 
 /// States on a line, and longer demonstrations: often few of the states lose their ways by what is decided.
-fn line() -> impl Strategy<Value = (Value, Value, Value, Option<usize>)> {
+fn line() -> impl Strategy<Value = (Value, Value)> {
     let states = prop::collection::vec((0..12_u32, 0..3_u32), 5..25);
     let transitions = prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..70);
     let seen = prop::collection::vec((0..12_u32, prop::option::weighted(0.7, 0..3_u32)), 5..25);
@@ -65,7 +71,7 @@ fn line() -> impl Strategy<Value = (Value, Value, Value, Option<usize>)> {
             "actions": costs.iter().enumerate().map(|(n, cost)| json!({"name": format!("a{n}"), "cost": cost})).collect::<Value>(),
             "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0, "unsafe": []},
         });
-        (model, json!(seen), json!({}), None)
+        (model, json!({"model": "m", "demonstration": seen, "weights": {}}))
     })
 }
 
@@ -74,63 +80,71 @@ proptest! {
 
     #[test]
     fn every_commit_is_what_the_definition_says(
-        (model, demonstration, weights, start) in prop_oneof![problem(), line()],
+        (model, request) in prop_oneof![problem(), line()],
         lookahead in prop::option::weighted(0.8, 1u32..6),
         turn in 0usize..8,
     ) {
         let mapper = Arc::new(mapper(&model));
-        let (committed, mapping) = follow(&mapper, &demonstration, &weights, start, lookahead);
-        let n = demonstration.as_array().unwrap().len() - 1;
-        let to_go = |node, to| oracle::cost_to_go(&model, &demonstration, &weights, node, to);
+        let (committed, mapping) = follow(&mapper, &request, lookahead);
+        let n = request["demonstration"].as_array().unwrap().len() - 1;
+        let starts = oracle::starts(&model, &request);
         let step_cost = |step: &CommittedStep| step.step.action_cost + step.step.distance;
+        // What it costs at least to come to the observation `to` from a node, or from before the start.
+        let to_go = |request: &Value, from: Option<(usize, usize)>, to: usize, ends: bool| match from {
+            Some(node) => oracle::cost_to_go(&model, request, node, to, ends),
+            None => oracle::cost_from(&model, request, &starts, to, ends),
+        };
 
         // A run of forced steps, up to the one that advances, is decided at once.
         let mut is_forced_once = false;
-        let mut index = 1;
+        let mut index = 0;
         while index < committed.len() {
-            let from = node(&committed[index - 1]);
+            let from = index.checked_sub(1).map(|before| node(&committed[before]));
             let after = committed[index].after as usize;
             let mut end = index;
             let mut cost = step_cost(&committed[end]);
+            // The observation at which the lookahead is used up.
+            let window = |lookahead: u32| from.map_or(0, |(i, _)| i + 1) + lookahead as usize - 1;
             if committed[index].is_proven {
                 // Whatever is still to come: this end of the demonstration, and, unless it had ended, another.
-                let other = (after <= n).then(|| another_end(&demonstration, after, turn));
-                for demonstration in [Some(&demonstration), other.as_ref()].into_iter().flatten() {
-                    let last = demonstration.as_array().unwrap().len() - 1;
-                    let to_go = |node| oracle::cost_to_go(&model, demonstration, &weights, node, last);
-                    let (best, taken) = (to_go(from), cost + to_go(node(&committed[index])));
+                let other = (after <= n).then(|| another_end(&request, after, turn));
+                for request in [Some(&request), other.as_ref()].into_iter().flatten() {
+                    let last = request["demonstration"].as_array().unwrap().len() - 1;
+                    let best = to_go(request, from, last, true);
+                    let taken = cost + to_go(request, Some(node(&committed[index])), last, true);
                     prop_assert!(close(best, taken), "step {index}: {taken} where {best} was possible");
                 }
             } else {
                 is_forced_once = true;
-                while committed[end].step.observation as usize == from.0 {
+                while from.is_some_and(|(i, _)| committed[end].step.observation as usize == i) {
                     end += 1;
                     cost += step_cost(&committed[end]);
                     prop_assert!(!committed[end].is_proven && committed[end].after as usize == after);
                 }
-                let window = from.0 + lookahead.unwrap() as usize;
+                let window = window(lookahead.unwrap());
                 prop_assert_eq!(after, window + 1, "decided when the lookahead was used up, not before and not after");
-                let (best, taken) = (to_go(from, window), cost + to_go(node(&committed[end]), window));
+                let best = to_go(&request, from, window, false);
+                let taken = cost + to_go(&request, Some(node(&committed[end])), window, false);
                 prop_assert!(close(best, taken), "steps {index}..={end}: {taken} where {best} was possible");
             }
             // Never later than the lookahead allows.
-            let latest = lookahead.map_or(n + 1, |lookahead| (from.0 + lookahead as usize + 1).min(n + 1));
+            let latest = lookahead.map_or(n + 1, |lookahead| (window(lookahead) + 1).min(n + 1));
             prop_assert!(after <= latest, "step {index} was committed after {after}, not by {latest}");
             index = end + 1;
         }
 
         prop_assert_eq!(mapping.status, if is_forced_once { Status::Local } else { Status::Optimal });
-        let optimum = oracle::optimal_cost(&model, &demonstration, &weights, start);
+        let optimum = oracle::optimal_cost(&model, &request);
         if mapping.status == Status::Optimal {
             prop_assert!(close(mapping.cost.total, optimum), "{} against {optimum}", mapping.cost.total);
             prop_assert_eq!(mapping.lower_bound, Some(mapping.cost.total));
         } else {
             prop_assert!(mapping.cost.total >= optimum - 1e-9 && mapping.lower_bound.is_none());
         }
-        let must_be_optimal = lookahead.is_none_or(|lookahead| lookahead as usize > n);
+        let must_be_optimal = lookahead.is_none_or(|lookahead| lookahead as usize > n + 1);
         prop_assert!(!must_be_optimal || mapping.status == Status::Optimal);
         let sum: f64 = committed.iter().map(step_cost).sum();
-        prop_assert!(close(sum, mapping.cost.total));
+        prop_assert!(close(sum + mapping.cost.end, mapping.cost.total));
         prop_assert_eq!(committed.len(), mapping.moves.len());
     }
 }
@@ -139,7 +153,8 @@ proptest! {
 fn figure_4_reaches_its_optimum_with_a_lookahead_of_8_and_commits_early_without() {
     let mapper = Arc::new(mapper(&example("figure-4/model.json")));
     let demonstration = example("figure-4/demonstration.json");
-    let total = |lookahead| follow(&mapper, &demonstration, &json!({}), None, lookahead).1.cost.total;
+    let request = json!({"model": "m", "demonstration": demonstration});
+    let total = |lookahead| follow(&mapper, &request, lookahead).1.cost.total;
     assert_eq!(total(None), 48.2);
     assert_eq!(total(Some(16)), 48.2);
     assert!(total(Some(8)) <= 48.2 * 1.01, "{}", total(Some(8)));
@@ -247,13 +262,13 @@ fn without_a_lookahead_proven_steps_come_early_and_memory_stays_flat() {
     let n = 12;
     let mapper = Arc::new(mapper(&corridor(n)));
     let schema = mapper.model().schema().clone();
-    let mut online = OnlineMapping::new(&mapper, schema.weights(), None, None);
+    let mut online = OnlineMapping::new(&mapper, schema.weights(), Conditions::default(), None);
     let mut most_nodes = 0;
     let mut longest_wait = 0;
     for i in 0..5000_u32 {
         let x = if i / (n - 1) % 2 == 0 { i % (n - 1) } else { n - 1 - i % (n - 1) };
         let observation = schema.read_observation(&Place::root(&json!([x])), &mut Faults::default()).unwrap();
-        for committed in online.observe(&observation, &mut Uninterrupted).unwrap() {
+        for committed in online.observe(&observation, None, &mut Uninterrupted).unwrap() {
             assert!(committed.is_proven);
             longest_wait = longest_wait.max(committed.after - committed.step.observation);
         }

@@ -63,8 +63,72 @@ fn value(attribute: &Value, n: usize) -> Value {
     }
 }
 
-/// A model with `table` dynamics, a demonstration, weights and a start.
-pub(crate) fn problem() -> impl Strategy<Value = (Value, Value, Value, Option<usize>)> {
+/// Where a request may say that the imitator starts, what counts, and what the body lacks; often the defaults. By numbers that are made to
+/// fit.
+fn conditions() -> impl Strategy<Value = Value> {
+    let weight = || prop_oneof![2 => Just(1.0), 1 => Just(0.0), 1 => 0.0..3.0];
+    (
+        prop::option::weighted(0.3, prop::collection::vec(0usize..100, 1..4)),
+        prop::option::weighted(0.4, prop::collection::vec(prop::option::weighted(0.8, weight()), 30)),
+        prop::option::weighted(0.5, prop_oneof![Just(0.0), Just(1.0), 0.0..1.0]),
+        prop::option::weighted(0.5, prop_oneof![Just(0.0), Just(10.0), 0.0..3.0]),
+        prop::option::weighted(0.2, 0usize..100),
+        prop::option::weighted(0.2, (0usize..100, 0.0..2.0)),
+    )
+        .prop_map(|(start, observation_weights, extra_weight, end_weight, without, action_cost)| {
+            json!({
+                "start": start, "observation_weights": observation_weights, "extra_weight": extra_weight,
+                "end_weight": end_weight, "without": without, "action_costs": action_cost,
+            })
+        })
+}
+
+/// The request with these conditions, whose numbers are made to fit.
+pub(crate) fn under(model: &Value, mut request: Value, conditions: &Value) -> Value {
+    let count = |value: &Value| value.as_array().map_or(0, Vec::len);
+    let (n_states, n_observations) = (count(&model["dynamics"]["states"]), count(&request["demonstration"]));
+    let unsafe_states = model["dynamics"]["unsafe"].as_array().cloned().unwrap_or_default();
+    let name = |n: &Value| {
+        let n = n.as_u64().unwrap() as usize % count(&model["actions"]);
+        model["actions"][n]["name"].as_str().unwrap().to_owned()
+    };
+    if let Some(starts) = conditions["start"].as_array() {
+        let fitted = starts.iter().map(|start| json!(start.as_u64().unwrap() as usize % n_states));
+        let safe: Vec<Value> = fitted.filter(|start| !unsafe_states.contains(start)).collect();
+        if !safe.is_empty() {
+            request["start"] = if safe.len() == 1 { safe[0].clone() } else { safe.into() };
+        }
+    }
+    if let Some(weights) = conditions["observation_weights"].as_array() {
+        request["observation_weights"] = weights[..n_observations].to_vec().into();
+    }
+    request["extra_weight"] = conditions["extra_weight"].clone();
+    request["end_weight"] = conditions["end_weight"].clone();
+    if !conditions["without"].is_null() {
+        request["without"] = json!([name(&conditions["without"])]);
+    }
+    if !conditions["action_costs"].is_null() {
+        request["action_costs"] = json!({name(&conditions["action_costs"][0]): conditions["action_costs"][1]});
+    }
+    request
+}
+
+/// A model with `table` dynamics, and a request. Some of the transitions have their own costs.
+pub(crate) fn problem() -> impl Strategy<Value = (Value, Value)> {
+    let own_costs = prop::option::weighted(0.4, prop::collection::vec(prop::option::of(0.0..3.0), 30));
+    (plain_problem(), conditions(), own_costs).prop_map(|((mut model, request), conditions, own_costs)| {
+        let transitions = model["dynamics"]["transitions"].as_array_mut().unwrap();
+        let own_costs = own_costs.unwrap_or_default();
+        for (transition, cost) in transitions.iter_mut().zip(own_costs).filter(|(_, cost)| cost.is_some()) {
+            *transition = json!([transition[0], transition[1], transition[2], null, cost]);
+        }
+        let request = under(&model, request, &conditions);
+        (model, request)
+    })
+}
+
+/// The same, with the defaults.
+fn plain_problem() -> impl Strategy<Value = (Value, Value)> {
     let attributes = prop::collection::vec(attribute(), 1..4);
     let costs = prop::collection::vec(prop_oneof![Just(0.0), Just(0.3), Just(1.0), 0.0..2.0], 1..4);
     (attributes, costs, 1usize..9).prop_flat_map(|(mut attributes, costs, n_states)| {
@@ -94,7 +158,7 @@ fn build(
         (i32, usize, Option<usize>),
         Option<(usize, f64)>,
     ),
-) -> (Value, Value, Value, Option<usize>) {
+) -> (Value, Value) {
     let n_states = states.len();
     let (start_kind, model_start, request_start) = starts;
     // Whatever may be a start is made safe.
@@ -136,7 +200,8 @@ fn build(
         "dynamics":
             {"kind": "table", "states": states, "transitions": transitions, "start": start, "unsafe": unsafe_states},
     });
-    (model, demonstration, weights, request_start)
+    let request = json!({"model": "m", "demonstration": demonstration, "weights": weights, "start": request_start});
+    (model, request)
 }
 
 /// A cave with up to three wumpi, pits and pieces of gold, a body, and a walk of a full body in the same cave.

@@ -34,7 +34,6 @@ use etude_core::attribute::AttributeDocument;
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
 use etude_core::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Options, RequestKind};
-use etude_core::model::Origin;
 
 #[derive(Args, Debug)]
 pub(super) struct Stream {
@@ -114,8 +113,7 @@ impl Stream {
 
         let weights = options.weights_over(schema.weights());
         printer.weights = Some(schema.by_attribute(weights.as_slice().iter().copied()));
-        let start = options.start.and_then(Origin::state);
-        let mut online = OnlineMapping::new(&mapper, weights, start, options.lookahead);
+        let mut online = OnlineMapping::new(&mapper, weights, options.conditions(), options.lookahead);
         let mut actions = Vec::new();
         let mut print = |printer: &mut Printer<'_, _>, steps: &[CommittedStep]| {
             for step in steps {
@@ -135,14 +133,19 @@ impl Stream {
                 let told = faults.listed().iter().map(|fault| spot.tell(&fault.pointer, &fault.detail));
                 faulty(told.collect(), faults.count() - faults.listed().len())
             };
-            let steps = online.observe(&faults.check(read).map_err(told)?, &mut Uninterrupted)?;
+            let steps = online.observe(&faults.check(read).map_err(told)?, None, &mut Uninterrupted)?;
             printer.received(online.n_observed());
             print(printer, &steps)?;
         }
         let Some((steps, mapping)) = online.end() else { return Err(nothing_observed()) };
         print(printer, &steps)?;
-        let done =
-            ServerFrame::Done { policy_id: None, status: mapping.status, cost: mapping.cost, actions: Some(&actions) };
+        let done = ServerFrame::Done {
+            policy_id: None,
+            status: mapping.status,
+            cost: mapping.cost,
+            end: &mapping.end,
+            actions: Some(&actions),
+        };
         printer.frame(&text_of(&done)?).map(drop)
     }
 

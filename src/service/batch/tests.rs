@@ -168,7 +168,9 @@ fn what_items_say_besides_their_demonstrations_is_counted() {
 #[test]
 fn what_is_wrong_with_items_takes_memory_too() {
     let mapper = mapper();
-    let item = format!(r#"{{"demonstration": [{}]}}"#, vec!["9"; 500].join(","));
+    // Each of another kind: what is wrong with all observations alike is told once.
+    let wrong: Vec<String> = (0..500).map(|n| format!(r#"{{"{n}": 9}}"#)).collect();
+    let item = format!(r#"{{"demonstration": [{}]}}"#, wrong.join(","));
     let text = format!(r#"{{"model": "figure-4", "items": [{}]}}"#, vec![item.as_str(); 100].join(","));
     let told = |room: u64| {
         let memory = Memory::with_room(room);

@@ -135,8 +135,9 @@ async fn the_refined_policy_is_the_optimum_however_the_first_one_was_to_be_searc
     let (_, mapper) = etude.mapper("world", "/model", None, None).await.unwrap();
     let schema = mapper.model().schema();
     let text = request["demonstration"].to_string();
-    let demonstration = Demonstration::read_again(schema, &[text], 3).unwrap().unwrap();
-    let problem = Problem::new(mapper.model(), demonstration, schema.weights(), None);
+    let (demonstration, _) = Demonstration::read_stored(schema, &[text], 3).unwrap().unwrap();
+    let problem =
+        Problem::new(mapper.model(), demonstration, schema.weights(), etude_core::mapping::Conditions::default());
     let refined =
         optimum(&mapper, problem, 1e9, Stamp::default(), (&etude.memory, &etude.clock), &mut || Signal::Finish);
     assert!(refined.unwrap().unwrap().is_none());

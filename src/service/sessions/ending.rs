@@ -3,8 +3,10 @@
 use std::sync::Arc;
 
 use etude_core::attribute::Weights;
-use etude_core::mapping::{Cost, Mapper, Mapping, OnlineMapping, Policy, Problem, Stamp, Status, WrittenPolicy};
-use etude_core::model::{Model, Origin};
+use etude_core::mapping::{
+    Conditions, Cost, Mapper, Mapping, OnlineMapping, Policy, PolicyEnd, Problem, Stamp, Status, WrittenPolicy,
+};
+use etude_core::model::Model;
 
 use super::committed::CommittedSteps;
 use super::{SessionError, read_stored};
@@ -34,6 +36,8 @@ pub struct SessionPolicy {
     pub status: Status,
     /// What it costs.
     pub cost: Cost,
+    /// How it ends.
+    pub end: PolicyEnd,
     /// Its actions, in order.
     pub actions: Vec<Arc<str>>,
 }
@@ -43,7 +47,7 @@ impl SessionPolicy {
     pub(super) fn of(id: Option<String>, model: &Model, mapping: &Mapping) -> Self {
         let actions = mapping.moves.iter().filter_map(|step| step.action);
         let actions = actions.map(|action| model.action_name(action)).collect();
-        Self { id, status: mapping.status, cost: mapping.cost, actions }
+        Self { id, status: mapping.status, cost: mapping.cost, end: mapping.end.clone(), actions }
     }
 
     /// Most bytes that it takes if it has so many steps.
@@ -80,16 +84,16 @@ pub(super) fn conclude(
     mut steps: CommittedSteps,
     (mapper, clock): (&Mapper, &Clock),
     (id, n_observations, texts): (&str, u32, &[String]),
-    weights: Weights,
-    start: Option<u32>,
+    (weights, conditions): (Weights, Conditions),
     stamp: Stamp,
 ) -> Result<Concluded, SessionError> {
     let started = clock.instant();
     let (rest, mapping) = online.end().ok_or(SessionError::Empty)?;
     steps.extend(rest);
     Policy::check_steps(mapper.model(), &mapping)?;
-    let demonstration = read_stored(mapper, texts, (id, n_observations))?;
-    let problem = Problem::new(mapper.model(), demonstration, weights, start.map(Origin::State));
+    let (demonstration, observation_weights) = read_stored(mapper, texts, (id, n_observations))?;
+    let conditions = conditions.with_observation_weights(&observation_weights, demonstration.len());
+    let problem = Problem::new(mapper.model(), demonstration, weights, conditions);
     let warnings = problem.warnings(&DEMONSTRATION);
     let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), warnings, ..stamp };
     report(&stamp, &mapping);

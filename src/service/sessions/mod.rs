@@ -70,7 +70,7 @@ impl Etude {
         let read = object
             .as_ref()
             .and_then(|object| opening::read(&mapper, learner.as_ref(), general, object, max_bytes, &mut faults));
-        let SessionOptions { mut weights, start, lookahead } = faults.check(read)?;
+        let SessionOptions { mut weights, conditions, lookahead } = faults.check(read)?;
         let model = names.model;
 
         let mut trial = None;
@@ -94,7 +94,7 @@ impl Etude {
                 model_hash: model_hash.clone(),
                 weights: mapper.model().schema().by_attribute(weights.as_slice().iter().copied()),
                 lookahead: lookahead.map(NonZeroU32::get),
-                start,
+                conditions: conditions.clone(),
                 learner: source.learner.clone(),
                 weights_version: source.weights_version,
                 trial,
@@ -109,7 +109,7 @@ impl Etude {
             }
             Opened::NumberTaken | Opened::KeyTaken => return Err(PoolError::Busy.into()),
         }
-        let online = OnlineMapping::new(&mapper, weights.clone(), start, lookahead);
+        let online = OnlineMapping::new(&mapper, weights.clone(), conditions.clone(), lookahead);
         let online = Some(online);
         Ok(Session {
             id,
@@ -118,7 +118,7 @@ impl Etude {
             mapper,
             weights,
             lookahead,
-            start,
+            conditions,
             source,
             n_received: 0,
             n_steps: 0,
@@ -173,11 +173,11 @@ impl Etude {
             model_hash: row.model_hash,
             weights: weights.clone(),
             lookahead,
-            start: row.start,
+            conditions: row.conditions.clone(),
             source: Source { learner: row.learner, weights_version: row.weights_version, trial_id: row.trial_id },
             n_received: row.n_observations,
             n_steps: 0,
-            online: Some(OnlineMapping::new(&mapper, weights, row.start, lookahead)),
+            online: Some(OnlineMapping::new(&mapper, weights, row.conditions, lookahead)),
             mapper,
             held: self.memory.try_take(0).map_err(ServiceError::from)?,
             client: caller.client,
@@ -191,8 +191,12 @@ impl Etude {
             let reading = {
                 let (mapper, id, n_received) = (Arc::clone(&session.mapper), session.id.clone(), session.n_received);
                 move || -> Result<Vec<Observation>, SessionError> {
-                    let demonstration = read_stored(&mapper, &texts, (&id, n_received))?;
-                    Ok(demonstration.iter().map(<[_]>::to_vec).collect())
+                    let (demonstration, weights) = read_stored(&mapper, &texts, (&id, n_received))?;
+                    let mut weights = weights.into_iter();
+                    let observed = demonstration
+                        .iter()
+                        .map(|values| Observation { values: values.to_vec(), weight: weights.next().flatten() });
+                    Ok(observed.collect())
                 }
             };
             let n_values = session.n_received as usize * session.mapper.model().schema().len();
@@ -378,8 +382,8 @@ fn read_stored(
     mapper: &Mapper,
     texts: &[String],
     (id, n_observations): (&str, u32),
-) -> Result<Demonstration, SessionError> {
-    let read = Demonstration::read_again(mapper.model().schema(), texts, n_observations as usize);
+) -> Result<(Demonstration, Vec<Option<f64>>), SessionError> {
+    let read = Demonstration::read_stored(mapper.model().schema(), texts, n_observations as usize);
     let read = read.map_err(|error| ServiceError::unreadable("observations", "states", id, error))?;
     read.ok_or(SessionError::Empty)
 }

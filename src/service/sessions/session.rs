@@ -17,7 +17,7 @@ use crate::store::{AcceptedReward, NewObservations, Owner, SessionEnd, TrialReco
 use etude_core::attribute::{ByAttribute, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, Uninterrupted};
-use etude_core::mapping::{Demonstration, Mapper, OnlineMapping, Policy, Stamp, Stopped};
+use etude_core::mapping::{Conditions, Demonstration, Mapper, OnlineMapping, Options, Policy, Stamp, Stopped};
 
 /// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
 /// in the pool.
@@ -32,7 +32,7 @@ pub struct Session {
     pub(super) mapper: Arc<Mapper>,
     pub(super) weights: Weights,
     pub(super) lookahead: Option<NonZeroU32>,
-    pub(super) start: Option<u32>,
+    pub(super) conditions: Conditions,
     pub(super) source: Source,
     pub(super) n_received: u32,
     pub(super) n_steps: usize,
@@ -139,7 +139,8 @@ impl Session {
     }
 
     /// Takes the states from `seq` on, of which those received before are ignored: they are durable when this returns. What
-    /// takes less time than the disk is mapped while that writes.
+    /// takes less time than the disk is mapped while that writes. `observation_weights` says what each of them counts, if not what the
+    /// session was opened with.
     ///
     /// # Errors
     ///
@@ -150,6 +151,7 @@ impl Session {
         etude: &Etude,
         seq: u32,
         states: &Place<'_, '_>,
+        observation_weights: Option<&Place<'_, '_>>,
         now: Timestamp,
     ) -> Result<Received, SessionError> {
         if self.has_ended() {
@@ -176,7 +178,22 @@ impl Session {
         let schema = self.mapper.model().schema();
         let places = new.iter().enumerate().map(|(n, state)| states.item(n_known + n, state));
         let read = Demonstration::read_observations(schema, places, &mut faults);
-        let observations = faults.check(read)?;
+        let weights = match observation_weights {
+            Some(place) => {
+                let weights = Options::read_observation_weights(place, &mut faults);
+                if let Some(weights) = weights.as_ref().filter(|weights| weights.len() != items.len()) {
+                    let detail =
+                        format!("expected one for each of the {} states, found {}", items.len(), weights.len());
+                    faults.note(place, detail);
+                }
+                weights
+            }
+            None => Some(Vec::new()),
+        };
+        let (observations, weights) = faults.check(read.zip(weights))?;
+        let mut weights = weights.into_iter().skip(n_known);
+        let observations: Vec<Observation> =
+            observations.into_iter().map(|values| Observation { values, weight: weights.next().flatten() }).collect();
         #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
         let n_states = new.len() as u32;
         let appending = etude.store.append_observations(NewObservations {
@@ -184,7 +201,7 @@ impl Session {
             owner: self.owner,
             seq: self.n_received,
             n_states,
-            states: serde_json::to_string(new).map_err(ServiceError::Write)?,
+            states: stored_states(new, &observations).map_err(ServiceError::Write)?,
             at: now,
         });
         let mapping = async {
@@ -230,7 +247,7 @@ impl Session {
             let mut online = online.within(usize::try_from(most_bytes).unwrap_or(usize::MAX));
             let mut steps = CommittedSteps::default();
             for observation in &observations {
-                match online.observe(observation, interrupt) {
+                match online.observe(&observation.values, observation.weight, interrupt) {
                     Ok(committed) => {
                         if steps.take_for(committed.len(), mapper.model(), &memory).is_err() {
                             return Ok(Err(no_room));
@@ -281,7 +298,7 @@ impl Session {
         }
         let (texts, texts_held) = etude.stored_observations(&self.id, self.n_received, self.mapper.model()).await?;
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
-        let (mapper, weights, start) = (Arc::clone(&self.mapper), self.weights.clone(), self.start);
+        let (mapper, wanted) = (Arc::clone(&self.mapper), (self.weights.clone(), self.conditions.clone()));
         let (id, n_committed) = (self.id.clone(), self.n_steps);
         let (memory, clock) = (etude.memory.clone(), etude.clock.clone());
         let policy_id = match &self.source.trial_id {
@@ -299,9 +316,9 @@ impl Session {
         };
         let job = move |_: &mut dyn Interrupt| {
             let steps = take_for_end(&online, n_committed, mapper.model(), &memory);
-            let concluded = steps.map_err(|no_room| ServiceError::from(no_room).into()).and_then(|steps| {
-                conclude(online, steps, (&mapper, &clock), (&id, seq, &texts), weights, start, stamp)
-            });
+            let concluded = steps
+                .map_err(|no_room| ServiceError::from(no_room).into())
+                .and_then(|steps| conclude(online, steps, (&mapper, &clock), (&id, seq, &texts), wanted, stamp));
             drop(texts_held);
             Ok(concluded)
         };
@@ -324,8 +341,25 @@ fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) 
     n_layers.saturating_mul(size) <= MAX_INLINE_WORK
 }
 
-/// An observation as it was read. Shape `[n_attributes]`; `None` where an attribute was not observed.
-pub type Observation = Vec<Option<etude_core::attribute::Value>>;
+/// An observation as it was read.
+#[derive(Clone, Debug)]
+pub struct Observation {
+    /// Shape `[n_attributes]`; `None` where an attribute was not observed.
+    pub values: Vec<Option<etude_core::attribute::Value>>,
+    /// What distances to it count; `None`: what the session was opened with.
+    pub weight: Option<f64>,
+}
+
+/// Observed states as they are stored: before each that counts differently, the number that it counts.
+fn stored_states(states: &[serde_json::Value], observations: &[Observation]) -> serde_json::Result<String> {
+    if observations.iter().all(|observation| observation.weight.is_none()) {
+        return serde_json::to_string(states);
+    }
+    let stored = states.iter().zip(observations).flat_map(|(state, observation)| {
+        observation.weight.map(serde_json::Value::from).into_iter().chain([state.clone()])
+    });
+    serde_json::to_string(&stored.collect::<Vec<_>>())
+}
 
 #[cfg(test)]
 mod tests;

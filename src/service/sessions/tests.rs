@@ -40,7 +40,9 @@ async fn observed(directory: &std::path::Path, tasks: &TaskTracker) -> (Etude, S
     let mut session = etude.open_session(&json!({"type": "open", "model": "wide"}), caller()).await.unwrap();
     let states = json!(vec![json!({}); 300]);
     for n in 0..4 {
-        if let Received::Waiting(states) = session.receive(&etude, 300 * n, &Place::root(&states), NOW).await.unwrap() {
+        if let Received::Waiting(states) =
+            session.receive(&etude, 300 * n, &Place::root(&states), None, NOW).await.unwrap()
+        {
             session.advance(&etude, states).await.unwrap();
         }
     }

@@ -2,7 +2,7 @@ use tokio_util::task::TaskTracker;
 
 use super::*;
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{Demonstration, Mapper, Problem, Stamp};
+use etude_core::mapping::{Conditions, Demonstration, Mapper, Problem, Stamp};
 use etude_core::model::{Definition, Limits, Model};
 
 /// A policy of a line of so many states with long names, which goes all the way: its answer, its summary and its steps as they are
@@ -25,7 +25,7 @@ fn long(id: &str, n_states: usize) -> (String, String, Vec<u8>) {
     let end = states.domain(0)[states.row(last)[0] as usize].clone();
     let demonstration = Demonstration::of([vec![None; N_ATTRIBUTES], vec![Some(end); N_ATTRIBUTES]]).unwrap();
     let weights = mapper.model().schema().weights();
-    let problem = Problem::new(mapper.model(), demonstration, weights, None);
+    let problem = Problem::new(mapper.model(), demonstration, weights, Conditions::default());
     let mapping = mapper.map(&problem, etude_core::mapping::Settings::default(), &mut Uninterrupted).unwrap();
     let stamp = Stamp { id: Some(id.to_owned()), ..Stamp::default() };
     let written = WrittenPolicy::new(&stamp, &problem, &mapping).unwrap();

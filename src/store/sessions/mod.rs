@@ -17,6 +17,7 @@ use super::policies::{NewPolicy, NewRefinement};
 use super::trials::{NewTrial, Opened};
 use super::{Page, Store, StoreError, corrupt, timestamp};
 use etude_core::attribute::ByAttribute;
+use etude_core::mapping::Conditions;
 pub(super) use verbs::SettleObservations;
 use verbs::{ExpireSessions, TakeSession, TouchSession};
 
@@ -73,8 +74,8 @@ pub struct SessionRecord {
     pub weights: ByAttribute<f64>,
     /// How many observations past the current one a decision may wait for; `None` for all.
     pub lookahead: Option<u32>,
-    /// Index of the start state, if the request named one.
-    pub start: Option<u32>,
+    /// What it may start from, what counts, and what the body lacks.
+    pub conditions: Conditions,
     /// The learner whose weights are used, if any.
     pub learner: Option<String>,
     /// The version of the learner's weights.
@@ -108,8 +109,8 @@ pub struct NewSession {
     pub weights: ByAttribute<f64>,
     /// How many observations past the current one a decision may wait for; `None` for all.
     pub lookahead: Option<u32>,
-    /// Index of the start state, if the request named one.
-    pub start: Option<u32>,
+    /// What it may start from, what counts, and what the body lacks.
+    pub conditions: Conditions,
     /// The learner whose weights are used, if any.
     pub learner: Option<String>,
     /// The version of the learner's weights.
@@ -130,7 +131,7 @@ impl NewSession {
             model_hash: "0".to_owned(),
             weights: [("x".into(), 1.0)].into_iter().collect(),
             lookahead: None,
-            start: None,
+            conditions: Conditions::default(),
             learner: None,
             weights_version: None,
             trial: None,
@@ -340,7 +341,7 @@ fn read_session(row: &SqliteRow) -> Result<SessionRecord, StoreError> {
         model_hash: row.try_get("model_hash")?,
         weights: serde_json::from_str(row.try_get("weights")?).map_err(corrupt(TABLE, "weights"))?,
         lookahead: count("lookahead")?,
-        start: count("start")?,
+        conditions: serde_json::from_str(row.try_get("conditions")?).map_err(corrupt(TABLE, "conditions"))?,
         learner: row.try_get("learner")?,
         weights_version: count("weights_version")?.map(u64::from),
         trial_id: row.try_get("trial_id")?,

@@ -160,7 +160,7 @@ async fn insert(connection: &mut SqliteConnection, session: &NewSession) -> Resu
     let created_at_ms = session.created_at.as_millisecond();
     sqlx::query(
         "INSERT INTO sessions
-             (id, model, model_hash, weights, lookahead, start, learner, weights_version, trial_id,
+             (id, model, model_hash, weights, lookahead, conditions, learner, weights_version, trial_id,
               status, owner, n_observations, created_at_ms, active_at_ms)
          VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', $11, 0, $10, $10)",
     )
@@ -169,7 +169,7 @@ async fn insert(connection: &mut SqliteConnection, session: &NewSession) -> Resu
     .bind(&session.model_hash)
     .bind(serde_json::to_string(&session.weights).map_err(corrupt("sessions", "weights"))?)
     .bind(session.lookahead)
-    .bind(session.start)
+    .bind(serde_json::to_string(&session.conditions).map_err(corrupt("sessions", "conditions"))?)
     .bind(&session.learner)
     .bind(session.weights_version.map(as_integer))
     .bind(session.trial.as_ref().map(|trial| &trial.id))

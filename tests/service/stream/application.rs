@@ -43,16 +43,16 @@ async fn resuming_and_repeating_keep_a_session_from_expiring() {
     let mut session = etude.open_session(&open, caller(0)).await.unwrap();
     let id = session.id().to_owned();
     let active_at = async || etude.session(&id).await.unwrap().active_at;
-    session.receive(&etude, 0, &states, at(1)).await.unwrap();
+    session.receive(&etude, 0, &states, None, at(1)).await.unwrap();
     assert_eq!(active_at().await, at(1));
-    session.receive(&etude, 0, &states, at(2)).await.unwrap();
+    session.receive(&etude, 0, &states, None, at(2)).await.unwrap();
     assert_eq!(active_at().await, at(2));
     drop(session);
     let mut resumed = etude.resume_session(&id, caller(3)).await.unwrap();
     assert_eq!((active_at().await, resumed.session.n_received()), (at(3), 16));
     // What is not settled yet came before.
     let more = json!([demonstration[0]]);
-    resumed.session.receive(&etude, 16, &Place::root(&more), at(4)).await.unwrap();
+    resumed.session.receive(&etude, 16, &Place::root(&more), None, at(4)).await.unwrap();
     drop(resumed);
     assert_eq!(etude.resume_session(&id, caller(5)).await.unwrap().session.n_received(), 17);
     assert_eq!(active_at().await, at(5));

@@ -39,17 +39,36 @@ impl<'s> WellFormed<'s> {
         deserializer.end()?;
         Ok(read)
     }
+
+    /// Reads all of `text`, in which a number before an observation is what it counts. Gives what they count as far as that is told of any.
+    ///
+    /// # Errors
+    ///
+    /// If it is not well-formed.
+    pub(super) fn read_weighted(self, text: &str) -> Result<(Demonstration, Vec<Option<f64>>), serde_json::Error> {
+        let mut weights = Vec::new();
+        let mut deserializer = serde_json::Deserializer::from_str(text);
+        let read = deserializer.deserialize_seq(Observations { all: self, weights: Some(&mut weights) })?;
+        deserializer.end()?;
+        Ok((read, weights))
+    }
+}
+
+/// Reads observations; numbers before them too, if there is a place for weights.
+struct Observations<'s, 'w> {
+    all: WellFormed<'s>,
+    weights: Option<&'w mut Vec<Option<f64>>>,
 }
 
 impl<'de> DeserializeSeed<'de> for WellFormed<'_> {
     type Value = Demonstration;
 
     fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Demonstration, D::Error> {
-        deserializer.deserialize_seq(self)
+        deserializer.deserialize_seq(Observations { all: self, weights: None })
     }
 }
 
-impl<'de> Visitor<'de> for WellFormed<'_> {
+impl<'de> Visitor<'de> for Observations<'_, '_> {
     type Value = Demonstration;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -57,18 +76,29 @@ impl<'de> Visitor<'de> for WellFormed<'_> {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Demonstration, A::Error> {
-        let Self { schema, n_values, max_len } = self;
+        let Self { all: WellFormed { schema, n_values, max_len }, mut weights } = self;
         let mut values = Vec::with_capacity(n_values);
         let mut len = 0;
         // Most observations have their members in the order of the first, and that is mostly the attributes'.
         let mut order: Vec<usize> = (0..schema.len()).collect();
         let mut last_seen = vec![0; schema.len()];
+        let mut weight = None;
         loop {
             let number = len + 1;
-            let observation =
+            let one =
                 OneObservation { schema, values: &mut values, order: &mut order, last_seen: &mut last_seen, number };
-            if items.next_element_seed(observation)?.is_none() {
-                break;
+            let Some(told) = items.next_element_seed(one)? else { break };
+            match (told, &mut weights) {
+                (Some(_), None) => return Err(A::Error::custom("a number is no observation")),
+                (Some(counts), Some(_)) => {
+                    weight = Some(counts);
+                    continue;
+                }
+                (None, Some(weights)) if weight.is_some() => {
+                    weights.resize(len, None);
+                    weights.push(weight.take());
+                }
+                (None, _) => {}
             }
             len = number;
             // As they come: what is not observed takes as much room as what is.
@@ -83,7 +113,7 @@ impl<'de> Visitor<'de> for WellFormed<'_> {
     }
 }
 
-/// Reads an observation, to the end of `values`.
+/// Reads an observation, to the end of `values`; or a number, which it gives.
 struct OneObservation<'s, 'v> {
     schema: &'s Schema,
     values: &'v mut Vec<Option<Value>>,
@@ -96,30 +126,34 @@ struct OneObservation<'s, 'v> {
 }
 
 impl<'de> DeserializeSeed<'de> for OneObservation<'_, '_> {
-    type Value = ();
+    type Value = Option<f64>;
 
-    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Option<f64>, D::Error> {
         deserializer.deserialize_any(self)
     }
 }
 
 impl<'de> Visitor<'de> for OneObservation<'_, '_> {
-    type Value = ();
+    type Value = Option<f64>;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("an observation")
     }
 
-    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
+    fn visit_f64<E: serde::de::Error>(self, number: f64) -> Result<Option<f64>, E> {
+        Ok(Some(number))
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<Option<f64>, A::Error> {
         for attribute in self.schema.attributes() {
             let value = items.next_element_seed(ValueSeed(attribute))?;
             self.values.push(value.ok_or_else(|| A::Error::custom("too few values"))?);
         }
         // One too many is an error of the deserializer.
-        Ok(())
+        Ok(None)
     }
 
-    fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<(), A::Error> {
+    fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<Option<f64>, A::Error> {
         let first = self.values.len();
         self.values.resize(first + self.schema.len(), None);
         let Self { schema, values, order, last_seen, number } = self;
@@ -127,7 +161,7 @@ impl<'de> Visitor<'de> for OneObservation<'_, '_> {
         loop {
             let mut further = 0;
             let expected = places.next().unwrap_or(&mut further);
-            let Some(position) = members.next_key_seed(Name { schema, expected: *expected })? else { return Ok(()) };
+            let Some(position) = members.next_key_seed(Name { schema, expected: *expected })? else { return Ok(None) };
             *expected = position;
             if std::mem::replace(&mut last_seen[position], number) == number {
                 return Err(A::Error::custom(TWICE));

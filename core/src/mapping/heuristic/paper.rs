@@ -15,7 +15,7 @@ pub(crate) struct Paper<'p> {
 
 impl<'p> Paper<'p> {
     pub(crate) fn new(problem: &'p Problem<'p>) -> Self {
-        Self { problem, least_action_cost: problem.least_action_cost() }
+        Self { problem, least_action_cost: problem.body.least_cost() }
     }
 }
 

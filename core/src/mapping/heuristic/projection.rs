@@ -4,13 +4,14 @@
 //! followed exactly. Doing so for every attribute and adding up gives a lower bound of the whole cost, if no cost is counted twice:
 //!
 //! - distances are sums over attributes, so each attribute pays its own terms;
-//! - the cost of an action is split evenly among the attributes that the transition changes, of those that take part. An attribute that
+//! - the cost of a transition is split evenly among the attributes that the transition changes, of those that take part. An attribute that
 //!   it does not change moves for nothing, which is the projected `skip`;
-//! - an extra action pays the distance once more, in all attributes: also in those that it does not change, which the others'
+//! - an extra action pays its part x of the distance once more, in all attributes: also in those that it does not change, which the others'
 //!   projections do not see. So let `least_k(i)` be the least term of the attribute k at observation i, of any value that
-//!   it may have; it is above 0 where the body can never have what was seen. The sum of these over all attributes is paid
+//!   it may have; it is above 0 where the body can never have what was seen. The part x of the sum of these over all attributes is paid
 //!   by every extra action at i, and is split as the cost of the action is (`share_i`, of both); an attribute that changes pays, besides,
-//!   what its term is above its least (`rest`).
+//!   the part x of what its term is above its least (`rest`);
+//! - what ending costs is a sum over attributes, as distances are. Extra actions at the last observation may save some of it.
 //!
 //! Every move of the real problem is then, in each attribute, a projected move or none, and the projected costs add up to at most
 //! the real one. Hence the sum of the exact projected costs-to-go is admissible, and, as it satisfies the triangle inequality of
@@ -23,7 +24,8 @@
 use rustc_hash::{FxHashMap, FxHashSet};
 
 use crate::interrupt::{Interrupt, Interrupted, Meter};
-use crate::model::{ActionIdx, Model, Operator, Rows};
+use crate::mapping::conditions::Body;
+use crate::model::{ActionIdx, Model, Operator, OwnCost, Rows};
 
 /// The projections of a model. They depend on neither demonstrations nor weights, so they are made once per model.
 #[derive(Debug)]
@@ -32,6 +34,8 @@ pub(crate) struct Projections {
     pub(super) attributes: Vec<Projection>,
     /// Distinct sets of these that some transition changes.
     pub(super) change_sets: Vec<Vec<u16>>,
+    /// Distinct costs that transitions have of their own, as [`Edge::own_cost`] numbers them.
+    own_costs: Vec<f64>,
 }
 
 /// A model, projected on one of its attributes.
@@ -57,6 +61,37 @@ pub(super) struct Edge {
     /// Which attributes change with it.
     pub(super) change_set: u32,
     pub(super) action: ActionIdx,
+    /// The number of what the transition costs itself, from 1 on; 0: what the action costs.
+    own_cost: OwnCostIdx,
+}
+
+type OwnCostIdx = u16;
+
+/// Distinct costs that transitions have of their own.
+#[derive(Default)]
+struct OwnCosts {
+    /// In the order of their numbers. The last number there can be is that of the least of all further costs, which keeps the bound a
+    /// bound.
+    costs: Vec<f64>,
+    numbers: FxHashMap<u64, OwnCostIdx>,
+}
+
+impl OwnCosts {
+    fn number_of(&mut self, cost: f64) -> OwnCostIdx {
+        if let Some(number) = self.numbers.get(&cost.to_bits()) {
+            return *number;
+        }
+        if self.costs.len() < usize::from(OwnCostIdx::MAX) {
+            self.costs.push(cost);
+        } else if let Some(last) = self.costs.last_mut() {
+            *last = last.min(cost);
+            return OwnCostIdx::MAX;
+        }
+        #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX")]
+        let number = self.costs.len() as OwnCostIdx;
+        self.numbers.insert(cost.to_bits(), number);
+        number
+    }
 }
 
 /// Most edges of all projections together, and most entries of all change sets: 256 and 32 MB. Projections whose edges do not fit are
@@ -85,9 +120,15 @@ impl Projections {
         let mut found = EdgeSets::of(positions.collect(), max_edges);
         match model.operators() {
             None => {
-                for (from, transition) in model.graph().iter() {
-                    meter.spend_or_stop(found.positions.len() as u64)?;
-                    found.add_transition(transition.action, states.row(from), states.row(transition.to));
+                let graph = model.graph();
+                for from in 0..states.len() {
+                    let own_costs = graph.own_costs(from);
+                    for (n, transition) in graph.successors(from).iter().enumerate() {
+                        meter.spend_or_stop(found.positions.len() as u64)?;
+                        let own_cost = own_costs.get(n).and_then(|cost| cost.get());
+                        let rows = (states.row(from), states.row(transition.to));
+                        found.add_transition(transition.action, own_cost, rows);
+                    }
                 }
             }
             Some(operators) => {
@@ -97,7 +138,7 @@ impl Projections {
                 }
             }
         }
-        let EdgeSets { positions, edges, change_sets, .. } = found;
+        let EdgeSets { positions, edges, change_sets, own_costs, .. } = found;
         let mut attributes = Vec::with_capacity(positions.len());
         for (position, edges) in positions.into_iter().zip(edges) {
             let n_values = states.domain(position).len();
@@ -111,7 +152,7 @@ impl Projections {
             }
             attributes.push(Projection { position, n_values, edges, is_kept });
         }
-        Ok(Self { attributes, change_sets: change_sets.sets })
+        Ok(Self { attributes, change_sets: change_sets.sets, own_costs: own_costs.costs })
     }
 
     /// Approximate size in memory, in bytes.
@@ -122,10 +163,18 @@ impl Projections {
     }
 }
 
+impl Projections {
+    /// What an edge costs a body: infinite if it lacks the action.
+    pub(super) fn cost(&self, edge: &Edge, body: &Body) -> f64 {
+        let own = usize::from(edge.own_cost).checked_sub(1).map(|number| OwnCost::of(Some(self.own_costs[number])));
+        body.cost(edge.action, own.as_ref())
+    }
+}
+
 impl Projection {
-    /// Whether no action changes the attribute.
-    pub(super) fn is_constant(&self) -> bool {
-        self.edges.n_items() == 0
+    /// Whether no action of a body changes the attribute.
+    pub(super) fn is_constant(&self, body: &Body) -> bool {
+        !self.edges.iter().flatten().any(|edge| body.has(edge.action))
     }
 }
 
@@ -137,6 +186,7 @@ struct EdgeSets {
     n_edges: usize,
     max_edges: usize,
     change_sets: ChangeSets,
+    own_costs: OwnCosts,
     /// The values that change, from and to what, of the projections that are kept.
     changed: Vec<(u16, ValueIdx, ValueIdx)>,
 }
@@ -144,16 +194,17 @@ struct EdgeSets {
 impl EdgeSets {
     fn of(positions: Vec<usize>, max_edges: usize) -> Self {
         let edges = vec![Some(FxHashSet::default()); positions.len()];
-        Self { positions, edges, n_edges: 0, max_edges, change_sets: ChangeSets::default(), changed: Vec::new() }
+        let (change_sets, own_costs) = (ChangeSets::default(), OwnCosts::default());
+        Self { positions, edges, n_edges: 0, max_edges, change_sets, own_costs, changed: Vec::new() }
     }
 
     /// Adds what a transition between states with these rows changes.
-    fn add_transition(&mut self, action: ActionIdx, row: &[u32], row_after: &[u32]) {
+    fn add_transition(&mut self, action: ActionIdx, own_cost: Option<f64>, (row, row_after): (&[u32], &[u32])) {
         let values = (0..).zip(&self.positions).map(|(number, at)| (number, row[*at], row_after[*at]));
         let edges = &self.edges;
         self.changed.clear();
         self.changed.extend(values.filter(|(number, from, to)| from != to && edges[usize::from(*number)].is_some()));
-        self.insert_changes(action);
+        self.insert_changes(action, own_cost);
     }
 
     /// Adds what any transition that is like `operator` changes.
@@ -163,14 +214,16 @@ impl EdgeSets {
             let change = operator.changed.iter().find(|(at, _, _)| at == position);
             self.changed.extend(change.filter(|_| edges.is_some()).map(|(_, from, to)| (number, *from, *to)));
         }
-        self.insert_changes(operator.action);
+        self.insert_changes(operator.action, operator.cost);
     }
 
-    fn insert_changes(&mut self, action: ActionIdx) {
+    fn insert_changes(&mut self, action: ActionIdx, own_cost: Option<f64>) {
+        let own_cost = own_cost.map_or(0, |cost| self.own_costs.number_of(cost));
         let change_set = self.change_sets.number_of(self.changed.iter().map(|(number, _, _)| *number));
         for (number, from, to) in &self.changed {
             let edges = self.edges[usize::from(*number)].as_mut();
-            let is_new = edges.is_some_and(|edges| edges.insert((*to, Edge { from: *from, change_set, action })));
+            let is_new =
+                edges.is_some_and(|edges| edges.insert((*to, Edge { from: *from, change_set, action, own_cost })));
             self.n_edges += usize::from(is_new);
         }
         if self.n_edges > self.max_edges || self.change_sets.n_entries > self.max_edges {
@@ -271,7 +324,7 @@ mod tests {
         let (mut known, mut lazy) = (none(), none());
         for (from, transition) in model.graph().iter() {
             let [row, row_after] = [from, transition.to].map(|state| model.states().row(state));
-            known.add_transition(transition.action, row, row_after);
+            known.add_transition(transition.action, None, (row, row_after));
         }
         unlisted.operators().unwrap().for_each(|operator| lazy.add_operator(&operator));
         let of = |found: &EdgeSets, number: usize| -> FxHashSet<(ValueIdx, ValueIdx, ActionIdx, Vec<u16>)> {

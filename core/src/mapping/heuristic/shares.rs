@@ -20,10 +20,10 @@ pub(super) struct SharedWay {
 }
 
 impl SharedWay {
-    /// What the attribute pays of an extra action, where `least_distance` is paid in all.
+    /// What the attribute pays of an extra action, where `least_paid` of the distance is paid in all.
     #[inline]
-    pub(super) fn of_extra(self, least_distance: f64) -> f64 {
-        self.share + self.part * least_distance
+    pub(super) fn of_extra(self, least_paid: f64) -> f64 {
+        self.share + self.part * least_paid
     }
 }
 
@@ -38,10 +38,11 @@ impl SharedWays {
     ) -> Self {
         let n_sharing = |set: &Vec<u16>| set.iter().map(|number| u32::from(used[usize::from(*number)])).sum::<u32>();
         let n_sharing: Vec<f64> = projections.change_sets.iter().map(|set| f64::from(n_sharing(set))).collect();
-        let mut ways = projection.edges.map(|edge| {
+        let mut ways = projection.edges.filter_map(|edge| {
             let n_sharing = n_sharing[edge.change_set as usize];
-            let share = problem.model.action(edge.action).cost / n_sharing;
-            SharedWay { from: edge.from, share, part: 1.0 / n_sharing }
+            let cost = projections.cost(edge, &problem.body);
+            // What the body lacks is no way.
+            cost.is_finite().then(|| SharedWay { from: edge.from, share: cost / n_sharing, part: 1.0 / n_sharing })
         });
         ways.dedup(|way, other| {
             let is_same = way.from == other.from;

@@ -1,6 +1,6 @@
 //! The search of large problems, which gets larger tables, and at last a sweep, the longer it takes.
 
-use super::{Budget, Buffers, Mapper, Mapping, Settings, conclude, within};
+use super::{Budget, Buffers, Mapper, Mapping, Settings, conclude, least_start, within};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::cost::SLACK;
 use crate::mapping::heuristic::Heuristic;
@@ -117,7 +117,8 @@ fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &KnownLayer
     const MAX_STATES: StateIdx = 1 << 17;
     let states = problem.model.states();
     if layer.observation == 0 {
-        return layer.costs[problem.start as usize] * (1.0 - SLACK);
+        let costs = problem.starts.states().iter().map(|state| layer.costs[*state as usize]);
+        return costs.fold(f64::INFINITY, f64::min) * (1.0 - SLACK);
     }
     if states.len() > MAX_STATES {
         return 0.0;
@@ -127,7 +128,7 @@ fn bound_of(problem: &Problem<'_>, projected: &Projected<'_>, layer: &KnownLayer
     let reachable = states.filter(|(row, _)| projected.speaks_of(row));
     let rises = reachable.map(|(row, cost)| cost - estimate(layer.observation, row));
     let least_rise = rises.fold(f64::INFINITY, f64::min);
-    (estimate(0, &problem.start_row) + least_rise) * (1.0 - SLACK)
+    (least_start(problem, projected) + least_rise) * (1.0 - SLACK)
 }
 
 /// Merges the results of two searches of one problem; `found` is that of the later one.

@@ -12,13 +12,13 @@ use rustc_hash::FxHashMap;
 use serde::{Deserialize, Serialize};
 
 use super::completion::{Allowance, Extras, complete};
-use super::cost::{Cost, ROUNDING, SLACK, cost_of};
+use super::cost::{Cost, ROUNDING, SLACK, action_costs, cost_of};
 use super::heuristic::paper::Paper;
 use super::heuristic::projected::{Projected, TableRoom};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Heuristic, HeuristicName};
 use super::search::{Found, Move, astar, layered};
-use super::{Budget, Problem, StoppedBy};
+use super::{Budget, PolicyEnd, Problem, StoppedBy};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
 use crate::model::{Model, Space, StateIdx, States};
 use buffers::{BufferPool, Buffers};
@@ -66,8 +66,12 @@ impl Status {
 pub struct Mapping {
     /// The steps, from [`Start`](super::MoveKind::Start) to the last observation.
     pub moves: Vec<Move>,
+    /// What the action of each of them costs; 0 without one.
+    pub action_costs: Vec<f64>,
     /// What they cost.
     pub cost: Cost,
+    /// How they end.
+    pub end: PolicyEnd,
     /// What was proven.
     pub status: Status,
     /// No mapping costs less. Equal to `cost.total` if optimal; `None` if local.
@@ -180,7 +184,7 @@ impl Mapper {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
         self.check(problem);
-        let Some(mut explored) = self.model.explore_from(&problem.start_row) else {
+        let Some(mut explored) = self.model.explore_from(problem.starts.rows()) else {
             return self.map_in(&mut self.model.whole(), problem, settings, interrupt);
         };
         let mut mapping = self.map_in(&mut explored, problem, settings, interrupt)?;
@@ -213,15 +217,15 @@ impl Mapper {
             HeuristicName::Paper => {
                 let found = astar::search(problem, space, &Paper::new(problem), budget, interrupt)?;
                 // The paper's estimate proves nothing; the projections bound the optimum all the same.
-                let first = problem.distances.distance(0, space.row(problem.start));
                 let room = TableRoom::within(budget.max_bytes);
                 if let Some(projected) = self.solve(problem, room, interrupt)? {
-                    let least_f = first + projected.cost_to_go(0, space.row(problem.start));
+                    let least_f = least_start(problem, &projected);
                     conclude(problem, space, &projected, Found { least_f, ..found }, interrupt)
                 } else {
-                    let stopped_by = found.stopped_by.or(Some(StoppedBy::Deadline));
-                    let found = Found { least_f: first, stopped_by, ..found };
-                    conclude(problem, space, &Projected::blind(problem), found, interrupt)
+                    let (blind, stopped_by) =
+                        (Projected::blind(problem), found.stopped_by.or(Some(StoppedBy::Deadline)));
+                    let found = Found { least_f: least_start(problem, &blind), stopped_by, ..found };
+                    conclude(problem, space, &blind, found, interrupt)
                 }
             }
         }
@@ -239,7 +243,7 @@ impl Mapper {
         let budget = settings.budget;
         let n_nodes =
             space.n_states().map_or(usize::MAX, |n_states| n_states.saturating_mul(problem.demonstration.len()));
-        if n_nodes > self.patience.max_layered_nodes || !layered::is_within(budget, &self.model, n_nodes) {
+        if n_nodes > self.patience.max_layered_nodes || !layered::is_within(budget, problem, n_nodes) {
             return Ok(None);
         }
         let solved = self.solve(problem, TableRoom::within(budget.max_bytes), interrupt)?;
@@ -292,6 +296,13 @@ impl Mapper {
     }
 }
 
+/// What a mapping costs at least, whichever start it has.
+fn least_start(problem: &Problem<'_>, heuristic: &impl Heuristic) -> f64 {
+    let starts = problem.starts.iter(problem.model);
+    let f = starts.map(|(_, row)| problem.distances.distance(0, row) + heuristic.cost_to_go(0, row));
+    f.fold(f64::INFINITY, f64::min)
+}
+
 /// How much memory ways take that are found, and the mapping, in bytes: some copies of some steps for each observation.
 fn way_bytes(problem: &Problem<'_>) -> usize {
     const N_STEPS: usize = 8;
@@ -336,19 +347,25 @@ fn conclude<S: Space, H: Heuristic>(
     let Found { paths, is_complete, stopped_by, least_f: lower_bound, n_expanded, n_generated } = found;
     let mut allowance = Allowance::new(interrupt);
     let ways: &[Extras] = if is_complete { &[Extras::Avoided] } else { &[Extras::Allowed, Extras::Avoided] };
-    let mut best: Option<(Cost, Vec<Move>)> = None;
+    let mut best: Option<(Cost, Vec<Move>, Vec<f64>)> = None;
     for (path, extras) in paths.into_iter().flat_map(|path| repeat_n(path, ways.len()).zip(ways)) {
         let moves = complete(problem, space, heuristic, *extras, path, &mut allowance)?;
-        let cost = cost_of(problem, space, &moves);
-        if best.as_ref().is_none_or(|(least, _)| cost.total < least.total) {
-            best = Some((cost, moves));
+        let action_costs = action_costs(problem, space, &moves);
+        let cost = cost_of(problem, space, &moves, &action_costs);
+        if best.as_ref().is_none_or(|(least, ..)| cost.total < least.total) {
+            best = Some((cost, moves, action_costs));
         }
     }
-    let (cost, moves) = best.expect("a search gives at least one path");
+    let (cost, moves, action_costs) = best.expect("a search gives at least one path");
     let is_optimal = cost.total * (1.0 - ROUNDING) <= lower_bound;
+    let row = moves.last().map_or(&[][..], |step| space.row(step.state));
+    let last = problem.demonstration.observation(problem.last());
+    let end = PolicyEnd::at(problem.model, row, last, &problem.weights);
     Ok(Mapping {
         moves,
+        action_costs,
         cost,
+        end,
         status: if is_optimal { Status::Optimal } else { Status::Bounded },
         lower_bound: Some(if is_optimal { cost.total } else { lower_bound }),
         stopped_by: stopped_by.filter(|_| !is_optimal),

@@ -26,7 +26,7 @@ impl Mapper {
             projected::most_bytes(&self.projections, problem, TableRoom::within(budget.max_bytes));
         let is_layered = are_all_in_columns
             && n_nodes <= self.patience.max_layered_nodes
-            && layered::is_within(budget, model, n_nodes);
+            && layered::is_within(budget, problem, n_nodes);
         let n_bytes = match heuristic {
             // Tables have a quarter of the budget, and it half.
             HeuristicName::Default if is_layered => 2 * layered::bytes_for(model, n_nodes).max(2 * tables),

@@ -4,9 +4,11 @@ use std::collections::BinaryHeap;
 
 use rustc_hash::FxHashMap;
 
-use crate::mapping::MoveKind;
+use crate::mapping::conditions::Body;
 use crate::mapping::distances::ObservedDistances;
 use crate::mapping::open_list::CheapestFirst;
+use crate::mapping::recurrence::Recurrence;
+use crate::mapping::{Conditions, MoveKind};
 use crate::model::{Model, StateIdx};
 
 /// Where a way comes from: a state of the layer before (by a skip if it is the same state, else by a match) or of the same
@@ -176,6 +178,15 @@ impl Layer {
         }
     }
 
+    /// What stands before the first observation's layer while the start is not decided: a node 0 from which all starts come, for nothing.
+    pub(super) fn before_starts(n_states: usize) -> Self {
+        let (mut costs, mut nodes) = (vec![f64::INFINITY; n_states], vec![Node::ABSENT; n_states]);
+        costs[0] = 0.0;
+        nodes[0].n_children = 0;
+        let nodes = LayerNodes::Dense(nodes);
+        Self { observed: ObservedDistances::default(), costs, nodes, n_alive: 1, n_reached: usize::MAX }
+    }
+
     /// Approximate size in memory, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
         /// Of a hash table, with the free ones beside it.
@@ -220,41 +231,45 @@ impl Layer {
     }
 
     /// The state with the cheapest way, the lowest among equals. `None` if no state has one.
-    #[expect(clippy::cast_possible_truncation, reason = "states are counted in u32")]
     pub(super) fn cheapest(&self) -> Option<StateIdx> {
-        let reached = self.costs.iter().enumerate().filter(|(_, cost)| cost.is_finite());
-        reached.min_by(|(_, cost), (_, other)| cost.total_cmp(other)).map(|(state, _)| state as StateIdx)
+        self.cheapest_to_end(|_| 0.0)
+    }
+
+    /// The state with the cheapest way where to end in a state costs `end`, the lowest among equals. `None` if no state has one.
+    pub(super) fn cheapest_to_end(&self, end: impl Fn(StateIdx) -> f64) -> Option<StateIdx> {
+        let reached = (0..).zip(&self.costs).filter(|(_, cost)| cost.is_finite());
+        let costs = reached.map(|(state, cost)| (state, cost + end(state)));
+        costs.min_by(|(_, cost), (_, other)| cost.total_cmp(other)).map(|(state, _)| state)
     }
 }
 
 /// Makes layers.
 #[derive(Debug)]
 pub(super) struct Sweep {
-    /// By action.
-    pub(super) action_costs: Vec<f64>,
+    pub(super) body: Body,
+    pub(super) recurrence: Recurrence,
     /// Distances to the observation in hand. Shape `[n_states]`.
     distances: Vec<f64>,
     pub(super) open: BinaryHeap<CheapestFirst>,
 }
 
 impl Sweep {
-    pub(super) fn new(model: &Model) -> Self {
-        let action_costs = model.actions().iter().map(|action| action.cost).collect();
-        Self { action_costs, distances: vec![0.0; model.graph().n_states()], open: BinaryHeap::new() }
+    pub(super) fn new(model: &Model, conditions: &Conditions) -> Self {
+        let (body, recurrence) = (conditions.body(model), conditions.recurrence());
+        Self { body, recurrence, distances: vec![0.0; model.graph().n_states()], open: BinaryHeap::new() }
     }
 
     /// Approximate size in memory, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
-        (self.distances.len() + self.action_costs.len()) * size_of::<f64>()
-            + self.open.capacity() * size_of::<CheapestFirst>()
+        self.distances.len() * size_of::<f64>() + self.open.capacity() * size_of::<CheapestFirst>()
     }
 
-    /// The layer of the root, which costs `cost`: extras lead on from there (Dijkstra's algorithm). They lead to none but
-    /// `reached`.
+    /// The layer of these states, each with what it costs and where its way comes from: extras lead on from there (Dijkstra's algorithm).
+    /// They lead to none but `reached`.
     pub(super) fn begin(
         &mut self,
         model: &Model,
-        (root, cost): (StateIdx, f64),
+        first: impl IntoIterator<Item = (StateIdx, f64, Source)>,
         reached: &[StateIdx],
         observed: ObservedDistances,
         spare: Spare,
@@ -263,8 +278,11 @@ impl Sweep {
             self.distances[*state as usize] = observed.distance(model, *state);
         }
         let Spare { mut costs, mut nodes, .. } = spare.cleared(model.graph().n_states(), usize::MAX);
-        costs[root as usize] = cost;
-        self.open.push(CheapestFirst { cost, id: root });
+        for (state, cost, source) in first {
+            costs[state as usize] = cost;
+            nodes[state as usize].source = source;
+            self.open.push(CheapestFirst { cost, id: state });
+        }
         while let Some(CheapestFirst { cost, id: state }) = self.open.pop() {
             if cost <= costs[state as usize] {
                 self.extras(model, state, &mut costs, &mut nodes, |_, _| true);
@@ -279,8 +297,8 @@ impl Sweep {
     /// The layer after one with the costs `before`: skips and matches from there, and extras wherever they lead to a state
     /// more cheaply. There are no ways but to `reached`.
     ///
-    /// An extra from a state is worth a look only where the state costs less than it did in the layer before: from there, the
-    /// same action would have matched.
+    /// If an extra pays the whole distance, one from a state is worth a look only where the state costs less than it did in the layer before:
+    /// from there, the same action would have matched.
     pub(super) fn follow(
         &mut self,
         model: &Model,
@@ -289,7 +307,7 @@ impl Sweep {
         observed: ObservedDistances,
         spare: Spare,
     ) -> Layer {
-        let graph = model.graph();
+        let (space, recurrence) = (model.whole(), self.recurrence);
         let Spare { mut costs, mut nodes, .. } = spare.cleared(before.len(), reached.len());
         for state in reached {
             costs[*state as usize] = before[*state as usize];
@@ -297,8 +315,8 @@ impl Sweep {
         }
         for state in reached {
             let from = before[*state as usize];
-            for transition in graph.successors(*state) {
-                let cost = from + self.action_costs[usize::from(transition.action)];
+            for (transition, action_cost) in self.body.ways(&space, *state) {
+                let cost = from + action_cost;
                 let to = transition.to as usize;
                 if cost < costs[to] {
                     costs[to] = cost;
@@ -309,9 +327,9 @@ impl Sweep {
         for state in reached {
             let at = *state as usize;
             self.distances[at] = observed.distance(model, *state);
-            costs[at] = MoveKind::Match.arrive(costs[at], self.distances[at]);
+            costs[at] = recurrence.arrive(MoveKind::Match, costs[at], self.distances[at]);
         }
-        let is_lower = |state: StateIdx, cost: f64| cost < before[state as usize];
+        let is_lower = |state: StateIdx, cost: f64| !recurrence.pays_alike() || cost < before[state as usize];
         for state in reached {
             let cost = costs[*state as usize];
             if is_lower(*state, cost) {
@@ -337,14 +355,15 @@ impl Sweep {
         leads_on: impl Fn(StateIdx, f64) -> bool,
     ) {
         let from = costs[state as usize];
-        for transition in model.graph().successors(state) {
+        let space = model.whole();
+        for (transition, action_cost) in self.body.ways(&space, state) {
             let to = transition.to as usize;
-            let cost = from + self.action_costs[usize::from(transition.action)];
+            let cost = from + action_cost;
             // A distance is never negative.
             if cost >= costs[to] {
                 continue;
             }
-            let cost = MoveKind::Extra.arrive(cost, self.distances[to]);
+            let cost = self.recurrence.arrive(MoveKind::Extra, cost, self.distances[to]);
             if cost < costs[to] {
                 costs[to] = cost;
                 nodes[to].source = Source::within(state);

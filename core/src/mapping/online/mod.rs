@@ -17,6 +17,8 @@
 //!
 //! - a step that all survivors share is *proven*: whatever is still to come, the cheapest mapping that begins with the
 //!   steps committed before it goes on with this one, or with one of equal cost;
+//! - where there are several start states, the tree hangs on a root before all of them, from which each is reached for nothing: a start is
+//!   committed as a move from there is;
 //! - with a lookahead of H, once the observation H past the root's has come, the cheapest way to it decides: it is
 //!   committed up to its first move that advances, and the ways that do not begin so are given up. States that have lost
 //!   their way by that get the cheapest one that is left: by a repair where they are few, which looks only at nodes that
@@ -29,8 +31,8 @@
 //! the cheapest or not, or else nothing would be proven. But three things are never looked at:
 //!
 //! - states that cannot be reached from the root any more (what was grabbed stays grabbed);
-//! - extras from a state that costs no less than it did at the observation before: the same action would have led from there
-//!   as a match, to the same state, for no more;
+//! - extras from a state that costs no less than it did at the observation before, if an extra pays the whole distance: the same action
+//!   would have led from there as a match, to the same state, for no more;
 //! - nodes at earlier observations that no survivor hangs on, and in a repair those whose lower bound (what they cost from an
 //!   earlier root) is no less than what a way that is left costs.
 //!
@@ -45,6 +47,7 @@
 //! lost come first. Among survivors the lower state is the cheapest. All this depends on the observations alone, so that
 //! the same ones give the same steps.
 
+mod committed;
 mod layer;
 mod memory;
 mod repair;
@@ -53,59 +56,30 @@ mod window;
 use std::num::NonZeroU32;
 use std::sync::Arc;
 
-use super::cost::Cost;
-use super::distances::ObservedDistances;
-use super::policy::{Step, StepWriter};
-use super::problem::choose_start;
-use super::{Mapper, Mapping, Move, MoveKind, Status};
-use crate::attribute::{Scalar, Value, Weights};
+use super::distances::{EndDistances, ObservedDistances};
+use super::policy::StepWriter;
+use super::problem::Starts;
+use super::{Conditions, Mapper, Mapping, Move, MoveKind, PolicyEnd, Status};
+use crate::attribute::{Value, Weights};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::model::{Model, StateIdx};
-use layer::{Layer, Sweep};
+pub use committed::{CommittedStep, Stopped};
+use layer::{Layer, Source, Sweep};
 pub(crate) use memory::longest_lookahead;
 use memory::{keeps, n_terms};
 use repair::{Predecessors, Repair, Repaired};
 use window::{NodePlace, Window};
-
-/// A step that will not be revised.
-#[derive(Clone, Debug, PartialEq)]
-pub struct CommittedStep {
-    /// The step.
-    pub step: Step,
-    /// Whether it is part of a cheapest mapping of the whole demonstration, whatever is still to come, among those that
-    /// begin with the steps committed before it.
-    pub is_proven: bool,
-    /// How many observations had come when it was committed.
-    pub after: u32,
-}
-
-impl CommittedStep {
-    /// About how many bytes of memory a step of `model` takes.
-    pub fn bytes_of(model: &Model) -> usize {
-        const ATTRIBUTE_BYTES: usize = size_of::<(Arc<str>, Scalar)>() + size_of::<(Arc<str>, f64)>();
-        size_of::<Self>() + model.schema().len() * ATTRIBUTE_BYTES
-    }
-}
-
-/// Why an observation was not taken.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum Stopped {
-    /// The caller lost interest.
-    #[error(transparent)]
-    Cancelled(#[from] Cancelled),
-    /// It would take more memory than the mapping may.
-    #[error("what may still turn out to be the cheapest mapping takes more memory than there is for it")]
-    Memory,
-}
 
 /// A mapping in the making.
 #[derive(Debug)]
 pub struct OnlineMapping {
     model: Arc<Model>,
     weights: Weights,
-    start: Option<StateIdx>,
+    conditions: Conditions,
     lookahead: Option<NonZeroU32>,
     n_observed: u32,
+    /// The newest observation. Shape `[n_attributes]`.
+    newest: Vec<Option<Value>>,
     n_swept: u64,
     window: Window,
     /// The cost of the way to the window's root, summed as the layers' costs are.
@@ -117,7 +91,8 @@ pub struct OnlineMapping {
     sweeps_from: usize,
     writer: StepWriter,
     moves: Vec<Move>,
-    cost: Cost,
+    /// What the action of each of these costs.
+    action_costs: Vec<f64>,
     was_forced: bool,
     /// How many terms of distances an observation has, one for each value of an attribute that weighs something.
     n_terms: usize,
@@ -130,26 +105,27 @@ pub struct OnlineMapping {
 const SWEEPS_FROM: usize = 8;
 
 impl OnlineMapping {
-    /// A mapping of a demonstration of which nothing has come yet. `start` overrides the model's; `lookahead` is how many
-    /// observations past the current one a decision may wait for, `None` for all.
+    /// A mapping of a demonstration of which nothing has come yet. `lookahead` is how many observations past the current one a decision may
+    /// wait for, `None` for all.
     ///
     /// # Panics
     ///
     /// If the model is searched lazily: each layer looks at all states.
     #[must_use]
-    pub fn new(mapper: &Mapper, weights: Weights, start: Option<StateIdx>, lookahead: Option<NonZeroU32>) -> Self {
+    pub fn new(mapper: &Mapper, weights: Weights, conditions: Conditions, lookahead: Option<NonZeroU32>) -> Self {
         let model = mapper.shared_model();
         assert!(!model.is_lazy(), "each layer needs all states");
         let n_terms = n_terms(&model, |position| weights.as_slice()[position] > 0.0);
         let keeps = keeps(model.graph().n_states(), n_terms, lookahead);
-        let sweep = Sweep::new(&model);
+        let sweep = Sweep::new(&model, &conditions);
         let window = Window::new(model.states().len(), keeps);
         Self {
             model,
             weights,
-            start,
+            conditions,
             lookahead,
             n_observed: 0,
+            newest: Vec::new(),
             n_swept: 0,
             window,
             root_cost: 0.0,
@@ -158,7 +134,7 @@ impl OnlineMapping {
             sweeps_from: SWEEPS_FROM,
             writer: StepWriter::default(),
             moves: Vec::new(),
-            cost: Cost::default(),
+            action_costs: Vec::new(),
             was_forced: false,
             n_terms,
             max_bytes: usize::MAX,
@@ -205,7 +181,8 @@ impl OnlineMapping {
         if self.is_whole { self.end().map(|(_, mapping)| mapping.moves).unwrap_or_default() } else { self.moves }
     }
 
-    /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits.
+    /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits. `observation_weight` is what distances to it
+    /// count, finite and at least 0; `None`: what the conditions say.
     ///
     /// # Errors
     ///
@@ -214,11 +191,14 @@ impl OnlineMapping {
     pub fn observe(
         &mut self,
         observation: &[Option<Value>],
+        observation_weight: Option<f64>,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Vec<CommittedStep>, Stopped> {
         self.check_memory(self.next_layer_bytes())?;
         self.is_whole = false;
-        let committed = self.take(observation, interrupt)?;
+        let of_conditions = || self.conditions.observation_weight(self.n_observed as usize);
+        let observation_weight = observation_weight.unwrap_or_else(of_conditions);
+        let committed = self.take(observation, observation_weight, interrupt)?;
         self.is_whole = true;
         Ok(committed)
     }
@@ -226,18 +206,24 @@ impl OnlineMapping {
     fn take(
         &mut self,
         observation: &[Option<Value>],
+        observation_weight: f64,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Vec<CommittedStep>, Stopped> {
         let mut committed = Vec::new();
         let model = &*Arc::clone(&self.model);
-        let observed = ObservedDistances::new(model, observation, &self.weights);
+        let observed = ObservedDistances::new(model, observation, &self.weights, observation_weight);
         self.n_observed += 1;
+        self.newest.clear();
+        self.newest.extend_from_slice(observation);
         if self.n_observed == 1 {
-            let state = self.start.unwrap_or_else(|| choose_start(model, |state| observed.distance(model, state)));
-            self.root_cost = observed.distance(model, state);
-            self.begin(state, self.root_cost, observed);
-            // There is no other start.
-            committed.push(self.commit(Move { kind: MoveKind::Start, action: None, observation: 0, state }, true));
+            let starts = Starts::of(model, self.conditions.starts.as_deref());
+            let arrived = |state: &StateIdx| {
+                let distance = observed.distance(model, *state);
+                (*state, self.sweep.recurrence.arrive(MoveKind::Start, 0.0, distance))
+            };
+            let first: Vec<(StateIdx, f64)> = starts.states().iter().map(arrived).collect();
+            self.window.add(Layer::before_starts(model.graph().n_states()));
+            self.begin(&first, Source::before(self.window.root), observed);
         } else {
             let layer = self.follow(observed, interrupt)?;
             self.window.push(layer);
@@ -253,22 +239,42 @@ impl OnlineMapping {
 
     /// How many steps would be committed if the demonstration ended now.
     pub fn n_rest(&self) -> usize {
-        let survivor = self.window.layers.back().and_then(Layer::cheapest);
-        survivor.map_or(0, |survivor| self.window.path(survivor).len())
+        self.survivor().map_or(0, |survivor| self.window.path(survivor).len())
+    }
+
+    /// The state in which the cheapest mapping of what has come ends; `None` if nothing has.
+    fn survivor(&self) -> Option<StateIdx> {
+        let newest = self.window.layers.back()?;
+        match self.end_distances() {
+            Some(end) => newest.cheapest_to_end(|state| end.cost(self.model.states().row(state))),
+            None => newest.cheapest(),
+        }
+    }
+
+    /// What ending costs now, unless it is free.
+    fn end_distances(&self) -> Option<EndDistances> {
+        let (schema, states, end_weight) = (self.model.schema(), self.model.states(), self.conditions.end_weight);
+        (end_weight > 0.0).then(|| EndDistances::new(schema, states, &self.newest, &self.weights, end_weight))
     }
 
     /// Ends the demonstration, and commits the rest of the cheapest mapping. `None` if nothing was observed.
     #[must_use]
     pub fn end(mut self) -> Option<(Vec<CommittedStep>, Mapping)> {
-        let survivor = self.window.layers.back()?.cheapest()?;
+        let survivor = self.survivor()?;
+        let row = self.model.states().row(survivor);
+        let end_cost = self.end_distances().map_or(0.0, |end| end.cost(row));
+        let end = PolicyEnd::at(&self.model, row, &self.newest, &self.weights);
         let path = self.window.path(survivor);
         let committed = path.into_iter().map(|place| self.commit_at(place, true)).collect();
         let status = if self.was_forced { Status::Local } else { Status::Optimal };
-        let lower_bound = (status == Status::Optimal).then_some(self.cost.total);
+        let cost = self.writer.cost_with_end(end_cost);
+        let lower_bound = (status == Status::Optimal).then_some(cost.total);
         let (n_expanded, n_generated) = (self.n_expanded(), self.n_generated());
         let mapping = Mapping {
             moves: self.moves,
-            cost: self.cost,
+            action_costs: self.action_costs,
+            cost,
+            end,
             status,
             lower_bound,
             stopped_by: None,
@@ -281,8 +287,9 @@ impl OnlineMapping {
 
     /// Whether the lookahead past the root is used up.
     fn must_decide(&self) -> bool {
-        let newest = self.n_observed - 1;
-        self.lookahead.is_some_and(|lookahead| self.window.first + lookahead.get() <= newest)
+        // So many layers are before the one of the newest observation.
+        let newest = self.n_observed;
+        self.lookahead.is_some_and(|lookahead| self.window.n_before + lookahead.get() <= newest)
     }
 
     /// Commits every step that all survivors share.
@@ -308,24 +315,16 @@ impl OnlineMapping {
     }
 
     fn commit_at(&mut self, place: NodePlace, is_proven: bool) -> CommittedStep {
-        let step = self.window.step(&self.model, place);
-        self.commit(step, is_proven)
-    }
-
-    fn commit(&mut self, step: Move, is_proven: bool) -> CommittedStep {
-        let model = &self.model;
-        let mut writer = self.writer;
-        let layer = &self.window.layers[(step.observation - self.window.first) as usize];
-        if step.kind != MoveKind::Start {
-            let action_cost = step.action.map_or(0.0, |action| model.action(action).cost);
-            self.root_cost += action_cost;
-            self.root_cost = step.kind.arrive(self.root_cost, layer.observed.distance(model, step.state));
-        }
+        let (step, action_cost) = self.window.step(&self.model, &self.sweep.body, place);
+        let (model, recurrence) = (&self.model, self.sweep.recurrence);
+        let layer = &self.window.layers[self.window.index_of(step.observation)];
+        let distance = layer.observed.distance(model, step.state);
+        self.root_cost = recurrence.arrive(step.kind, self.root_cost + action_cost, distance);
         let terms = layer.observed.terms(model, step.state);
-        let written = writer.write(model, model.states(), &step, terms);
-        self.cost = writer.cost();
-        self.writer = writer;
+        let paid = terms.map(|(position, term)| (position, recurrence.paid(step.kind, term)));
+        let written = self.writer.write(model, model.states(), &step, action_cost, paid);
         self.moves.push(step);
+        self.action_costs.push(action_cost);
         CommittedStep { step: written, is_proven, after: self.n_observed }
     }
 
@@ -336,7 +335,7 @@ impl OnlineMapping {
         if self.window.keeps() {
             let made = if self.predecessors.is_none() { Predecessors::bytes_for(model.graph()) } else { 0 };
             self.check_memory(made + self.window.layers.len() * model.graph().n_states() * repair::NODE_BYTES)?;
-            let predecessors = self.predecessors.get_or_insert_with(|| Predecessors::new(model.graph()));
+            let predecessors = self.predecessors.get_or_insert_with(|| Predecessors::new(model, &self.sweep.body));
             let repair = Repair::new(&mut self.window, model, predecessors, &mut self.sweep);
             let most = n_survivors.checked_div(self.sweeps_from).unwrap_or(usize::MAX);
             if repair.run(most, interrupt)? == Repaired::All {
@@ -347,7 +346,8 @@ impl OnlineMapping {
         let mut observed = self.window.clear().into_iter();
         if let Some(mut first) = observed.next() {
             first.fill_tables(model);
-            self.begin(root, self.root_cost, first);
+            self.window.root = root;
+            self.begin(&[(root, self.root_cost)], Source::NONE, first);
         }
         for mut observed in observed {
             observed.fill_tables(model);
@@ -364,11 +364,12 @@ impl OnlineMapping {
         Ok(())
     }
 
-    fn begin(&mut self, root: StateIdx, cost: f64, observed: ObservedDistances) {
+    /// Begins with the layer of these states, which come from `source`, and to which the way costs so much.
+    fn begin(&mut self, first: &[(StateIdx, f64)], source: Source, observed: ObservedDistances) {
         self.n_swept += 1;
         let spare = self.window.spare();
-        let layer = self.sweep.begin(&self.model, (root, cost), &self.window.reached, observed, spare);
-        self.window.root = root;
+        let first = first.iter().map(|(state, cost)| (*state, *cost, source));
+        let layer = self.sweep.begin(&self.model, first, &self.window.reached, observed, spare);
         self.window.add(layer);
         self.window.shrink();
         self.window.recount();

@@ -13,20 +13,24 @@
 use std::collections::BinaryHeap;
 
 use super::layer::{Source, Sweep};
-use super::window::{NodePlace, Window, action};
+use super::window::{NodePlace, Window, cheapest_way};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::mapping::MoveKind;
+use crate::mapping::conditions::Body;
 use crate::mapping::open_list::CheapestFirst;
-use crate::model::{ActionIdx, Graph, Model, Rows, StateIdx};
+use crate::mapping::recurrence::Recurrence;
+use crate::model::{Graph, Model, Rows, StateIdx};
 
-/// The ways into states, by the state that is led to.
+/// The ways of a body into states, by the state that is led to: where each comes from, and what its action costs.
 #[derive(Debug)]
-pub(super) struct Predecessors(Rows<(StateIdx, ActionIdx)>);
+pub(super) struct Predecessors(Rows<(StateIdx, f64)>);
 
 impl Predecessors {
-    pub(super) fn new(graph: &Graph) -> Self {
-        let ways = graph.iter().map(|(from, transition)| (transition.to, (from, transition.action)));
-        Self(Rows::of_entries(graph.n_states(), ways))
+    pub(super) fn new(model: &Model, body: &Body) -> Self {
+        let space = model.whole();
+        let ways = (0..model.states().len())
+            .flat_map(|from| body.ways(&space, from).map(move |(transition, cost)| (transition.to, (from, cost))));
+        Self(Rows::of_entries(model.graph().n_states(), ways))
     }
 
     /// Size in memory, in bytes.
@@ -36,10 +40,10 @@ impl Predecessors {
 
     /// The same, before they are made.
     pub(super) fn bytes_for(graph: &Graph) -> usize {
-        graph.n_states() * size_of::<u32>() + graph.n_transitions() * size_of::<(StateIdx, ActionIdx)>()
+        graph.n_states() * size_of::<u32>() + graph.n_transitions() * size_of::<(StateIdx, f64)>()
     }
 
-    fn of(&self, state: StateIdx) -> &[(StateIdx, ActionIdx)] {
+    fn of(&self, state: StateIdx) -> &[(StateIdx, f64)] {
         self.0.of(state as usize)
     }
 }
@@ -72,7 +76,8 @@ pub(super) struct Repair<'r> {
     window: &'r mut Window,
     model: &'r Model,
     predecessors: &'r Predecessors,
-    action_costs: &'r [f64],
+    body: &'r Body,
+    recurrence: Recurrence,
     open: &'r mut BinaryHeap<CheapestFirst>,
     n_states: usize,
     /// Shape `[n_layers, n_states]`.
@@ -90,13 +95,14 @@ impl<'r> Repair<'r> {
         predecessors: &'r Predecessors,
         sweep: &'r mut Sweep,
     ) -> Self {
-        let Sweep { action_costs, open, .. } = sweep;
+        let Sweep { body, recurrence, open, .. } = sweep;
         let (n_layers, n_states) = (window.layers.len(), model.graph().n_states());
         Self {
             window,
             model,
             predecessors,
-            action_costs,
+            body,
+            recurrence: *recurrence,
             open,
             n_states,
             standings: vec![Standing::Unknown; n_layers * n_states],
@@ -161,7 +167,7 @@ impl<'r> Repair<'r> {
     /// What it costs to come from `origin` to `place`, with this distance.
     fn arrive(&self, origin: NodePlace, action_cost: f64, place: NodePlace, distance: f64) -> f64 {
         let kind = if origin.0 == place.0 { MoveKind::Extra } else { MoveKind::Match };
-        kind.arrive(self.cost(origin) + action_cost, distance)
+        self.recurrence.arrive(kind, self.cost(origin) + action_cost, distance)
     }
 
     /// Whether a node's way leads from the root and costs what it says. Every node of the way is noted as what it is.
@@ -207,7 +213,7 @@ impl<'r> Repair<'r> {
         let action_cost = if is_skip {
             0.0
         } else {
-            action(self.model, source.1, state).map_or(f64::INFINITY, |action| self.action_costs[usize::from(action)])
+            cheapest_way(self.model, self.body, source.1, state).map_or(f64::INFINITY, |(_, cost)| cost)
         };
         #[expect(clippy::float_cmp, reason = "the same sum gives the same float")]
         let is_same = self.arrive(source, action_cost, place, self.distance(place)) == self.cost(place);
@@ -220,12 +226,11 @@ impl<'r> Repair<'r> {
             look(self, (index - 1, state), 0.0);
         }
         let predecessors = self.predecessors;
-        for (from, action) in predecessors.of(state) {
-            let action_cost = self.action_costs[usize::from(*action)];
+        for (from, action_cost) in predecessors.of(state) {
             if index > 0 {
-                look(self, (index - 1, *from), action_cost);
+                look(self, (index - 1, *from), *action_cost);
             }
-            look(self, (index, *from), action_cost);
+            look(self, (index, *from), *action_cost);
         }
     }
 
@@ -271,13 +276,13 @@ impl<'r> Repair<'r> {
             if cost > self.cost((index, state)) {
                 continue;
             }
-            for transition in self.model.graph().successors(state) {
+            let (space, body) = (self.model.whole(), self.body);
+            for (transition, action_cost) in body.ways(&space, state) {
                 let to = (index, transition.to);
                 if self.standings[self.at(to)] != Standing::Wanted {
                     continue;
                 }
-                let before = cost + self.action_costs[usize::from(transition.action)];
-                let cost = MoveKind::Extra.arrive(before, self.distance(to));
+                let cost = self.recurrence.arrive(MoveKind::Extra, cost + action_cost, self.distance(to));
                 if cost < self.cost(to) {
                     self.set(to, (cost, Source::within(state)));
                 }

@@ -39,11 +39,11 @@ fn loops(n_each: usize, n_attributes: usize) -> Mapper {
 fn without_a_lookahead_an_observation_that_commits_nothing_keeps_no_distances() {
     let (n_each, n_attributes) = (150, 8);
     let mapper = loops(n_each, n_attributes);
-    let mut online = OnlineMapping::new(&mapper, mapper.model().schema().weights(), None, None);
+    let mut online = OnlineMapping::new(&mapper, mapper.model().schema().weights(), Conditions::default(), None);
     let mut sizes = Vec::new();
     for n in 0..900_u32 {
         let observation = vec![Some(Value::Number(f64::from(1 + n % 150))); n_attributes];
-        online.observe(&observation, &mut Uninterrupted).unwrap();
+        online.observe(&observation, None, &mut Uninterrupted).unwrap();
         assert!(online.window.knows_its_size());
         sizes.push(online.size_bytes());
     }
@@ -61,12 +61,12 @@ fn an_observation_that_would_take_more_memory_than_there_is_is_not_taken_and_wha
     let weights = mapper.model().schema().weights();
     let observe = |online: &mut OnlineMapping, n: u32| {
         let observation = vec![Some(Value::Number(f64::from(1 + n % 150))); 8];
-        online.observe(&observation, &mut Uninterrupted)
+        online.observe(&observation, None, &mut Uninterrupted)
     };
     // Window of layers that are thinned, kept whole, and thinned again.
     for lookahead in [None, Some(100), Some(10_000)] {
         let lookahead = lookahead.and_then(NonZeroU32::new);
-        let new = || OnlineMapping::new(&mapper, weights.clone(), None, lookahead);
+        let new = || OnlineMapping::new(&mapper, weights.clone(), Conditions::default(), lookahead);
         let mut unbounded = new();
         let mut most = 0;
         for n in 0..300 {
@@ -103,7 +103,7 @@ proptest! {
     ) {
         let mapper = mapper(&places, &transitions);
         let weights = mapper.model().schema().weights();
-        let new = || OnlineMapping::new(&mapper, weights.clone(), None, NonZeroU32::new(lookahead));
+        let new = || OnlineMapping::new(&mapper, weights.clone(), Conditions::default(), NonZeroU32::new(lookahead));
         let mut repaired = OnlineMapping { sweeps_from: 0, ..new() };
         let mut swept = OnlineMapping { sweeps_from: usize::MAX, ..new() };
         // A window that is not kept is always swept.
@@ -116,7 +116,7 @@ proptest! {
         };
         for x in observed {
             let observation = [Some(Value::Number(f64::from(x)))];
-            let observe = |online: &mut OnlineMapping| online.observe(&observation, &mut Uninterrupted).unwrap();
+            let observe = |online: &mut OnlineMapping| online.observe(&observation, None, &mut Uninterrupted).unwrap();
             prop_assert_eq!(observe(&mut swept), observe(&mut thinned));
             prop_assert_eq!(costs(&swept), costs(&thinned));
             prop_assert_eq!(swept.n_nodes(), thinned.n_nodes());
@@ -145,16 +145,16 @@ proptest! {
         // What it costs to go on from a node to the observation `to`, by a search of its own.
         let to_go = |(i, state): (u32, StateIdx), to: u32| {
             let rest = Demonstration::of(observations[i as usize..=to as usize].to_vec()).unwrap();
-            let problem = Problem::new(mapper.model(), rest, weights.clone(), Some(Origin::State(state)));
+            let problem = Problem::new(mapper.model(), rest, weights.clone(), Conditions::starting_at(Origin::State(state)));
             let settings = Settings { heuristic: HeuristicName::None, ..Settings::default() };
             let cost = mapper.map(&problem, settings, &mut Uninterrupted).unwrap().cost.total;
             cost - problem.distances.distance(0, mapper.model().states().row(state))
         };
-        let new = OnlineMapping::new(&mapper, weights.clone(), None, NonZeroU32::new(lookahead));
+        let new = OnlineMapping::new(&mapper, weights.clone(), Conditions::default(), NonZeroU32::new(lookahead));
         let mut online = OnlineMapping { sweeps_from: 0, ..new };
         let mut at = (0, 0);
         for (i, observation) in (0..).zip(&observations) {
-            let committed = online.observe(observation, &mut Uninterrupted).unwrap();
+            let committed = online.observe(observation, None, &mut Uninterrupted).unwrap();
             let mut paid = 0.0;
             let mut from = at;
             for (n, CommittedStep { step, is_proven, after }) in committed.iter().enumerate() {
@@ -175,10 +175,10 @@ proptest! {
                 (from, paid) = (at, 0.0);
             }
             // Every survivor's way, also where no commit depends on it: as that of a sweep that begins at the root.
-            let (first, root) = (online.window.first as usize, online.window.root);
-            let mut swept = OnlineMapping::new(&mapper, weights.clone(), Some(root), None);
+            let (first, root) = (online.window.n_before as usize - 1, online.window.root);
+            let mut swept = OnlineMapping::new(&mapper, weights.clone(), Conditions::starting_at(Origin::State(root)), None);
             for observation in &observations[first..=i as usize] {
-                swept.observe(observation, &mut Uninterrupted).unwrap();
+                swept.observe(observation, None, &mut Uninterrupted).unwrap();
             }
             let before = online.root_cost - online.window.layers[0].observed.distance(mapper.model(), root);
             let newest = |online: &OnlineMapping| online.window.layers.back().unwrap().costs.clone();
@@ -187,7 +187,7 @@ proptest! {
                 prop_assert!(is_same, "{cost}, not {before} + {swept}");
             }
         }
-        let cost = online.cost.total;
+        let cost = online.writer.cost_with_end(0.0).total;
         let rest = to_go(at, u32::try_from(observations.len()).unwrap() - 1);
         let (_, mapping) = online.end().unwrap();
         prop_assert!((mapping.cost.total - cost - rest).abs() <= 1e-9 * (1.0 + cost + rest));

@@ -3,6 +3,7 @@
 use std::collections::VecDeque;
 
 use super::layer::{Layer, NODE_BYTES, Source, Spare};
+use crate::mapping::conditions::Body;
 use crate::mapping::distances::ObservedDistances;
 use crate::mapping::{Move, MoveKind};
 use crate::model::{ActionIdx, Model, StateIdx};
@@ -14,9 +15,10 @@ pub(super) type NodePlace = (usize, StateIdx);
 #[derive(Debug)]
 pub(super) struct Window {
     pub(super) layers: VecDeque<Layer>,
-    /// The observation of the first layer.
-    pub(super) first: u32,
-    /// The last committed node's state; it is in the first layer.
+    /// How many layers there were before the first one. The layer of the observation i has i + 1 before it: the one
+    /// [before the starts](Layer::before_starts), and those of earlier observations.
+    pub(super) n_before: u32,
+    /// The last committed node's state; it is in the first layer. Before the starts, 0.
     pub(super) root: StateIdx,
     /// The states that a way may lead to, ascending; they only ever become fewer.
     pub(super) reached: Vec<StateIdx>,
@@ -30,13 +32,18 @@ pub(super) struct Window {
 impl Window {
     pub(super) fn new(n_states: StateIdx, keeps: bool) -> Self {
         let reached = (0..n_states).collect();
-        Self { layers: VecDeque::new(), first: 0, root: 0, reached, keeps, spare: Vec::new(), layer_bytes: 0 }
+        Self { layers: VecDeque::new(), n_before: 0, root: 0, reached, keeps, spare: Vec::new(), layer_bytes: 0 }
     }
 
     /// Approximate size in memory, in bytes. Looks at no layer.
     pub(super) fn size_bytes(&self) -> usize {
         let spare: usize = self.spare.iter().map(Spare::size_bytes).sum();
         self.layer_bytes + spare + self.reached.capacity() * size_of::<StateIdx>()
+    }
+
+    /// The place of an observation's layer. It must be there.
+    pub(super) fn index_of(&self, observation: u32) -> usize {
+        (observation + 1 - self.n_before) as usize
     }
 
     /// How many nodes survivors hang on. Looks at every layer.
@@ -195,6 +202,9 @@ impl Window {
         let is_child = |(index, state): NodePlace| {
             self.layers[index].node(state).is_alive() && self.source((index, state)) == Some((0, root))
         };
+        if self.n_before == 0 {
+            return self.reached.iter().map(|state| (1, *state)).find(|at| is_child(*at));
+        }
         let successors = model.graph().successors(root).iter().map(|transition| transition.to);
         std::iter::once((1, root)).chain(successors.flat_map(|state| [(1, state), (0, state)])).find(|at| is_child(*at))
     }
@@ -209,7 +219,7 @@ impl Window {
                 self.layer_bytes -= layer.size_bytes();
                 let (spare, _) = layer.into_spare();
                 self.recycle(spare);
-                self.first += 1;
+                self.n_before += 1;
             }
         }
         self.root = state;
@@ -229,26 +239,32 @@ impl Window {
         path
     }
 
-    /// The step that leads to a node.
-    pub(super) fn step(&self, model: &Model, place: NodePlace) -> Move {
+    /// The step that leads to a node, and what its action costs.
+    pub(super) fn step(&self, model: &Model, body: &Body, place: NodePlace) -> (Move, f64) {
         let (index, state) = place;
         let source = self.layers[index].node(state).source;
-        let (kind, action) = if source.is_within() {
-            (MoveKind::Extra, action(model, source.state(), state))
-        } else if source.state() == state {
-            (MoveKind::Skip, None)
-        } else {
-            (MoveKind::Match, action(model, source.state(), state))
-        };
         #[expect(clippy::cast_possible_truncation, reason = "observations are counted in u32")]
-        let observation = self.first + index as u32;
-        Move { kind, action, observation, state }
+        let n_before = self.n_before + index as u32;
+        let kind = if source.is_within() {
+            MoveKind::Extra
+        } else if n_before == 1 {
+            MoveKind::Start
+        } else if source.state() == state {
+            MoveKind::Skip
+        } else {
+            MoveKind::Match
+        };
+        let acts = matches!(kind, MoveKind::Extra | MoveKind::Match);
+        let way = acts.then(|| cheapest_way(model, body, source.state(), state)).flatten();
+        let step = Move { kind, action: way.map(|(action, _)| action), observation: n_before - 1, state };
+        (step, way.map_or(0.0, |(_, cost)| cost))
     }
 }
 
-/// The cheapest action from one state to another, the first among equals.
-pub(super) fn action(model: &Model, from: StateIdx, to: StateIdx) -> Option<ActionIdx> {
-    let actions = model.graph().successors(from).iter().filter(|transition| transition.to == to);
-    let cost = |action: ActionIdx| model.action(action).cost;
-    actions.map(|transition| transition.action).min_by(|action, other| cost(*action).total_cmp(&cost(*other)))
+/// The cheapest action from one state to another, the first among equals, and what it costs.
+pub(super) fn cheapest_way(model: &Model, body: &Body, from: StateIdx, to: StateIdx) -> Option<(ActionIdx, f64)> {
+    let space = model.whole();
+    let ways = body.ways(&space, from).filter(|(transition, _)| transition.to == to);
+    let ways = ways.map(|(transition, cost)| (transition.action, cost));
+    ways.min_by(|(_, cost), (_, other)| cost.total_cmp(other))
 }

@@ -25,7 +25,9 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
     let last = problem.last();
-    let actions = problem.model.actions();
+    let recurrence = problem.recurrence();
+    // Where ending costs something, nodes at the last observation lead to one more, the end.
+    let goal = if problem.end.is_some() { last + 1 } else { last };
     let mut nodes = FoundNodes::default();
     let mut open = BinaryHeap::new();
     // With what was taken out.
@@ -33,12 +35,16 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
     let (mut n_expanded, mut n_generated) = (0, 0);
     let mut meter = Meter::new(interrupt, POLL_EVERY);
 
-    let row = space.row(problem.start);
-    let g = MoveKind::Start.arrive(0.0, problem.distances.distance(0, row));
-    let first = nodes.reach(CheapestWay { observation: 0, state: problem.start, g, action: NO_ACTION, parent: 0 });
-    open.extend(first.map(|id| Open::new(g + heuristic.cost_to_go(0, row), g, 0, id)));
-    // The farthest expanded node, and among those the most promising: where a search out of budget goes on greedily.
-    let mut farthest = Open::new(f64::INFINITY, g, 0, 0);
+    for state in problem.starts.states() {
+        let row = space.row(*state);
+        let g = recurrence.arrive(MoveKind::Start, 0.0, problem.distances.distance(0, row));
+        let first = nodes.reach(CheapestWay { observation: 0, state: *state, g, action: NO_ACTION, parent: NO_PARENT });
+        open.extend(first.map(|id| Open::new(g + heuristic.cost_to_go(0, row), g, 0, id)));
+    }
+    // The most promising start, and the farthest expanded node, among those the most promising: where a search out of budget goes on
+    // greedily.
+    let first = open.peek().map_or(0, |first: &Open| first.id);
+    let mut farthest = Open::new(f64::INFINITY, 0.0, 0, first);
 
     while let Some(entry) = open.pop() {
         let node = *nodes.get(entry.id);
@@ -46,14 +52,14 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             continue;
         }
         let (i, state) = (node.observation as usize, node.state);
-        if i == last {
-            let paths = vec![nodes.path(entry.id)];
+        if i == goal {
+            let paths = vec![nodes.path(entry.id, last)];
             let least_f = f64::INFINITY;
             return Ok(Found { paths, is_complete: true, stopped_by: None, least_f, n_expanded, n_generated });
         }
         // Whatever is left of an expansion that is broken off costs at least the `f` of its node.
         let unfinished = |stopped_by, nodes: &FoundNodes, farthest: Open, n_expanded, n_generated| {
-            let paths = [entry.id, farthest.id, 0].map(|id| nodes.path(id)).to_vec();
+            let paths = [entry.id, farthest.id, first].map(|id| nodes.path(id, last)).to_vec();
             let (least_f, stopped_by) = (entry.f(), Some(stopped_by));
             Ok(Found { paths, is_complete: false, stopped_by, least_f, n_expanded, n_generated })
         };
@@ -74,14 +80,18 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             farthest = entry;
         }
 
-        let skip = (MoveKind::Skip, i + 1, state, 0.0, NO_ACTION);
+        if i == last {
+            let g = node.g + problem.end_cost(space.row(state));
+            let way = CheapestWay { observation: entry.observation + 1, state, g, action: NO_ACTION, parent: entry.id };
+            open.extend(nodes.reach(way).map(|id| Open::new(g, g, way.observation, id)));
+        }
+        let skip = (i < last).then_some((MoveKind::Skip, i + 1, state, 0.0, NO_ACTION));
         space.explore(state);
-        let moves = space.successors(state).iter().flat_map(|transition| {
-            let cost = actions[usize::from(transition.action)].cost;
-            let moves = [(MoveKind::Match, i + 1), (MoveKind::Extra, i)];
-            moves.map(|(kind, i)| (kind, i, transition.to, cost, transition.action))
+        let moves = problem.body.ways(space, state).flat_map(|(transition, cost)| {
+            let moves = [(MoveKind::Match, i + 1), (MoveKind::Extra, i)].into_iter().filter(|(_, i)| *i <= last);
+            moves.map(move |(kind, i)| (kind, i, transition.to, cost, transition.action))
         });
-        for (kind, i, state, cost, action) in std::iter::once(skip).chain(moves) {
+        for (kind, i, state, cost, action) in skip.into_iter().chain(moves) {
             match meter.spend(heuristic.work(i)) {
                 Signal::Continue => {}
                 Signal::Finish => {
@@ -91,7 +101,7 @@ pub(in crate::mapping) fn search<S: Space, H: Heuristic>(
             }
             n_generated += 1;
             let row = space.row(state);
-            let g = kind.arrive(node.g + cost, problem.distances.distance(i, row));
+            let g = recurrence.arrive(kind, node.g + cost, problem.distances.distance(i, row));
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
             let observation = i as u32;
             if let Some(id) = nodes.reach(CheapestWay { observation, state, g, action, parent: entry.id }) {
@@ -130,7 +140,7 @@ fn is_out_of_memory(
 struct CheapestWay {
     /// Cost of the way, `g`.
     g: f64,
-    /// Where it came from.
+    /// Where it came from; [`NO_PARENT`] at the start.
     parent: NodeId,
     state: StateIdx,
     observation: u32,
@@ -139,6 +149,8 @@ struct CheapestWay {
 }
 
 type NodeId = u32;
+
+const NO_PARENT: NodeId = NodeId::MAX;
 
 /// The nodes that were found, and where each is.
 #[derive(Default)]
@@ -186,27 +198,26 @@ impl FoundNodes {
         is_cheaper.then_some(id)
     }
 
-    /// The way from the start to the node `id`.
-    fn path(&self, id: NodeId) -> Vec<Move> {
+    /// The way from the start to the node `id`, without the step to the end.
+    fn path(&self, mut id: NodeId, last: usize) -> Vec<Move> {
         let mut moves = Vec::new();
-        let mut at = self.get(id);
-        loop {
-            let parent = self.get(at.parent);
-            let is_start = at.observation == 0 && at.action == NO_ACTION;
-            let kind = match (at.action == NO_ACTION, at.observation > parent.observation) {
-                _ if is_start => MoveKind::Start,
+        while id != NO_PARENT {
+            let at = self.get(id);
+            id = at.parent;
+            if at.observation as usize > last {
+                continue;
+            }
+            let kind = match (at.action == NO_ACTION, id != NO_PARENT && at.observation > self.get(id).observation) {
+                _ if id == NO_PARENT => MoveKind::Start,
                 (true, _) => MoveKind::Skip,
                 (false, true) => MoveKind::Match,
                 (false, false) => MoveKind::Extra,
             };
             let action = (at.action != NO_ACTION).then_some(at.action);
             moves.push(Move { kind, action, observation: at.observation, state: at.state });
-            if is_start {
-                moves.reverse();
-                return moves;
-            }
-            at = parent;
         }
+        moves.reverse();
+        moves
     }
 }
 

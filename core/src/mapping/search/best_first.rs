@@ -23,10 +23,12 @@ use super::seen::{Estimates, Seen, SeenIdx, SeenWay};
 use super::{End, Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
+use crate::mapping::heuristic::Heuristic as _;
 use crate::mapping::heuristic::projected::Projected;
 use crate::mapping::open_list::CheapestFirst;
+use crate::mapping::recurrence::Recurrence;
 use crate::mapping::{Budget, Problem, StoppedBy};
-use crate::model::{Model, Space};
+use crate::model::{Model, Space, StateIdx};
 
 /// How many times as wide each probe is as the one before.
 const PROBE_WIDENING: u64 = 8;
@@ -94,16 +96,9 @@ pub(in crate::mapping) fn search<S: Space>(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
     let SearchBuffers { seen, nodes, open } = buffers;
-    seen.prepare(space, projected);
-    nodes.clear(problem.demonstration.len());
+    seen.prepare(space, &problem.body, projected);
+    nodes.clear(problem.demonstration.len(), problem.recurrence());
     open.buckets.clear();
-    let state = seen.number_of(problem.start, space, projected);
-    let start = Arrival { kind: MoveKind::Start, observation: 0, state, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
-    // The start is kept whatever it costs: it is what is left to complete if there is no budget at all.
-    let estimates = &Estimates { seen, projected, space };
-    let first = nodes.take(&mut nodes.find(state, 0), start, estimates, f64::INFINITY);
-    let least_f = first.map_or(0.0, |first| first.f);
-    let first = first.map_or(NO_NODE, |first| first.id);
     let mut search = Search {
         problem,
         space,
@@ -112,24 +107,26 @@ pub(in crate::mapping) fn search<S: Space>(
         seen,
         nodes,
         limit: most.next_up(),
-        least_f,
-        incumbent: (problem.last() == 0).then_some(first),
+        first: NO_NODE,
+        least_f: 0.0,
+        left_out_f: f64::INFINITY,
+        incumbent: None,
         n_expanded: 0,
         n_generated: 0,
         unspent_until: 0,
         #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
         last: problem.last() as u32,
+        recurrence: problem.recurrence(),
         rounding: rounding_of_sums(problem.demonstration.len()),
         meter: Meter::new(interrupt, POLL_EVERY),
     };
-    let mut end = End::Done;
-    if search.incumbent.is_none() {
-        end = search.probe(1, open)?;
-        if end == End::Done {
-            end = search.expand_best_first(open)?;
-        }
+    let others = search.start();
+    let mut end = search.probe(1, open)?;
+    if end == End::Done {
+        search.start_in(others);
+        end = search.expand_best_first(open)?;
     }
-    Ok(search.found(first, end))
+    Ok(search.found(end))
 }
 
 struct Search<'s, 'p, S> {
@@ -141,8 +138,12 @@ struct Search<'s, 'p, S> {
     nodes: &'s mut Nodes,
     /// Mappings of this cost or more are of no interest.
     limit: f64,
+    /// The most promising start.
+    first: NodeId,
     /// No node's `f` is less.
     least_f: f64,
+    /// No `f` of a start that is not yet among the nodes is less.
+    left_out_f: f64,
     /// The end of the cheapest mapping that was found.
     incumbent: Option<NodeId>,
     n_expanded: u64,
@@ -151,12 +152,60 @@ struct Search<'s, 'p, S> {
     unspent_until: u64,
     /// The last observation.
     last: u32,
+    recurrence: Recurrence,
     /// Relative tolerance: mappings that are cheaper by less are not searched for.
     rounding: f64,
     meter: Meter<'s>,
 }
 
 impl<S: Space> Search<'_, '_, S> {
+    /// Takes the most promising start, whatever it costs: it is what is left to complete if there is no budget at all. Gives the others,
+    /// with their `f`.
+    fn start(&mut self) -> Vec<(f64, StateIdx)> {
+        let starts = self.problem.starts.states();
+        let mut others = Vec::new();
+        let mut first = starts[0];
+        if starts.len() > 1 {
+            let f = |state: &StateIdx| {
+                let row = self.space.row(*state);
+                let distance = self.problem.distances.distance(0, row);
+                let f = self.recurrence.arrive(MoveKind::Start, 0.0, distance) + self.projected.cost_to_go(0, row);
+                (f, *state)
+            };
+            others.extend(starts.iter().map(f));
+            // The first among equals.
+            let by_f =
+                |(_, (f, _)): &(usize, (f64, StateIdx)), (_, (other, _)): &(usize, (f64, StateIdx))| f.total_cmp(other);
+            let best = others.iter().copied().enumerate().min_by(by_f).map_or(0, |(at, _)| at);
+            (_, first) = others.remove(best);
+            self.left_out_f = others.iter().map(|(f, _)| *f).fold(f64::INFINITY, f64::min);
+        }
+        let limit = std::mem::replace(&mut self.limit, f64::INFINITY);
+        let taken = self.take_start(first);
+        self.limit = self.limit.min(limit);
+        self.first = taken.map_or(self.incumbent.unwrap_or(NO_NODE), |first| first.id);
+        self.least_f = self.nodes.get(self.first).f.min(self.left_out_f);
+        others
+    }
+
+    /// Takes these starts, as far as they are of interest.
+    fn start_in(&mut self, starts: Vec<(f64, StateIdx)>) {
+        for (f, state) in starts {
+            if f < self.limit {
+                self.take_start(state);
+            }
+        }
+        self.left_out_f = f64::INFINITY;
+    }
+
+    fn take_start(&mut self, state: StateIdx) -> Option<Reached> {
+        let state = self.seen.number_of(state, self.space, self.projected);
+        let kind = MoveKind::Start;
+        let start = Arrival { kind, observation: 0, state, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
+        let mut block = self.nodes.find(state, 0);
+        self.take(&mut block, start)
+    }
+
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
     fn probe(&mut self, width: u64, Open { buckets, probed, ahead }: &mut Open) -> Result<End, Cancelled> {
@@ -164,7 +213,8 @@ impl<S: Space> Search<'_, '_, S> {
         let left = self.budget.beside(self.size_bytes(buckets)).beside(self.space.found_bytes());
         let max_known = left.max_bytes / (2 * size_of::<(CheapestFirst, Option<u32>)>());
         // Of each observation, the last of those that are open, and where the one before it is.
-        let mut last_of: Vec<Option<u32>> = vec![None; self.problem.last()];
+        let n_layers = self.problem.last() + usize::from(self.problem.end.is_some());
+        let mut last_of: Vec<Option<u32>> = vec![None; n_layers];
         let mut known = Vec::new();
         for Reached { id, f, .. } in self.nodes.open().filter(|node| node.f < self.limit) {
             match self.meter.spend(1) {
@@ -278,10 +328,7 @@ impl<S: Space> Search<'_, '_, S> {
     #[expect(clippy::inline_always, reason = "it is done for every expansion")]
     #[inline(always)]
     fn spend(&mut self, state: SeenIdx, buckets: &mut Buckets) -> Result<Result<Range<usize>, StoppedBy>, Cancelled> {
-        let ways = self
-            .seen
-            .explored(state)
-            .unwrap_or_else(|| self.seen.explore(state, self.space, self.projected, self.problem.model.actions()));
+        let ways = self.seen.explored(state).unwrap_or_else(|| self.seen.explore(state, self.space, self.projected));
         match self.meter.spend(1 + 2 * ways.len() as u64) {
             Signal::Cancel => Err(Cancelled),
             Signal::Finish => Ok(Err(StoppedBy::Deadline)),
@@ -327,13 +374,14 @@ impl<S: Space> Search<'_, '_, S> {
         nodes + self.seen.size_bytes() + buckets.size_bytes()
     }
 
-    /// Follows the moves out of a node. Calls `found` with each node, not of the last observation, to which that gives a cheaper
-    /// way.
+    /// Follows the moves out of a node. Calls `found` with each node that is to be expanded to which that gives a cheaper way.
     #[inline]
     fn expand(&mut self, id: NodeId, g: f64, step: Position, ways: Range<usize>, mut found: impl FnMut(Reached, u32)) {
         let Position { state, observation: here, kind } = step;
         let next = here + 1;
-        let (may_skip, may_linger) = (MoveKind::Skip.may_follow(kind), MoveKind::Extra.may_follow(kind));
+        let may_advance = here < self.last;
+        let may_skip = may_advance && self.recurrence.may_follow(kind, MoveKind::Skip);
+        let may_linger = self.recurrence.may_follow(kind, MoveKind::Extra);
         self.nodes.close(id);
         if may_skip {
             let is_near = Nodes::are_together(next);
@@ -347,12 +395,13 @@ impl<S: Space> Search<'_, '_, S> {
             }
         }
         self.n_expanded += 1;
-        self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
+        let n_by_way = u64::from(may_advance) + u64::from(may_linger);
+        self.n_generated += u64::from(may_skip) + n_by_way * ways.len() as u64;
         for way in ways {
             let SeenWay { cost, to: state, action } = self.seen.way(way);
             let cost = g + cost;
-            let mut block = self.nodes.find(state, next);
-            if self.nodes.may_take(block, next, cost) {
+            let mut block = self.nodes.find(state, if may_advance { next } else { here });
+            if may_advance && self.nodes.may_take(block, next, cost) {
                 let kind = MoveKind::Match;
                 let arrival = Arrival { kind, observation: next, state, cost, parent: id, action };
                 if let Some(node) = self.take(&mut block, arrival) {
@@ -362,7 +411,7 @@ impl<S: Space> Search<'_, '_, S> {
             if !may_linger {
                 continue;
             }
-            if !Nodes::are_together(next) {
+            if may_advance && !Nodes::are_together(next) {
                 block = self.nodes.find(state, here);
             }
             if self.nodes.may_take(block, here, cost) {
@@ -375,8 +424,8 @@ impl<S: Space> Search<'_, '_, S> {
         }
     }
 
-    /// Takes a cheaper way to a node, if mappings that go on from there are of interest. Gives the node, unless it is of the last
-    /// observation.
+    /// Takes a cheaper way to a node, if mappings that go on from there are of interest. Gives the node if it is to be expanded: at the
+    /// last observation, only where ending costs something, which extra actions may save.
     #[expect(clippy::inline_always, reason = "it is what a search does most")]
     #[inline(always)]
     fn take(&mut self, block: &mut BlockIdx, arrival: Arrival) -> Option<Reached> {
@@ -384,18 +433,28 @@ impl<S: Space> Search<'_, '_, S> {
         let Self { nodes, seen, projected, space, .. } = self;
         let node = nodes.take(block, arrival, &Estimates { seen, projected, space: &**space }, self.limit)?;
         if observation == self.last {
-            self.limit = node.g * (1.0 - self.rounding);
-            self.incumbent = Some(node.id);
-            return None;
+            return self.end_at(node, arrival.state);
         }
         Some(node)
     }
 
-    fn found(self, first: NodeId, end: End) -> Found {
+    /// Takes note of a mapping that ends here, if it is cheaper.
+    #[inline(never)]
+    fn end_at(&mut self, node: Reached, state: SeenIdx) -> Option<Reached> {
+        let cost = node.g + self.problem.end_cost(self.space.row(self.seen.state(state)));
+        if cost < self.limit {
+            self.limit = cost * (1.0 - self.rounding);
+            self.incumbent = Some(node.id);
+        }
+        (self.problem.end.is_some() && node.f < self.limit).then_some(node)
+    }
+
+    fn found(self, end: End) -> Found {
         let nodes = &*self.nodes;
+        let first = self.first;
         let is_complete = end == End::Done;
-        let least_f =
-            if is_complete { f64::INFINITY } else { self.open().map(|node| node.f).fold(self.limit, f64::min) };
+        let open = || self.open().map(|node| node.f).fold(self.limit.min(self.left_out_f), f64::min);
+        let least_f = if is_complete { f64::INFINITY } else { open() };
         let path = |id| nodes.path(id, self.seen);
         let paths = if let Some(incumbent) = self.incumbent {
             vec![path(incumbent)]

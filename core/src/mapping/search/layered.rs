@@ -11,6 +11,9 @@
 //! above the optimum in the last pass. But there is no open list to keep in order, and nodes are found without an index: an
 //! expansion takes less than half of the time that it takes [`best_first`](super::best_first): figure 4 takes that 1.8 times as long. In larger problems beams miss the
 //! optimum by more, and there are too many nodes for each to have a place.
+//!
+//! Ways to a node are compared before they pay its distance, and none goes on from the last observation. So it is for problems in which
+//! all moves pay the same part of a distance, and ending is free.
 
 mod joined;
 mod ways_out;
@@ -19,6 +22,7 @@ use super::{End, Found, Move, MoveKind, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::projected::{Estimate, Projected};
+use crate::mapping::recurrence::Recurrence;
 use crate::mapping::{Budget, Problem, StoppedBy};
 use crate::model::{Model, StateIdx};
 use joined::JoinedTables;
@@ -116,14 +120,17 @@ pub(in crate::mapping) fn bytes_for(model: &Model, n_nodes: usize) -> usize {
 /// Most transitions of a model: their copies take 6 MB.
 const MAX_WAYS: usize = 1 << 18;
 
-/// Whether `n_nodes` of `model`, its states at so many observations, may be searched: there is memory for all of them beside tables, and
-/// each may be expanded and expanded again.
-pub(in crate::mapping) fn is_within(budget: Budget, model: &Model, n_nodes: usize) -> bool {
+/// Whether `n_nodes` of `problem`, its states at so many observations, may be searched: its moves are such, there is memory for all of them
+/// beside tables, and each may be expanded and expanded again.
+pub(in crate::mapping) fn is_within(budget: Budget, problem: &Problem<'_>, n_nodes: usize) -> bool {
+    let model = problem.model;
     let attributes = 0..model.schema().len();
     let n_values = |position| model.states().domain(position).len() as u128;
     // So that the values of a state are one number.
     let are_countable = attributes.map(n_values).try_fold(1, u128::checked_mul).is_some();
-    model.graph().n_transitions() <= MAX_WAYS
+    problem.recurrence().pays_alike()
+        && problem.end.is_none()
+        && model.graph().n_transitions() <= MAX_WAYS
         && are_countable
         && bytes_for(model, n_nodes) <= budget.max_bytes / 2
         && 2 * n_nodes as u64 <= budget.max_expansions
@@ -144,7 +151,7 @@ pub(in crate::mapping) fn search(
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
     let LayeredBuffers { ways_out, tables, nodes } = buffers;
-    ways_out.prepare(problem.model);
+    ways_out.prepare(problem.model, &problem.body);
     tables.prepare(problem, projected);
     nodes.prepare(problem);
     let mut search = Search {
@@ -169,17 +176,19 @@ pub(in crate::mapping) fn search(
     let is_complete = end == End::Done;
     let least_f = if is_complete { f64::INFINITY } else { search.least_f() };
     let Search { cheapest, n_expanded, n_generated, .. } = search;
-    Ok(Found {
-        paths: vec![cheapest.map_or_else(
-            || nodes.path(ways_out, 0, problem.start),
-            |state| nodes.path(ways_out, problem.last(), state),
-        )],
-        is_complete,
-        stopped_by: end.stopped_by(),
-        least_f,
-        n_expanded,
-        n_generated,
-    })
+    let most_promising = || {
+        let f = |state: &StateIdx| {
+            let Estimate { distance, cost_to_go } = tables.estimate(tables.at(0), *state);
+            distance + cost_to_go
+        };
+        let starts = problem.starts.states().iter().copied();
+        starts.min_by(|state, other| f(state).total_cmp(&f(other))).unwrap_or_default()
+    };
+    let path = match cheapest {
+        Some(state) => nodes.path(ways_out, problem.last(), state),
+        None => nodes.path(ways_out, 0, most_promising()),
+    };
+    Ok(Found { paths: vec![path], is_complete, stopped_by: end.stopped_by(), least_f, n_expanded, n_generated })
 }
 
 struct Search<'s> {
@@ -247,7 +256,8 @@ impl Search<'_> {
             at += 1;
             let estimate = self.tables.estimate(entries, state);
             let kind = links[state as usize].kind();
-            let before = kind.arrive(costs[state as usize], estimate.distance);
+            // No kind pays another part.
+            let before = costs[state as usize] + estimate.distance;
             let f = before + estimate.cost_to_go;
             if f >= limit || n_left == 0 {
                 // It stays open for a wider beam, if it is of interest then.
@@ -266,7 +276,9 @@ impl Search<'_> {
             }
             n_left -= 1;
             are_open[state as usize] = false;
-            let (may_skip, may_linger) = (MoveKind::Skip.may_follow(kind), MoveKind::Extra.may_follow(kind));
+            let recurrence = Recurrence::default();
+            let may_skip = recurrence.may_follow(kind, MoveKind::Skip);
+            let may_linger = recurrence.may_follow(kind, MoveKind::Extra);
             self.n_expanded += 1;
             self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
             let mut advance = |to: StateIdx, cost: f64, link: LastStep| {
@@ -320,7 +332,7 @@ impl Search<'_> {
         for state in open[self.last].drain(..) {
             let at = self.last * *n_states + state as usize;
             are_open[at] = false;
-            let cost = MoveKind::Match.arrive(costs[at], self.tables.estimate(entries, state).distance);
+            let cost = costs[at] + self.tables.estimate(entries, state).distance;
             if cost < self.limit {
                 self.limit = cost * (1.0 - self.rounding);
                 self.cheapest = Some(state);
@@ -342,7 +354,7 @@ fn note(least: &mut [f64], f: f64) {
 }
 
 impl LayeredNodes {
-    /// Forgets all nodes but the start.
+    /// Forgets all nodes but the start states'.
     fn prepare(&mut self, problem: &Problem<'_>) {
         let n_observations = problem.demonstration.len();
         self.n_states = problem.model.graph().n_states();
@@ -355,10 +367,12 @@ impl LayeredNodes {
         self.open.iter_mut().for_each(Vec::clear);
         self.open.resize_with(n_observations.max(self.open.len()), Vec::new);
 
-        self.costs[problem.start as usize] = 0.0;
-        self.links[problem.start as usize] = LastStep::START;
-        self.are_open[problem.start as usize] = true;
-        self.open[0].push(problem.start);
+        for start in problem.starts.states() {
+            self.costs[*start as usize] = 0.0;
+            self.links[*start as usize] = LastStep::START;
+            self.are_open[*start as usize] = true;
+            self.open[0].push(*start);
+        }
     }
 
     /// The way of `ways_out` from the start to a node.

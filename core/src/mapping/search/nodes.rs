@@ -9,6 +9,7 @@ use super::seen::{Estimates, Seen, SeenIdx};
 use super::{Move, MoveKind, NO_ACTION};
 use crate::mapping::cost::SLACK;
 use crate::mapping::heuristic::projected::{CHUNK_LEN, Estimate};
+use crate::mapping::recurrence::Recurrence;
 use crate::model::{ActionIdx, Space, make_room};
 
 /// Where a node is in [`Nodes`]: its block, and its place in that.
@@ -44,16 +45,6 @@ pub(super) struct Reached {
     pub(super) f: f64,
 }
 
-impl Reached {
-    /// By a way of `cost` before the distance is paid.
-    #[inline]
-    fn by(id: NodeId, cost: f64, estimate: Estimate) -> Self {
-        // Moves of all kinds pay the same, so that ways are compared before.
-        let g = MoveKind::Match.arrive(cost, estimate.distance);
-        Self { id, g, f: g + estimate.cost_to_go }
-    }
-}
-
 /// A way to a node, before its distance is paid.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Arrival {
@@ -74,8 +65,9 @@ struct LastLink {
 
 const NO_LINK: LastLink = LastLink { parent: NO_NODE, action: NO_ACTION };
 
-/// Upper bounds, one per node of a block, on the cost of a path before the node's distance is paid: costlier paths are discarded. A bound
-/// is the cost of the cheapest path that was found or discarded, or follows from the search's limit. One cache line.
+/// Upper bounds, one per node of a block, on the cost of a path: costlier paths are discarded. A bound is the cost of the cheapest path
+/// that was found or discarded, or follows from the search's limit. It is before the node's distance is paid if moves of all kinds pay the
+/// same of it, and after otherwise. One cache line.
 #[derive(Clone, Copy, Debug)]
 #[repr(align(64))]
 struct Costs([f64; BLOCK_LEN]);
@@ -102,6 +94,7 @@ pub(super) struct Nodes {
     estimates: Vec<[Estimate; BLOCK_LEN]>,
     links: Vec<[LastLink; BLOCK_LEN]>,
     index: Index,
+    recurrence: Recurrence,
 }
 
 /// The key of [`NO_BLOCK`], which never has a node.
@@ -114,8 +107,9 @@ const BLOCK_BYTES: usize = size_of::<Key>()
     + size_of::<[LastLink; BLOCK_LEN]>();
 
 impl Nodes {
-    /// Forgets all nodes, and keeps the memory. There will be nodes at so many observations.
-    pub(super) fn clear(&mut self, n_observations: usize) {
+    /// Forgets all nodes, and keeps the memory. There will be nodes at so many observations, to which moves cost what `recurrence` says.
+    pub(super) fn clear(&mut self, n_observations: usize, recurrence: Recurrence) {
+        self.recurrence = recurrence;
         self.index.clear(&self.keys, n_observations.div_ceil(BLOCK_LEN));
         self.keys.clear();
         self.marks.clear();
@@ -172,7 +166,9 @@ impl Nodes {
     #[inline]
     pub(super) fn get(&self, id: NodeId) -> Reached {
         let (block, in_block) = split(id);
-        Reached::by(id, self.costs[block].0[in_block], self.estimates[block][in_block])
+        let (cost, estimate) = (self.costs[block].0[in_block], self.estimates[block][in_block]);
+        let g = if self.recurrence.pays_alike() { cost + estimate.distance } else { cost };
+        Reached { id, g, f: g + estimate.cost_to_go }
     }
 
     /// Where a node is, and how the way to it ends.
@@ -239,7 +235,7 @@ impl Nodes {
         limit: f64,
     ) -> Option<Reached> {
         let Arrival { kind, observation, state, cost, parent, action } = arrival;
-        if *block == NO_BLOCK && !self.add(block, state, observation, cost, estimates, limit) {
+        if *block == NO_BLOCK && !self.add(block, arrival, estimates, limit) {
             return None;
         }
         let (at, in_block) = (*block as usize, (observation & IN_BLOCK) as usize);
@@ -249,8 +245,16 @@ impl Nodes {
             *mark |= ESTIMATED;
             *estimate = estimates.of(state, observation);
         }
-        let reached = Reached::by(*block << BLOCK_BITS | observation & IN_BLOCK, cost, *estimate);
-        self.costs[at].0[in_block] = cost;
+        let g = self.recurrence.arrive(kind, cost, estimate.distance);
+        let reached = Reached { id: *block << BLOCK_BITS | observation & IN_BLOCK, g, f: g + estimate.cost_to_go };
+        let known = &mut self.costs[at].0[in_block];
+        if self.recurrence.pays_alike() {
+            *known = cost;
+        } else if g < *known {
+            *known = g;
+        } else {
+            return None;
+        }
         if reached.f >= limit && *mark & FOUND == 0 {
             return None;
         }
@@ -270,14 +274,12 @@ impl Nodes {
     fn add(
         &mut self,
         block: &mut BlockIdx,
-        state: SeenIdx,
-        observation: u32,
-        cost: f64,
+        Arrival { kind, observation, state, cost, .. }: Arrival,
         estimates: &Estimates<'_, '_, impl Space>,
         limit: f64,
     ) -> bool {
         let estimate = estimates.of(state, observation);
-        if cost + estimate.distance + estimate.cost_to_go >= limit {
+        if self.recurrence.arrive(kind, cost, estimate.distance) + estimate.cost_to_go >= limit {
             return false;
         }
         let number = observation >> BLOCK_BITS;
@@ -293,7 +295,8 @@ impl Nodes {
             // A little more, as sums differ by rounding.
             let most = limit * (1.0 + SLACK);
             self.marks.push([ESTIMATED; BLOCK_LEN]);
-            self.costs.push(Costs(estimates.map(|estimate| most - estimate.distance - estimate.cost_to_go)));
+            let paid_later = if self.recurrence.pays_alike() { 1.0 } else { 0.0 };
+            self.costs.push(Costs(estimates.map(|own| most - paid_later * own.distance - own.cost_to_go)));
             self.estimates.push(estimates);
         } else {
             self.marks.push([0; BLOCK_LEN]);

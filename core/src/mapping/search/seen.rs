@@ -4,8 +4,9 @@ use std::ops::Range;
 
 use rustc_hash::FxHashMap;
 
+use crate::mapping::conditions::Body;
 use crate::mapping::heuristic::projected::{CHUNK_LEN, ChangingColumn, Estimate, Projected};
-use crate::model::{Action, ActionIdx, Space, StateIdx, make_room};
+use crate::model::{ActionIdx, Space, StateIdx, make_room};
 
 /// A state's number among those that a search has seen, in the order in which it did.
 pub(super) type SeenIdx = u32;
@@ -33,6 +34,8 @@ pub(super) struct Seen {
     /// The states' classes in the tables of estimates. Shape `[n_seen, columns.len()]`.
     classes: Vec<u32>,
     columns: Vec<ChangingColumn>,
+    /// Whose ways these are.
+    body: Body,
     /// This search.
     search: SearchNumber,
     /// States that this search has reached, including those that earlier searches reached.
@@ -65,10 +68,10 @@ const STATE_BYTES: usize = size_of::<StateIdx>() + size_of::<Bounds>() + size_of
 const ENTRY_BYTES: usize = 2 * size_of::<(StateIdx, SeenIdx)>();
 
 impl Seen {
-    /// Makes room for a search in `space`, with estimates by `projected`: keeps the states that mean the same to it, unless they are
-    /// too many.
-    pub(super) fn prepare(&mut self, space: &impl Space, projected: &Projected<'_>) {
-        let are_alike = space.keeps_numbers() && self.columns == projected.changing_columns();
+    /// Makes room for a search in `space` of the ways of `body`, with estimates by `projected`: keeps the states that mean the same to it,
+    /// unless they are too many.
+    pub(super) fn prepare(&mut self, space: &impl Space, body: &Body, projected: &Projected<'_>) {
+        let are_alike = space.keeps_numbers() && self.columns == projected.changing_columns() && self.body == *body;
         if !are_alike || self.states.len() > MAX_KEPT_STATES || self.search == SearchNumber::MAX {
             self.numbers.clear();
             self.states.clear();
@@ -77,6 +80,7 @@ impl Seen {
             self.ways.clear();
             self.classes.clear();
             self.columns = projected.changing_columns().to_vec();
+            self.body.clone_from(body);
             self.search = 0;
         }
         self.search += 1;
@@ -160,18 +164,18 @@ impl Seen {
         number: SeenIdx,
         space: &mut impl Space,
         projected: &Projected<'_>,
-        actions: &[Action],
     ) -> Range<usize> {
         let known = self.bounds[number as usize];
         let ways = if known.explored_by == 0 {
             let state = self.state(number);
             space.explore(state);
             let begin = self.ways.len();
-            for transition in space.successors(state) {
+            let body = std::mem::take(&mut self.body);
+            for (transition, cost) in body.ways(space, state) {
                 let to = self.number_of(transition.to, space, projected);
-                let cost = actions[usize::from(transition.action)].cost;
                 self.ways.push(SeenWay { cost, to, action: transition.action });
             }
+            self.body = body;
             begin..self.ways.len()
         } else {
             known.ways().for_each(|at| self.come_to(self.ways[at].to));

@@ -10,7 +10,7 @@ mod backward;
 use super::{Found, Move, MoveKind};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::{Budget, Problem};
-use crate::model::{Graph, Model, Transition};
+use crate::model::{Graph, Model, StateIdx, Transition};
 use backward::{GoOn, GoOnLink, NoLinks, NoteLinks, Ways, Workspace};
 
 /// What a sweep came to.
@@ -57,7 +57,7 @@ pub(in crate::mapping) fn sweep(
 fn in_sections(problem: &Problem<'_>, section_len: usize, mut meter: Meter<'_>) -> Result<Swept, Cancelled> {
     let model = problem.model;
     let n_states = model.graph().n_states();
-    let ways = match Ways::new(model, &mut meter) {
+    let ways = match Ways::new(problem, &mut meter) {
         Ok(Some(ways)) => ways,
         Ok(None) => return Ok(Swept::TooLarge),
         Err(Signal::Cancel) => return Err(Cancelled),
@@ -74,6 +74,7 @@ fn in_sections(problem: &Problem<'_>, section_len: usize, mut meter: Meter<'_>) 
         distances: vec![0.0; n_states],
         here: vec![0.0; n_states],
         next: vec![0.0; n_states],
+        end_links: Vec::new(),
         n_stepped: 0,
         workspace: Workspace::default(),
         meter,
@@ -107,7 +108,7 @@ pub(in crate::mapping) fn most_bytes(model: &Model, n_observations: usize) -> us
 /// What a sweep takes besides its sections: the graph, distances, two layers and one to be told if it is cut short, and as much in
 /// buffers.
 fn basis_bytes(graph: &Graph) -> usize {
-    Ways::bytes_for(graph.n_states(), graph.n_transitions()) + 8 * graph.n_states() * size_of::<f64>()
+    Ways::bytes_for(graph) + 8 * graph.n_states() * size_of::<f64>()
 }
 
 /// How many layers a section has, as many as there is room for; `None` if there is not even for the shortest.
@@ -132,6 +133,8 @@ struct Sweep<'s, 'i> {
     here: Vec<f64>,
     /// By state, the distance at the next observation plus the cost-to-go from there.
     next: Vec<f64>,
+    /// By state, how it is left at the last observation, where a skip is the end; empty if ending is free.
+    end_links: Vec<GoOnLink>,
     /// Layers done, counting those that were done twice.
     n_stepped: usize,
     workspace: Workspace,
@@ -162,7 +165,7 @@ impl Sweep<'_, '_> {
                 kept.push(self.here.clone());
             }
         }
-        let mut moves = vec![self.start()];
+        let mut moves = Vec::new();
         let mut first = 0;
         let mut earliest = None;
         // Of a section's layers, the last one's first. They are made one by one: together they take long to be written for the first time.
@@ -176,16 +179,16 @@ impl Sweep<'_, '_> {
                 stepped.map_err(with_earliest(&mut earliest))?;
                 links.push(of_layer);
             }
+            if first == 0 {
+                moves.push(self.start());
+            }
             self.follow(&links, end, &mut moves);
             if end == last {
+                self.linger(&mut moves);
                 return Ok(moves);
             }
             if first == 0 {
-                let costs = self
-                    .distances
-                    .iter()
-                    .zip(&self.here)
-                    .map(|(distance, here)| MoveKind::Start.go_on(*distance, *here));
+                let costs = (0..self.problem.model.states().len()).map(|state| self.from_start(state));
                 earliest = Some(KnownLayer { observation: 0, costs: costs.collect() });
             }
             first = end;
@@ -200,9 +203,17 @@ impl Sweep<'_, '_> {
             Some(costs) => self.here = costs,
             None => self.here.fill(0.0),
         }
-        let Self { problem, distances, meter, .. } = self;
-        let looked_up = problem.distances.of_states(observation, problem.model.states(), distances, meter);
-        looked_up.map_err(|signal| {
+        let Self { problem, ways, distances, here, end_links, workspace, meter, .. } = self;
+        let states = problem.model.states();
+        let mut begun = problem.distances.of_states(observation, states, distances, meter);
+        if let Some(end) = problem.end.as_ref().filter(|_| observation == problem.last()) {
+            (0..).zip(&mut *here).for_each(|(state, here)| *here = end.cost(states.row(state)));
+            end_links.clear();
+            end_links.resize(here.len(), GoOnLink::SKIP);
+            let links = end_links.as_mut_slice();
+            begun = begun.and_then(|()| ways.linger(distances, here, links, workspace, meter));
+        }
+        begun.map_err(|signal| {
             // Nothing is less.
             distances.fill(0.0);
             CutShort { signal, known: KnownLayer { observation, costs: std::mem::take(distances) } }
@@ -211,9 +222,10 @@ impl Sweep<'_, '_> {
 
     /// Goes back by an observation.
     fn step_back<L: NoteLinks + ?Sized>(&mut self, links: &mut L) -> Result<(), CutShort> {
-        let Self { problem, ways, observation, distances, here, next, n_stepped, workspace, meter } = self;
+        let Self { problem, ways, observation, distances, here, next, n_stepped, workspace, meter, .. } = self;
+        let recurrence = problem.recurrence();
         for ((next, distance), here) in next.iter_mut().zip(&*distances).zip(&*here) {
-            *next = MoveKind::Match.go_on(*distance, *here);
+            *next = recurrence.go_on(MoveKind::Match, *distance, *here);
         }
         *observation -= 1;
         let looked_up = problem.distances.of_states(*observation, problem.model.states(), distances, meter);
@@ -226,31 +238,56 @@ impl Sweep<'_, '_> {
         Ok(())
     }
 
+    /// What a mapping costs that starts in a state, if the first layer was done last.
+    fn from_start(&self, state: StateIdx) -> f64 {
+        let (distance, here) = (self.distances[state as usize], self.here[state as usize]);
+        self.problem.recurrence().go_on(MoveKind::Start, distance, here)
+    }
+
+    /// The start of the cheapest mapping, the first among equals.
     fn start(&self) -> Move {
-        Move { kind: MoveKind::Start, action: None, observation: 0, state: self.problem.start }
+        let states = self.problem.starts.states().iter().copied();
+        let cheapest = states.min_by(|state, other| self.from_start(*state).total_cmp(&self.from_start(*other)));
+        Move { kind: MoveKind::Start, action: None, observation: 0, state: cheapest.unwrap_or_default() }
+    }
+
+    /// Goes on with `moves` by the extra actions that are worth their cost at the last observation.
+    fn linger(&self, moves: &mut Vec<Move>) {
+        while let Some(last) = moves.last().copied()
+            && let Some(GoOn::Extra(way)) = self.end_links.get(last.state as usize).map(|link| link.go_on())
+        {
+            self.push_extra(last, way, moves);
+        }
+    }
+
+    /// Adds the extra action by this way out of where `last`, the last of `moves`, leads.
+    fn push_extra(&self, last: Move, way: usize, moves: &mut Vec<Move>) {
+        let Transition { action, to } = self.problem.model.graph().successors(last.state)[way];
+        let mut kind = MoveKind::Extra;
+        if !self.problem.recurrence().may_follow(last.kind, kind) {
+            // The action instead of the skip leads here too, for no more.
+            moves.pop();
+            kind = MoveKind::Match;
+        }
+        moves.push(Move { kind, action: Some(action), observation: last.observation, state: to });
     }
 
     /// Goes on with `moves` to the observation `end`, as `links` say: those of the layer before it, then of the one before that.
     fn follow(&self, links: &[Vec<GoOnLink>], end: usize, moves: &mut Vec<Move>) {
-        while let Some(&Move { kind, observation, state, .. }) = moves.last()
-            && let Some(before_end) = (end - observation as usize).checked_sub(1)
+        while let Some(last) = moves.last().copied()
+            && let Some(before_end) = (end - last.observation as usize).checked_sub(1)
         {
-            let link = links[before_end][state as usize];
-            let by_way = |way: usize, kind, observation| {
-                let Transition { action, to } = self.problem.model.graph().successors(state)[way];
-                Move { kind, action: Some(action), observation, state: to }
-            };
-            let step = match link.go_on() {
-                GoOn::Skip => Move { kind: MoveKind::Skip, action: None, observation: observation + 1, state },
-                GoOn::Match(way) => by_way(way, MoveKind::Match, observation + 1),
-                // The action instead of the skip leads here too, for no more.
-                GoOn::Extra(way) if kind == MoveKind::Skip => {
-                    moves.pop();
-                    by_way(way, MoveKind::Match, observation)
+            let observation = last.observation + 1;
+            match links[before_end][last.state as usize].go_on() {
+                GoOn::Skip => {
+                    moves.push(Move { kind: MoveKind::Skip, action: None, observation, state: last.state });
                 }
-                GoOn::Extra(way) => by_way(way, MoveKind::Extra, observation),
-            };
-            moves.push(step);
+                GoOn::Match(way) => {
+                    let Transition { action, to } = self.problem.model.graph().successors(last.state)[way];
+                    moves.push(Move { kind: MoveKind::Match, action: Some(action), observation, state: to });
+                }
+                GoOn::Extra(way) => self.push_extra(last, way, moves),
+            }
         }
     }
 }

@@ -14,7 +14,7 @@ impl Cave {
                 if act != Act::Climb {
                     kept.push((position::OUTSIDE, 0));
                 }
-                Operator { action, kept, changed }
+                Operator { action, cost: None, kept, changed }
             })
         })
     }

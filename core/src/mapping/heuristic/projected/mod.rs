@@ -14,7 +14,7 @@ pub(in crate::mapping) use table::CHUNK_LEN;
 use table::{Table, stride_for};
 
 use super::Heuristic;
-use super::projection::Projection;
+use super::projection::{Projection, ValueIdx};
 use crate::mapping::Problem;
 
 /// What a node `(i, s)` costs: what is paid on arriving, and what must still be paid after.
@@ -64,6 +64,8 @@ struct Column<'p> {
     projection: &'p Projection,
     /// Where its values begin in the table.
     offset: usize,
+    /// The value that all states have that a search may come to, if no action of the body changes it.
+    fixed: Option<ValueIdx>,
 }
 
 /// A column of an attribute that actions change.
@@ -120,8 +122,7 @@ impl<'p> Projected<'p> {
 
     /// Whether estimates hold for a state with this row: attributes that no action changes must have their value at the start.
     pub(in crate::mapping) fn speaks_of(&self, values: &[u32]) -> bool {
-        let mut constant = self.columns.iter().map(|column| column.projection).filter(|own| own.is_constant());
-        constant.all(|own| values[own.position] == self.problem.start_row[own.position])
+        self.columns.iter().all(|own| own.fixed.is_none_or(|fixed| values[own.projection.position] == fixed))
     }
 
     /// The classes of the state with this row: one for each of the [changing columns](Self::changing_columns), in order.
@@ -191,7 +192,7 @@ impl<'p> Projected<'p> {
 impl Heuristic for Projected<'_> {
     #[inline]
     fn cost_to_go(&self, observation: usize, row: &[u32]) -> f64 {
-        self.columns.iter().fold(0.0, |sum, Column { projection, offset }| {
+        self.columns.iter().fold(0.0, |sum, Column { projection, offset, .. }| {
             sum + self.table.at(offset + row[projection.position] as usize, observation).cost_to_go
         })
     }

@@ -65,9 +65,8 @@ impl TableRoom {
 pub(super) fn used_projections(projections: &Projections, problem: &Problem<'_>, room: TableRoom) -> (Vec<bool>, u64) {
     let attributes = &projections.attributes;
     // An attribute that weighs nothing would take its share of the actions' costs to no purpose.
-    let is_wanted = |own: &Projection| {
-        own.is_kept && own.edges.n_items() <= room.max_ways && problem.distances.is_active(own.position)
-    };
+    let is_wanted =
+        |own: &Projection| own.is_kept && own.edges.n_items() <= room.max_ways && problem.depends_on(own.position);
     let mut wanted: Vec<usize> = (0..attributes.len()).filter(|number| is_wanted(&attributes[*number])).collect();
     wanted.sort_by_key(|number| attributes[*number].n_values);
     let mut used = vec![false; attributes.len()];

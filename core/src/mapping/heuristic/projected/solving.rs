@@ -6,6 +6,7 @@ use super::room::{TableRoom, used_projections};
 use super::table::Table;
 use super::{ChangingColumn, Column, Estimate, Projected};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Meter};
+use crate::mapping::conditions::Body;
 use crate::mapping::heuristic::projection::Projections;
 use crate::mapping::heuristic::shares::SharedWays;
 use crate::mapping::open_list::CheapestFirst;
@@ -16,8 +17,10 @@ use crate::mapping::{MoveKind, Problem};
 pub(in crate::mapping) struct TableBuffers {
     /// By column, the ways into each value, if they are few.
     ways: Vec<SharedWays>,
-    /// The projections that have tables with these ways: nothing else that they depend on differs from problem to problem of a model.
+    /// The projections that have tables with these ways.
     used: Vec<bool>,
+    /// The body whose ways they are.
+    body: Body,
     layer: ColumnLayer,
 }
 
@@ -66,7 +69,9 @@ impl<'p> Projected<'p> {
         let mut projected = Self { n_left_out, ..Self::blind(problem) };
         let (mut width, n_observations) = (0, problem.demonstration.len());
         for (projection, _) in projections.attributes.iter().zip(&used).filter(|(_, is_used)| **is_used) {
-            projected.columns.push(Column { projection, offset: width });
+            let is_constant = projection.is_constant(&problem.body);
+            let fixed = is_constant.then(|| problem.starts.common_value(problem.model, projection.position)).flatten();
+            projected.columns.push(Column { projection, offset: width, fixed });
             width += projection.n_values;
             projected.untabled.retain(|at| *at != projection.position);
         }
@@ -96,9 +101,10 @@ impl<'p> Projected<'p> {
         let ways_of = |column: &Column<'_>| SharedWays::new(projections, column.projection, problem, used);
         let n_edges: usize = self.columns.iter().map(|column| column.projection.edges.n_items()).sum();
         let are_kept = n_edges <= MAX_KEPT_EDGES;
-        if are_kept && buffers.used != used {
+        if are_kept && (buffers.used != used || buffers.body != problem.body) {
             buffers.ways = self.columns.iter().map(ways_of).collect();
             used.clone_into(&mut buffers.used);
+            buffers.body.clone_from(&problem.body);
         }
         for number in 0..self.columns.len() {
             let made = (!are_kept).then(|| ways_of(&self.columns[number]));
@@ -112,10 +118,8 @@ impl<'p> Projected<'p> {
     /// Writes the terms of a column, and the least of them at each observation. What no action changes stays as it was at the start.
     fn write_terms(&mut self, number: usize, least: &mut Vec<f64>, meter: &mut Meter<'_>) -> Result<(), Interrupted> {
         let (n_observations, n_columns) = (self.problem.demonstration.len(), self.columns.len());
-        let Column { projection, offset } = self.columns[number];
+        let Column { projection, offset, fixed } = self.columns[number];
         let position = projection.position;
-        let start = self.problem.start_row[position];
-        let is_unchanged = projection.is_constant();
         let Some(terms) = self.problem.distances.of(position) else { return Ok(()) };
         least.clear();
         least.resize(n_observations, f64::INFINITY);
@@ -124,7 +128,7 @@ impl<'p> Projected<'p> {
             let entries = self.table.of_mut(offset + value as usize);
             for ((i, least), entry) in least.iter_mut().enumerate().zip(entries) {
                 entry.distance = terms.term(i, value);
-                if !is_unchanged || value == start {
+                if fixed.is_none_or(|fixed| value == fixed) {
                     *least = least.min(entry.distance);
                 }
             }
@@ -149,10 +153,10 @@ impl<'p> Projected<'p> {
     fn tell_unchanged(&mut self) {
         self.unchanged.fill(Estimate::default());
         self.changing.clear();
-        for Column { projection, offset } in &self.columns {
+        for Column { projection, offset, fixed } in &self.columns {
             let position = projection.position;
-            if projection.is_constant() {
-                let entries = self.table.of_mut(offset + self.problem.start_row[position] as usize);
+            if let Some(fixed) = fixed {
+                let entries = self.table.of_mut(offset + *fixed as usize);
                 self.unchanged.iter_mut().zip(entries).for_each(|(sum, entry)| *sum += *entry);
             } else {
                 #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
@@ -164,7 +168,8 @@ impl<'p> Projected<'p> {
     /// Fills the table of an attribute: with `N_i(v) = term(i+1, v) + H_{i+1}(v)`, what it costs to be next at class `v`,
     ///
     /// ```text
-    /// H_n(v) = 0
+    /// H_n(v) = min( what v adds to the cost of ending,       end
+    ///               share_n(v, v') + rest(n, v') + H_n(v') ) extra
     /// H_i(v) = min( N_i(v),                                  skip
     ///               share(v, v') + N_i(v'),                  match
     ///               share_i(v, v') + rest(i, v') + H_i(v') ) extra
@@ -172,7 +177,7 @@ impl<'p> Projected<'p> {
     ///
     /// with `share_i` and `rest` as in [`projection`](super::super::projection).
     ///
-    /// The last line refers to the same observation, so each observation is a pass of Dijkstra's algorithm from those
+    /// The lines of extra actions refer to the same observation, so each observation is a pass of Dijkstra's algorithm from those
     /// classes that an extra action improves.
     fn solve_column(
         &mut self,
@@ -181,42 +186,52 @@ impl<'p> Projected<'p> {
         layer: &mut ColumnLayer,
         meter: &mut Meter<'_>,
     ) -> Result<(), Interrupted> {
-        let Column { projection, offset } = self.columns[number];
-        let n_values = projection.n_values;
+        let Column { projection, offset, .. } = self.columns[number];
+        let (n_values, last, recurrence) = (projection.n_values, self.problem.last(), self.problem.recurrence());
+        let end = self.problem.end.as_ref();
         let ColumnLayer { here, next, open, .. } = layer;
         next.clear();
-        next.extend((0..n_values).map(|value| self.table.at(offset + value, self.problem.last())));
+        next.resize(n_values, Estimate::default());
         here.clone_from(next);
         open.clear();
         let (mut here, mut next) = (here.as_mut_slice(), next.as_mut_slice());
-        for i in (0..self.problem.last()).rev() {
+        for i in (0..=last).rev() {
             meter.spend_or_stop(n_values as u64)?;
-            for (value, (here, next)) in here.iter_mut().zip(&*next).enumerate() {
-                here.distance = self.table.at(offset + value, i).distance;
-                here.cost_to_go = MoveKind::Skip.go_on(next.distance, next.cost_to_go);
+            for (value, here) in (0..).zip(here.iter_mut()) {
+                here.distance = self.table.at(offset + value as usize, i).distance;
+                let next = next[value as usize];
+                here.cost_to_go = if i < last {
+                    recurrence.go_on(MoveKind::Skip, next.distance, next.cost_to_go)
+                } else {
+                    end.map_or(0.0, |end| end.term(projection.position, value))
+                };
             }
-            for (value, next) in next.iter().enumerate() {
-                let cost = MoveKind::Match.go_on(next.distance, next.cost_to_go);
-                for way in predecessors.leading_to(value) {
-                    let matched = way.share + cost;
-                    let known = &mut here[way.from as usize].cost_to_go;
-                    if matched < *known {
-                        *known = matched;
+            if i < last {
+                for (value, next) in next.iter().enumerate() {
+                    let cost = recurrence.go_on(MoveKind::Match, next.distance, next.cost_to_go);
+                    for way in predecessors.leading_to(value) {
+                        let matched = way.share + cost;
+                        let known = &mut here[way.from as usize].cost_to_go;
+                        if matched < *known {
+                            *known = matched;
+                        }
                     }
                 }
             }
-            let least = self.least_terms[i * self.columns.len() + number];
-            let least_distance = self.least_distances[i];
-            for value in 0..n_values {
-                let cost = MoveKind::Extra.go_on(here[value].distance - least, here[value].cost_to_go);
-                relax(predecessors, value, cost, least_distance, here, open);
-            }
-            while let Some(CheapestFirst { cost, id: value }) = open.pop() {
-                meter.spend_or_stop(1)?;
-                let entry = here[value as usize];
-                if cost <= entry.cost_to_go {
-                    let cost = MoveKind::Extra.go_on(entry.distance - least, cost);
-                    relax(predecessors, value as usize, cost, least_distance, here, open);
+            if i < last || end.is_some() {
+                let least = self.least_terms[i * self.columns.len() + number];
+                let least_paid = recurrence.paid(MoveKind::Extra, self.least_distances[i]);
+                let linger = |distance: f64, cost: f64| recurrence.go_on(MoveKind::Extra, distance - least, cost);
+                for value in 0..n_values {
+                    let cost = linger(here[value].distance, here[value].cost_to_go);
+                    relax(predecessors, value, cost, least_paid, here, open);
+                }
+                while let Some(CheapestFirst { cost, id: value }) = open.pop() {
+                    meter.spend_or_stop(1)?;
+                    let entry = here[value as usize];
+                    if cost <= entry.cost_to_go {
+                        relax(predecessors, value as usize, linger(entry.distance, cost), least_paid, here, open);
+                    }
                 }
             }
             for (value, entry) in here.iter().enumerate() {
@@ -228,18 +243,18 @@ impl<'p> Projected<'p> {
     }
 }
 
-/// Offers every value an extra action into `value`, which costs `cost` from its arrival on, without the least distance.
+/// Offers every value an extra action into `value`, which costs `cost` from its arrival on, without `least_paid` of the distance.
 #[inline]
 fn relax(
     predecessors: &SharedWays,
     value: usize,
     cost: f64,
-    least_distance: f64,
+    least_paid: f64,
     here: &mut [Estimate],
     open: &mut BinaryHeap<CheapestFirst>,
 ) {
     for way in predecessors.leading_to(value) {
-        let extra = way.of_extra(least_distance) + cost;
+        let extra = way.of_extra(least_paid) + cost;
         let known = &mut here[way.from as usize].cost_to_go;
         if extra < *known {
             *known = extra;

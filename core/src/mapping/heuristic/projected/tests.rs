@@ -5,12 +5,21 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::interrupt::Uninterrupted;
-use crate::mapping::by_definition::{compiled, distance, fitted, least_costs, moves, nodes, problem};
+use crate::mapping::by_definition::{
+    any_conditions, compiled, distance, fitted, least_costs, moves, nodes, optimum, problem, with_conditions,
+};
 use crate::mapping::heuristic::projection::Projections;
 use crate::model::StateIdx;
 
 /// A model of up to 12 states and three attributes, of which some weigh nothing, and a demonstration.
 fn model_and_demonstration() -> impl Strategy<Value = (Value, Value)> {
+    (model_and_seen(), any_conditions()).prop_map(|((model, request), conditions)| {
+        let request = with_conditions(request, &model, &conditions);
+        (model, request)
+    })
+}
+
+fn model_and_seen() -> impl Strategy<Value = (Value, Value)> {
     let weights = prop::array::uniform3(prop_oneof![Just(0.0), Just(1.0), 0.1..3.0]);
     let costs = prop::array::uniform3(prop_oneof![Just(0.0), Just(1.0), 0.1..3.0]);
     let row = || prop::array::uniform3(0u8..3);
@@ -54,7 +63,7 @@ proptest! {
         let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
         let problem = problem(&model, &request);
         let [from_start, to_end] = least_costs(&problem);
-        let optimum = from_start[problem.last()].iter().copied().fold(f64::INFINITY, f64::min);
+        let optimum = optimum(&problem, &from_start);
         let close = 1e-9 * (1.0 + optimum);
 
         let room = TableRoom::within(usize::MAX);

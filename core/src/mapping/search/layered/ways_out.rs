@@ -1,13 +1,15 @@
 //! The ways out of the states of a model, in one array.
 
+use crate::mapping::conditions::Body;
 use crate::model::{ActionIdx, Model, StateIdx};
 
-/// The ways out of all states.
+/// The ways out of all states that a body has.
 #[derive(Debug, Default)]
 pub(super) struct WaysOut {
     pub(super) ways: Vec<WayOut>,
     /// By state, where its ways end.
     pub(super) ends: Vec<usize>,
+    body: Body,
 }
 
 /// A way out of a state.
@@ -20,19 +22,18 @@ pub(super) struct WayOut {
 }
 
 impl WaysOut {
-    /// Gathers the ways of `model`, the same every time.
-    pub(super) fn prepare(&mut self, model: &Model) {
-        if !self.ends.is_empty() {
+    /// Gathers the ways of `body` in `model`, which is the same every time.
+    pub(super) fn prepare(&mut self, model: &Model, body: &Body) {
+        if !self.ends.is_empty() && self.body == *body {
             return;
         }
+        self.ways.clear();
+        self.ends.clear();
+        self.body.clone_from(body);
+        let space = model.whole();
         for state in 0..model.states().len() {
-            let ways = model.graph().successors(state).iter();
-            self.ways.extend(ways.map(|way| WayOut {
-                cost: model.action(way.action).cost,
-                from: state,
-                to: way.to,
-                action: way.action,
-            }));
+            let ways = body.ways(&space, state);
+            self.ways.extend(ways.map(|(way, cost)| WayOut { cost, from: state, to: way.to, action: way.action }));
             self.ends.push(self.ways.len());
         }
     }

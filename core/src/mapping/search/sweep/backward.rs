@@ -1,6 +1,6 @@
 //! What it costs to go on, exactly, from all states: one observation after the other, from the last backwards.
 //!
-//! This is the [recurrence](crate::mapping::MoveKind) backwards, for all states at once.
+//! This is the [recurrence](crate::mapping::recurrence) backwards, for all states at once.
 //!
 //! Skips and matches are done in one pass over the states. Extra actions lead to states at the same observation, so passes are repeated
 //! until few states change, and Dijkstra's algorithm does the rest. Only a cheaper way replaces another, so chains of extra actions end even
@@ -10,9 +10,10 @@ use std::collections::BinaryHeap;
 use std::hint::select_unpredictable;
 
 use crate::interrupt::{Meter, Signal};
-use crate::mapping::MoveKind;
 use crate::mapping::open_list::CheapestFirst;
-use crate::model::{ActionIdx, Model, Rows, StateIdx};
+use crate::mapping::recurrence::Recurrence;
+use crate::mapping::{MoveKind, Problem};
+use crate::model::{ActionIdx, Graph, Rows, StateIdx};
 
 /// The transitions of a model, to go back over.
 #[derive(Debug)]
@@ -21,8 +22,13 @@ pub(super) struct Ways {
     out: Rows<SweepWay>,
     /// The same ways, by the state to which they lead; of each, where it comes from.
     into: Rows<SweepWay>,
-    /// By action.
+    /// By action; infinite for those that the body lacks.
     costs: Vec<f64>,
+    /// What each way of `out` costs, in the same order; empty if that is what its action costs.
+    out_costs: Vec<f64>,
+    /// Likewise, of `into`.
+    into_costs: Vec<f64>,
+    recurrence: Recurrence,
 }
 
 /// A way between two states, as one of them sees it.
@@ -108,13 +114,13 @@ pub(super) struct Workspace {
 }
 
 impl Ways {
-    /// The ways of `model`. `None` if more leave one state than can be numbered.
+    /// The ways of the body of `problem`. `None` if more leave one state than can be numbered.
     ///
     /// # Errors
     ///
     /// What the interrupt of `meter` said, if that was not to continue.
-    pub(super) fn new(model: &Model, meter: &mut Meter<'_>) -> Result<Option<Self>, Signal> {
-        let graph = model.graph();
+    pub(super) fn new(problem: &Problem<'_>, meter: &mut Meter<'_>) -> Result<Option<Self>, Signal> {
+        let (graph, body) = (problem.model.graph(), &problem.body);
         let ways = graph.iter().map(|(from, to)| (from, SweepWay { state: to.to, action: to.action, number: 0 }));
         let mut out = Rows::try_of_entries(graph.n_states(), ways, || meter.go_on(1))?;
         for state in 0..graph.n_states() {
@@ -128,12 +134,32 @@ impl Ways {
         let reversed =
             rows.flat_map(|(ways, from)| ways.iter().map(move |way| (way.state, SweepWay { state: from, ..*way })));
         let into = Rows::try_of_entries(graph.n_states(), reversed, || meter.go_on(1))?;
-        Ok(Some(Self { out, into, costs: model.actions().iter().map(|action| action.cost).collect() }))
+        let (mut out_costs, mut into_costs) = (Vec::new(), Vec::new());
+        if graph.has_own_costs() {
+            #[expect(clippy::cast_possible_truncation, reason = "states are counted in u32")]
+            let own_costs = |from: usize| graph.own_costs(from as StateIdx);
+            let costs = out.iter().enumerate().flat_map(|(from, ways)| {
+                ways.iter().zip(own_costs(from)).map(|(way, own)| body.cost(way.action, Some(own)))
+            });
+            out_costs = costs.collect();
+            let own_of = |way: &SweepWay| own_costs(way.state as usize).get(usize::from(way.number));
+            into_costs = into.iter().flatten().map(|way| body.cost(way.action, own_of(way))).collect();
+        }
+        #[expect(clippy::cast_possible_truncation, reason = "actions are counted in u16")]
+        let costs = (0..problem.model.actions().len()).map(|action| body.cost(action as ActionIdx, None)).collect();
+        Ok(Some(Self { out, into, costs, out_costs, into_costs, recurrence: problem.recurrence() }))
     }
 
-    /// How much memory the ways of so many states take, in bytes.
-    pub(super) fn bytes_for(n_states: usize, n_ways: usize) -> usize {
-        2 * (n_states * size_of::<u32>() + n_ways * size_of::<SweepWay>())
+    /// What the ways out of a state cost, if not what their actions cost.
+    #[inline]
+    fn own_costs<'w>(costs: &'w [f64], rows: &Rows<SweepWay>, state: usize) -> &'w [f64] {
+        if costs.is_empty() { &[] } else { &costs[rows.range(state)] }
+    }
+
+    /// How much memory the ways of `graph` take, in bytes.
+    pub(super) fn bytes_for(graph: &Graph) -> usize {
+        let cost_bytes = if graph.has_own_costs() { size_of::<f64>() } else { 0 };
+        2 * (graph.n_states() * size_of::<u32>() + graph.n_transitions() * (size_of::<SweepWay>() + cost_bytes))
     }
 
     /// Writes to `here` what it costs to go on from each state at an observation with these `distances`, if being at it at the next one
@@ -153,7 +179,8 @@ impl Ways {
     ) -> Result<(), Signal> {
         for (state, ((here, skipped), ways)) in here.iter_mut().zip(next).zip(self.out.iter()).enumerate() {
             meter.go_on(1 + ways.len() as u64)?;
-            let (cost, link) = self.cheapest(*skipped, ways, next, GoOnLink::matched);
+            let own = Self::own_costs(&self.out_costs, &self.out, state);
+            let (cost, link) = self.cheapest(*skipped, ways, own, next, GoOnLink::matched);
             *here = cost;
             links.set(state, link.unwrap_or(GoOnLink::SKIP));
         }
@@ -161,7 +188,11 @@ impl Ways {
     }
 
     /// Makes cheaper what extra actions make cheaper.
-    fn linger<L: NoteLinks + ?Sized>(
+    ///
+    /// # Errors
+    ///
+    /// What the interrupt of `meter` said, if that was not to continue.
+    pub(super) fn linger<L: NoteLinks + ?Sized>(
         &self,
         distances: &[f64],
         here: &mut [f64],
@@ -175,14 +206,16 @@ impl Ways {
         const MAX_PASSES: usize = 8;
         let Workspace { arrivals, changed, open } = workspace;
         arrivals.clear();
-        arrivals.extend(here.iter().zip(distances).map(|(here, distance)| MoveKind::Extra.go_on(*distance, *here)));
+        let arrive = |distance: f64, here: f64| self.recurrence.go_on(MoveKind::Extra, distance, here);
+        arrivals.extend(here.iter().zip(distances).map(|(here, distance)| arrive(*distance, *here)));
         for _ in 0..MAX_PASSES {
             changed.clear();
             for (state, (here, ways)) in (0..).zip(here.iter_mut().zip(self.out.iter())) {
                 meter.go_on(1 + ways.len() as u64)?;
-                if let (cost, Some(link)) = self.cheapest(*here, ways, arrivals, GoOnLink::extra) {
+                let own = Self::own_costs(&self.out_costs, &self.out, state as usize);
+                if let (cost, Some(link)) = self.cheapest(*here, ways, own, arrivals, GoOnLink::extra) {
                     *here = cost;
-                    arrivals[state as usize] = MoveKind::Extra.go_on(distances[state as usize], cost);
+                    arrivals[state as usize] = arrive(distances[state as usize], cost);
                     links.set(state as usize, link);
                     changed.push(state);
                 }
@@ -199,9 +232,10 @@ impl Ways {
             }
             let ways = self.into.of(id as usize);
             meter.go_on(1 + ways.len() as u64)?;
-            let arrival = MoveKind::Extra.go_on(distances[id as usize], cost);
-            for way in ways {
-                let cost = self.costs[usize::from(way.action)] + arrival;
+            let own = Self::own_costs(&self.into_costs, &self.into, id as usize);
+            let arrival = arrive(distances[id as usize], cost);
+            for (n, way) in ways.iter().enumerate() {
+                let cost = own.get(n).copied().unwrap_or_else(|| self.costs[usize::from(way.action)]) + arrival;
                 let known = &mut here[way.state as usize];
                 if cost < *known {
                     *known = cost;
@@ -213,20 +247,23 @@ impl Ways {
         Ok(())
     }
 
-    /// The least of `cost` and of what the `ways` out of a state cost, the first among equals; with the way's link, if it is one.
+    /// The least of `cost` and of what the `ways` out of a state cost, the first among equals; with the way's link, if it is one. `own` is
+    /// what each of them costs, if that is not what its action costs.
     #[inline]
     fn cheapest(
         &self,
         cost: f64,
         ways: &[SweepWay],
+        own: &[f64],
         arrivals: &[f64],
         link_by: impl Fn(u16) -> GoOnLink,
     ) -> (f64, Option<GoOnLink>) {
         // Costs are not negative, so their bits are in the same order. Which way is cheaper cannot be foreseen, so there should be no
         // branch.
         let (mut least, mut number) = (cost.to_bits(), NO_WAY);
-        for way in ways {
-            let cost = (self.costs[usize::from(way.action)] + arrivals[way.state as usize]).to_bits();
+        for (n, way) in ways.iter().enumerate() {
+            let cost = own.get(n).copied().unwrap_or_else(|| self.costs[usize::from(way.action)]);
+            let cost = (cost + arrivals[way.state as usize]).to_bits();
             let is_less = cost < least;
             number = select_unpredictable(is_less, way.number, number);
             least = select_unpredictable(is_less, cost, least);

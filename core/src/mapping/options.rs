@@ -1,0 +1,344 @@
+//! Options: what a client may say in a request.
+//!
+//! [`Options`] is the one description of what requests of all kinds may say: its fields are documented as clients see them (OpenAPI is
+//! derived from it), [`Options::read`] reads each of them and notes what is wrong with it, and [`RequestKind::fields`] says which request
+//! may have which. A new option needs a line in each.
+
+use std::collections::BTreeMap;
+use std::num::NonZeroU32;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use super::{Budget, Conditions, Demonstration, HeuristicName, Settings, longest_lookahead};
+use crate::attribute::{Scalar, Weights};
+use crate::document::{Faults, Object, Path, Place, Range};
+use crate::model::{ActionIdx, Model, Origin, StateIdx};
+
+/// What is requested.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum RequestKind {
+    /// A policy.
+    Policy,
+    /// Policies for many demonstrations.
+    Batch,
+    /// One of them.
+    Item,
+    /// A trial of a learner.
+    Trial,
+    /// A session, which observations are streamed to.
+    Session,
+}
+
+impl RequestKind {
+    /// The names of the fields that a request may have, in the order in which they are listed where one is unknown.
+    #[must_use]
+    pub const fn fields(self) -> &'static [&'static str] {
+        /// These, and those that say how a demonstration is followed.
+        macro_rules! following {
+            ($($own:literal),*) => {
+                &[
+                    $($own,)*
+                    "weights",
+                    "lookahead",
+                    "start",
+                    "observation_weights",
+                    "extra_weight",
+                    "end_weight",
+                    "without",
+                    "action_costs",
+                    "unsafe_cost",
+                ]
+            };
+        }
+        match self {
+            Self::Policy => {
+                following!("model", "demonstration", "learner", "heuristic", "max_expansions", "deadline_ms", "store")
+            }
+            Self::Batch => {
+                following!("model", "items", "learner", "heuristic", "max_expansions", "deadline_ms", "store")
+            }
+            Self::Item => following!("demonstration", "heuristic", "max_expansions"),
+            Self::Trial => following!("model", "demonstration", "heuristic", "max_expansions", "deadline_ms"),
+            Self::Session => following!("type", "model", "learner", "explore"),
+        }
+    }
+
+    /// The field with what is to be followed, if the request has it.
+    #[must_use]
+    pub const fn observed(self) -> Option<&'static str> {
+        match self {
+            Self::Policy | Self::Item | Self::Trial => Some("demonstration"),
+            Self::Batch => Some("items"),
+            Self::Session => None,
+        }
+    }
+}
+
+/// What a request says besides what is to be followed.
+#[derive(Clone, Debug, Default, PartialEq)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+pub struct Options {
+    /// Weights by attribute name, each at least 0; attributes not named keep the model's. No attribute adds more than 1e150 to
+    /// a distance, however large its weight.
+    // By the attributes' positions.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, f64>>))]
+    pub weights: Vec<(usize, f64)>,
+    /// Where the imitator may start: a state, or several, of which the mapping starts where that costs least. If left out, as the model
+    /// says.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<StartReference>))]
+    pub start: Option<Vec<Origin>>,
+    /// How many observations past the current one a decision may wait for; `null`: all. With a number, the policy is what a
+    /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`). It may reach so far that
+    /// the observations it spans times the model's states are 134 million. Not for a world that is searched lazily.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<u32>, minimum = 1, maximum = 100_000))]
+    pub lookahead: Option<NonZeroU32>,
+    /// By observation, what a distance to it counts, each at least 0 (`null`: 1), as many as there are observations; all 1 if left out. A
+    /// distance adds no more than 1e150, however much it counts.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<Vec<Option<f64>>>))]
+    pub observation_weights: Option<Vec<f64>>,
+    /// The part of the distance that an action pays that does not meet the next observation, 0 to 1. 1 if left out: such a step pays the
+    /// whole distance once more. 0 is for demonstrations whose observations are far apart (way points): only the step that meets an
+    /// observation pays.
+    #[cfg_attr(feature = "openapi", schema(minimum = 0.0, maximum = 1.0))]
+    pub extra_weight: Option<f64>,
+    /// What the distance between the last state and the last observation costs once more, at least 0; 0 if left out. For tasks whose
+    /// outcome matters more than the way to it.
+    #[cfg_attr(feature = "openapi", schema(minimum = 0.0))]
+    pub end_weight: Option<f64>,
+    /// Names of actions that the body lacks, though its model has them.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<Vec<String>>))]
+    pub without: Option<Vec<ActionIdx>>,
+    /// By name of an action, what it costs instead of what the model says: finite, at least 0. A transition that has its own cost keeps
+    /// that.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, f64>>))]
+    pub action_costs: Option<Vec<(ActionIdx, f64)>>,
+    /// What an unsafe outcome of an action costs; only for stochastic models. `null`: actions with unsafe outcomes are not taken.
+    pub unsafe_cost: Option<f64>,
+    /// What guides the search.
+    pub heuristic: Option<HeuristicName>,
+    /// Most nodes to expand; then the best mapping found so far is answered, with `status` `bounded`. With a lookahead, each
+    /// observation expands every state once, and again where its layer is made anew; then the rest is followed greedily.
+    pub max_expansions: Option<u64>,
+    /// Most milliseconds to search, waiting included; then as above. At most a day.
+    #[cfg_attr(feature = "openapi", schema(maximum = 86_400_000))]
+    pub deadline_ms: Option<u64>,
+}
+
+impl Options {
+    /// Longest deadline: a day.
+    const MAX_DEADLINE_MS: u64 = 86_400_000;
+
+    /// Reads the options among the members of `object`. Those that it does not have are those of `base`.
+    pub fn read(object: &Object<'_, '_>, model: &Model, base: &Self, faults: &mut Faults) -> Option<Self> {
+        let of_model = base.read_of_model(object, model, faults);
+        let general = Self::read_general(object, base, faults);
+        let Self { weights, start, without, action_costs, .. } = of_model?;
+        Some(Self { weights, start, without, action_costs, ..general? })
+    }
+
+    /// These options, with those of `object` that depend on the model.
+    pub fn read_of_model(&self, object: &Object<'_, '_>, model: &Model, faults: &mut Faults) -> Option<Self> {
+        let weights = match object.optional("weights") {
+            Some(place) => model.schema().read_named_weights(&place, faults),
+            None => Some(Vec::new()),
+        };
+        let start = match object.optional("start") {
+            Some(place) => model.read_starts(&place, faults).map(Some),
+            None => Some(self.start.clone()),
+        };
+        let without = match object.optional("without") {
+            Some(place) => model.read_action_names(&place, faults).map(Some),
+            None => Some(self.without.clone()),
+        };
+        let action_costs = match object.optional("action_costs") {
+            Some(place) => model.read_action_costs(&place, faults).map(Some),
+            None => Some(self.action_costs.clone()),
+        };
+        if let Some(place) = object.optional("unsafe_cost") {
+            faults.note(
+                &place,
+                "only stochastic models have unsafe outcomes, and there are no policies for such models yet",
+            );
+            return None;
+        }
+        let weights = self.weights.iter().copied().chain(weights?).collect();
+        let (start, without, action_costs) = (start?, without?, action_costs?);
+        Some(Self { weights, start, without, action_costs, ..self.clone() })
+    }
+
+    /// Reads the options that do not depend on the model.
+    pub fn read_general(object: &Object<'_, '_>, base: &Self, faults: &mut Faults) -> Option<Self> {
+        let mut options = base.clone();
+        let n_before = faults.count();
+        if let Some(place) = object.optional("observation_weights") {
+            let weights = Self::read_observation_weights(&place, faults);
+            options.observation_weights =
+                weights.map(|weights| weights.into_iter().map(|weight| weight.unwrap_or(1.0)).collect());
+        }
+        if let Some(place) = object.optional("extra_weight") {
+            options.extra_weight = place.number(Range::UpTo(1.0), faults);
+        }
+        if let Some(place) = object.optional("end_weight") {
+            options.end_weight = place.number(Range::NonNegative, faults);
+        }
+        if let Some(place) = object.optional("heuristic") {
+            options.heuristic = read_heuristic(&place, faults);
+        }
+        if let Some(place) = object.optional("lookahead") {
+            options.lookahead = read_lookahead(&place, faults);
+        }
+        if let Some(place) = object.optional("max_expansions") {
+            options.max_expansions = place.integer(0, u64::MAX, faults);
+        }
+        if let Some(place) = object.optional("deadline_ms") {
+            options.deadline_ms = place.integer(0, Self::MAX_DEADLINE_MS, faults);
+        }
+        (faults.count() == n_before).then_some(options)
+    }
+
+    /// Reads what observations count: an array of numbers of at least 0, `null` where it is not said.
+    pub fn read_observation_weights(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Option<f64>>> {
+        let items = place.array(faults)?;
+        let n_before = faults.count();
+        let read = items.iter().enumerate().map(|(index, item)| {
+            if item.is_null() { None } else { place.item(index, item).number(Range::NonNegative, faults) }
+        });
+        let weights = read.collect();
+        (faults.count() == n_before).then_some(weights)
+    }
+
+    /// The weights that are named, and those of `base` for the others.
+    #[must_use]
+    pub fn weights_over(&self, mut base: Weights) -> Weights {
+        for (position, weight) in &self.weights {
+            base.set(*position, *weight);
+        }
+        base
+    }
+
+    /// How long the search may take, counted from when the request arrived.
+    #[must_use]
+    pub fn deadline(&self) -> Option<Duration> {
+        self.deadline_ms.map(Duration::from_millis)
+    }
+
+    /// The conditions that they make.
+    #[must_use]
+    pub fn conditions(&self) -> Conditions {
+        Conditions {
+            starts: self.start.clone(),
+            observation_weights: self.observation_weights.clone().unwrap_or_default(),
+            extra_weight: self.extra_weight.unwrap_or(Conditions::DEFAULT_EXTRA_WEIGHT),
+            end_weight: self.end_weight.unwrap_or(Conditions::DEFAULT_END_WEIGHT),
+            without: self.without.clone().unwrap_or_default(),
+            action_costs: self.action_costs.clone().unwrap_or_default(),
+        }
+    }
+
+    /// Notes that there are not as many weights of observations as these.
+    pub(super) fn check_observation_weights(
+        &self,
+        n_observations: usize,
+        object: &Object<'_, '_>,
+        faults: &mut Faults,
+    ) {
+        if let Some(weights) = self.observation_weights.as_ref().filter(|weights| weights.len() != n_observations) {
+            let path = Path::Member(&object.path, "observation_weights");
+            let detail = format!("expected one for each of the {n_observations} observations, found {}", weights.len());
+            faults.note_at(&path, detail);
+        }
+    }
+
+    /// How to search.
+    pub(super) fn settings(&self) -> Settings {
+        let max_expansions = self.max_expansions.unwrap_or(Budget::DEFAULT.max_expansions);
+        Settings {
+            heuristic: self.heuristic.unwrap_or_default(),
+            budget: Budget { max_expansions, ..Budget::DEFAULT },
+            upper_bound: None,
+        }
+    }
+
+    /// Notes a lookahead at all in a world that is searched lazily.
+    pub fn check_lookahead_is_possible(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
+        if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {
+            faults.note(&place, "this world is searched lazily, which needs the whole demonstration: leave this out");
+        }
+    }
+
+    /// Notes what is wrong with the lookahead for a demonstration of so many observations, whose window may take about `max_bytes`.
+    /// `object` is what the options were read from.
+    pub fn check_lookahead(
+        &self,
+        model: &Model,
+        n_observations: usize,
+        max_bytes: usize,
+        object: &Object<'_, '_>,
+        faults: &mut Faults,
+    ) {
+        let path = Path::Member(&object.path, "lookahead");
+        let Some(lookahead) = self.lookahead else { return };
+        if model.is_lazy() {
+            return;
+        }
+        let longest = longest_lookahead(model, max_bytes);
+        let reach = usize::try_from(lookahead.get()).unwrap_or(usize::MAX).min(n_observations.saturating_sub(1));
+        if reach > longest as usize {
+            let n_states = model.states().len();
+            let detail = format!(
+                "a lookahead over {reach} observations is too far for a model of {n_states} states, where it may be {longest}: \
+                 make it shorter, or leave it out"
+            );
+            faults.note_at(&path, detail);
+        }
+    }
+}
+
+/// Reads a lookahead: 1 to the most observations that there can be.
+fn read_lookahead(place: &Place<'_, '_>, faults: &mut Faults) -> Option<NonZeroU32> {
+    let lookahead = place.integer(1, Demonstration::MAX_OBSERVATIONS as u64, faults)?;
+    u32::try_from(lookahead).ok().and_then(NonZeroU32::new)
+}
+
+fn read_heuristic(place: &Place<'_, '_>, faults: &mut Faults) -> Option<HeuristicName> {
+    let named = HeuristicName::ALL.into_iter().find(|(name, _)| place.value.as_str() == Some(name));
+    match named {
+        Some((_, heuristic)) => Some(heuristic),
+        None => place.mismatch("one of \"default\", \"paper\", \"none\"", faults),
+    }
+}
+
+/// An observed state: an object by attribute name, or an array of values in attribute order.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(untagged)]
+#[cfg_attr(feature = "openapi", schema(as = Observation))]
+pub enum ObservationDocument {
+    /// By attribute name; those left out were not observed.
+    ByName(BTreeMap<String, ObservedDocument>),
+    /// In attribute order.
+    InOrder(Vec<ObservedDocument>),
+}
+
+/// An observed value; `null` was not observed.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[cfg_attr(feature = "openapi", schema(as = Observed))]
+pub struct ObservedDocument(pub Option<Scalar>);
+
+/// A state, or a list of states: an index, or attribute values that exactly one state has. In a world that is searched lazily, all
+/// attribute values but that of `gold`, which may be left out; there, only the start has an index, 0.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(untagged)]
+pub enum StartReference {
+    /// The state's index.
+    #[cfg_attr(feature = "openapi", schema(value_type = u32))]
+    Index(StateIdx),
+    /// Values by attribute name.
+    Values(BTreeMap<String, Scalar>),
+    /// Several states, at least one.
+    #[cfg_attr(feature = "openapi", schema(no_recursion))]
+    Several(Vec<StartReference>),
+}
