@@ -8,6 +8,7 @@
 )]
 
 mod compiling;
+mod conditions;
 mod implicit;
 mod lazy;
 mod mapping;
