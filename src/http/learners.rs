@@ -1,9 +1,8 @@
 //! `/v1/learners`.
 
 use axum::extract::{FromRequestParts, Query, Request, State};
-use axum::http::header::{ETAG, IF_NONE_MATCH};
 use axum::http::request::Parts;
-use axum::http::{HeaderMap, HeaderValue, StatusCode};
+use axum::http::{HeaderMap, StatusCode};
 use axum::response::{IntoResponse, Response};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -15,6 +14,7 @@ use super::body::{NoForm, read_json};
 use super::paging::{List, Paging};
 use super::path::PathName;
 use super::problem::{BodyProblems, NoBodyProblems, Problem};
+use super::tags::{has_tag, with_tag};
 use crate::service::{LearnerAnswer, Registered, WeightsAnswer};
 use etude_core::document::{Faults, Path};
 use etude_core::learning::LearnerDocument;
@@ -120,7 +120,7 @@ pub(super) async fn put_learner(
     let (registered, answer) = context.etude.put_learner(&name, &body, context.etude.clock().now()).await?;
     let status = match registered {
         Registered::New => StatusCode::CREATED,
-        Registered::Already => StatusCode::OK,
+        Registered::Instead | Registered::Already => StatusCode::OK,
     };
     Ok(json(status, &LearnerBody::from(answer)))
 }
@@ -231,20 +231,6 @@ pub(super) async fn get_weights(
         return Ok(with_tag(StatusCode::NOT_MODIFIED.into_response(), &tag));
     }
     Ok(with_tag(json(StatusCode::OK, &WeightsBody::from(answer)), &tag))
-}
-
-/// Whether the client has what `tag` stands for (RFC 9110, section 13.1.2).
-fn has_tag(headers: &HeaderMap, tag: &str) -> bool {
-    let lists = headers.get_all(IF_NONE_MATCH).iter().filter_map(|list| list.to_str().ok());
-    let mut tags = lists.flat_map(|list| list.split(',')).map(str::trim);
-    tags.any(|given| given == "*" || given.strip_prefix("W/").unwrap_or(given) == tag)
-}
-
-fn with_tag(mut response: Response, tag: &str) -> Response {
-    if let Ok(tag) = HeaderValue::from_str(tag) {
-        response.headers_mut().insert(ETAG, tag);
-    }
-    response
 }
 
 /// Versions of the weights of a learner, oldest first.

@@ -31,6 +31,7 @@ mod request_id;
 mod requests;
 mod stalled;
 mod stream;
+mod tags;
 mod trials;
 
 use std::sync::Arc;

@@ -4,8 +4,9 @@ use std::sync::Arc;
 
 use axum::body::Bytes;
 use axum::extract::{Request, State};
-use axum::http::StatusCode;
-use axum::response::Response;
+use axum::http::header::IF_NONE_MATCH;
+use axum::http::{HeaderMap, StatusCode};
+use axum::response::{IntoResponse, Response};
 use futures_util::StreamExt;
 use futures_util::future::{self, OptionFuture};
 use futures_util::stream::{self, Stream};
@@ -22,6 +23,7 @@ use super::encoding::DecodedLimit;
 use super::paging::{List, Paging};
 use super::path::PathName;
 use super::problem::{BodyProblems, NoBodyProblems, Problem};
+use super::tags::{has_tag, replaces, with_tag};
 use crate::service::{Caller, DefinitionReader, Etude, ModelDefinition, Registered, ServiceError};
 use crate::service::{ModelSummary, PIECE_BYTES};
 use etude_core::attribute::AttributeDocument;
@@ -106,21 +108,28 @@ struct WholeModelBody {
 /// comes. As NDJSON, the first line is the model, whose `dynamics` may lack `states` and `transitions`; each further line is an object
 /// with more of one or both, such as `{"states": [[2, "east", "open"]]}`, in any number and order. A line has at most 64 MiB.
 /// Faults then carry the `line`, and a `pointer` within it.
+///
+/// With `If-Match`, the model takes the place of the one that has this hash, at once: requests from then on use it. Policies keep the hash of
+/// the model that they were made with, and sessions that run go on with it; it is gone for sessions that are resumed and policies that are to
+/// be refined. Learners are of attributes, and stay.
 #[utoipa::path(
     put, path = "/v1/models/{model}", tag = "models",
     params(
         ("model" = String, Path, description = "Its name: 1 to 64 of `a-z A-Z 0-9 . _ -`, other than `.` and `..`"),
         ("content-encoding" = Option<String>, Header, description = "`gzip`, `zstd` or `identity`"),
+        ("if-match" = Option<String>, Header, description = "The hash of the model that is to be replaced, in quotes as in `ETag`; `*`: whichever there is"),
     ),
     request_body(content(
         (DefinitionDocument = "application/json"),
         (String = "application/x-ndjson", example = "{\"attributes\":[{\"name\":\"x\",\"kind\":\"number\"}],\"actions\":[{\"name\":\"on\"}],\"dynamics\":{\"kind\":\"table\",\"start\":0}}\n{\"states\":[[0],[1]]}\n{\"transitions\":[[0,\"on\",1]]}\n"),
     )),
     responses(
-        (status = 201, description = "It is new", body = ModelBody),
-        (status = 200, description = "The same content was there already, under this name", body = ModelBody),
+        (status = 201, description = "It is new", body = ModelBody, headers(("etag" = String, description = "The hash in quotes"))),
+        (status = 200, description = "The same content was there already, under this name, or it took the place of what `If-Match` names", body = ModelBody,
+            headers(("etag" = String, description = "The hash in quotes"))),
         BodyProblems,
         (status = 409, description = "`conflict`: other content is there under this name", body = Problem, content_type = "application/problem+json"),
+        (status = 412, description = "`precondition-failed`: other content is there than `If-Match` names, or none", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "`unsupported-media-type`; `unsupported-encoding`: see `Accept-Encoding`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
@@ -137,25 +146,31 @@ pub(super) async fn put_model(
         None => SentLimit { n_bytes: context.max_body_bytes, setting: "ETUDE_MAX_BODY_BYTES" },
     };
     let decoded = DecodedLimit { n_bytes: context.max_model_text_bytes, setting: "ETUDE_MAX_MODEL_TEXT_BYTES" };
+    let replaces = replaces(request.headers());
     let SentModel { text, format, pump, held } = read_model(request, sent, decoded, &context).await?;
-    let put = context.etude.put_model(&name, text, format, caller);
+    let put = context.etude.replace_model(&name, text, format, replaces, caller);
     let pumping = OptionFuture::from(pump.map(|pump| pump.run(&context)));
     let (put, _) = tokio::join!(put, pumping);
     drop(held);
     let (registered, summary) = put?;
     let status = match registered {
         Registered::New => StatusCode::CREATED,
-        Registered::Already => StatusCode::OK,
+        Registered::Instead | Registered::Already => StatusCode::OK,
     };
-    Ok(json(status, &ModelBody::from(summary)))
+    let tag = tag_of(&summary.hash);
+    Ok(with_tag(json(status, &ModelBody::from(summary)), &tag))
 }
 
 /// A model, with what it was registered as.
 #[utoipa::path(
     get, path = "/v1/models/{model}", tag = "models",
-    params(("model" = String, Path, description = "Its name")),
+    params(
+        ("model" = String, Path, description = "Its name"),
+        ("if-none-match" = Option<String>, Header, description = "Hashes that the client has, as in `ETag`"),
+    ),
     responses(
-        (status = 200, description = "The model", body = WholeModelBody),
+        (status = 200, description = "The model", body = WholeModelBody, headers(("etag" = String, description = "The hash in quotes"))),
+        (status = 304, description = "The client has this one"),
         (status = 404, description = "`unknown-model`", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
     ),
@@ -163,14 +178,28 @@ pub(super) async fn put_model(
 pub(super) async fn get_model(
     State(context): State<SharedContext>,
     PathName(name): PathName,
+    headers: HeaderMap,
 ) -> Result<Response, Problem> {
+    if headers.contains_key(IF_NONE_MATCH) {
+        let tag = tag_of(&context.etude.model_hash(&name).await?);
+        if has_tag(&headers, &tag) {
+            return Ok(with_tag(StatusCode::NOT_MODIFIED.into_response(), &tag));
+        }
+    }
     // What it takes is held until the answer is written.
     let answer = context.etude.model(&name).await?;
+    let tag = tag_of(&answer.summary.hash);
     let summary = answer.summary.into();
-    match answer.definition {
-        ModelDefinition::Text(definition) => Ok(json(StatusCode::OK, &WholeModelBody { summary, definition })),
-        ModelDefinition::Pieces(pieces) => Ok(json_stream(whole_model(Arc::clone(&context.etude), &summary, pieces)?)),
-    }
+    let response = match answer.definition {
+        ModelDefinition::Text(definition) => json(StatusCode::OK, &WholeModelBody { summary, definition }),
+        ModelDefinition::Pieces(pieces) => json_stream(whole_model(Arc::clone(&context.etude), &summary, pieces)?),
+    };
+    Ok(with_tag(response, &tag))
+}
+
+/// The tag of a model with this hash.
+fn tag_of(hash: &str) -> String {
+    format!("\"{hash}\"")
 }
 
 /// The text of a [`WholeModelBody`] whose definition is too large to be held.

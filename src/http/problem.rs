@@ -35,6 +35,7 @@ pub(super) enum ProblemKind {
     MethodNotAllowed,
     SlowBody,
     Conflict,
+    PreconditionFailed,
     InUse,
     KeyReused,
     AlreadyRewarded,
@@ -75,6 +76,9 @@ impl ProblemKind {
             }
             Self::SlowBody => ("slow-body", "The body took too long", StatusCode::REQUEST_TIMEOUT),
             Self::Conflict => ("conflict", "The name is taken", StatusCode::CONFLICT),
+            Self::PreconditionFailed => {
+                ("precondition-failed", "It is not what was expected", StatusCode::PRECONDITION_FAILED)
+            }
             Self::KeyReused => {
                 ("idempotency-key-reused", "The key is another request's", StatusCode::UNPROCESSABLE_ENTITY)
             }
@@ -320,6 +324,7 @@ impl From<ServiceError> for Problem {
             }
             ServiceError::BatchFull => Self::new(ProblemKind::BatchFull, detail),
             ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),
+            ServiceError::PreconditionFailed { .. } => Self::new(ProblemKind::PreconditionFailed, detail),
             ServiceError::KeyReused { .. } => Self::new(ProblemKind::KeyReused, detail),
             ServiceError::InUse { .. } => Self::new(ProblemKind::InUse, detail),
             ServiceError::UnknownVersion { .. } => Self::new(ProblemKind::UnknownVersion, detail),

@@ -41,6 +41,14 @@ pub enum ServiceError {
         /// The hash of what is there.
         existing_hash: String,
     },
+    /// What is to be replaced is not there, or something else is.
+    #[error("{}", mismatch(name, existing_hash.as_deref()))]
+    PreconditionFailed {
+        /// The name.
+        name: String,
+        /// The hash of what is there, if anything is.
+        existing_hash: Option<String>,
+    },
     /// A request with the same key and another body was answered.
     #[error(
         "the `Idempotency-Key` {} was sent before with another body; give each request a key of its own",
@@ -119,6 +127,15 @@ pub enum ServiceError {
     /// A policy could not be written: a defect.
     #[error("a policy could not be written")]
     WritePolicy(#[from] WriteError),
+}
+
+fn mismatch(name: &str, existing_hash: Option<&str>) -> String {
+    match existing_hash {
+        Some(hash) => format!("model {name:?} has the hash {hash}, which is not one that `If-Match` names"),
+        None => format!(
+            "there is no model {name:?} to be replaced, as `If-Match` says; leave that out to register a new one"
+        ),
+    }
 }
 
 impl ServiceError {

@@ -62,7 +62,9 @@ use crate::clock::{Clock, Ids};
 use crate::memory::Memory;
 pub(crate) use crate::store::PIECE_BYTES;
 use crate::store::Store;
-pub use crate::store::{AcceptedReward, ModelSummary, Page, SessionRecord, StoreError, TrialStatus, Unavailable};
+pub use crate::store::{
+    AcceptedReward, ModelSummary, Page, Replaces, SessionRecord, StoreError, TrialStatus, Unavailable,
+};
 use cache::ModelNames;
 use compiler::Compiler;
 use etude_core::model::Limits;

@@ -14,7 +14,7 @@ use super::pool::Places;
 use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::memory::{Held, NoRoom, SMALL_BYTES};
 use crate::store::{
-    Deletion, ModelKey, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, Page, Registration,
+    Deletion, ModelKey, ModelRegistration, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, Page, Replaces,
     StoredDefinition,
 };
 use etude_core::attribute::AttributeDocument;
@@ -81,9 +81,11 @@ impl Drop for Upload<'_> {
 /// Whether a registration changed anything.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Registered {
-    /// The model is new.
+    /// It is new.
     New,
-    /// The same model was there already.
+    /// It took the place of another one.
+    Instead,
+    /// The same was there already.
     Already,
 }
 
@@ -100,10 +102,28 @@ impl Etude {
         format: Format,
         caller: Caller,
     ) -> Result<(Registered, ModelSummary), ServiceError> {
+        self.replace_model(name, text, format, Replaces::Nothing, caller).await
+    }
+
+    /// Registers the model in `text` under `name`, at once in the place of a model that it `replaces`. Sessions that run go on with the model
+    /// that they were opened with, and policies keep its hash; a session that is resumed and a policy that is to be refined do not find
+    /// it any more, as if it were deleted.
+    ///
+    /// # Errors
+    ///
+    /// Likewise; [`ServiceError::PreconditionFailed`] if what is there, if anything, is neither to be replaced nor the same.
+    pub async fn replace_model(
+        &self,
+        name: &Name,
+        text: ModelText,
+        format: Format,
+        replaces: Replaces,
+        caller: Caller,
+    ) -> Result<(Registered, ModelSummary), ServiceError> {
         let limits = self.limits;
-        // If the name is taken, nothing is stored or compiled: the hash decides whether it is the same model.
+        // Unless it can take the name, nothing is stored or compiled: the hash decides whether it is the same model.
         let existing = self.store.model_key(name.as_str()).await?;
-        let is_new = existing.is_none();
+        let is_new = existing.map_or(replaces == Replaces::Nothing, |existing| replaces.admits(&existing.hash));
         let (writer, pieces) = definition_writer(is_new);
         let compiler = self.compiler.clone();
         let prepare = move |read: Result<Definition, ReadError>, interrupt: &mut dyn Interrupt| {
@@ -134,11 +154,10 @@ impl Etude {
         let Prepared { text, hash, compiled } = prepared??;
         let Some(Compiled { mapper, attributes, actions }) = compiled else {
             // Looked up again, as the model may have been deleted meanwhile.
-            let existing = self.store.model(name.as_str()).await?.ok_or(PoolError::Busy)?.summary;
-            return if existing.hash == hash {
-                Ok((Registered::Already, existing))
-            } else {
-                Err(conflict(name, existing.hash))
+            return match self.store.model(name.as_str()).await? {
+                Some(existing) if existing.summary.hash == hash => Ok((Registered::Already, existing.summary)),
+                None if replaces == Replaces::Nothing => Err(PoolError::Busy.into()),
+                existing => Err(conflict(name, &replaces, existing.map(|existing| existing.summary.hash))),
             };
         };
         let model = mapper.model();
@@ -161,10 +180,12 @@ impl Etude {
             (None, Some(pieces)) => NewDefinition::Pieces(pieces),
             (None, None) => return Err(PoolError::Busy.into()),
         };
-        let (registered, summary) = match self.store.register_model(NewModel { summary, definition }).await? {
-            Registration::Created(summary) => (Registered::New, summary),
-            Registration::Unchanged(summary) => (Registered::Already, summary),
-            Registration::Conflict { existing_hash } => return Err(conflict(name, existing_hash)),
+        let new = NewModel { summary, definition, replaces: replaces.clone() };
+        let (registered, summary) = match self.store.register_model(new).await? {
+            ModelRegistration::Created(summary) => (Registered::New, summary),
+            ModelRegistration::Replaced(summary) => (Registered::Instead, summary),
+            ModelRegistration::Unchanged(summary) => (Registered::Already, summary),
+            ModelRegistration::Conflict { existing_hash } => return Err(conflict(name, &replaces, existing_hash)),
         };
         self.compiler.put(key, &Arc::new(mapper)).await;
         Ok((registered, summary))
@@ -182,6 +203,16 @@ impl Etude {
             stored = Some(definition);
         }
         Ok(stored)
+    }
+
+    /// The hash of the model called `name`.
+    ///
+    /// # Errors
+    ///
+    /// If there is none.
+    pub async fn model_hash(&self, name: &Name) -> Result<String, ServiceError> {
+        let key = self.store.model_key(name.as_str()).await?;
+        Ok(key.ok_or_else(|| unknown(name.as_str(), None))?.hash)
     }
 
     /// The model called `name`.
@@ -236,8 +267,14 @@ impl Etude {
     }
 }
 
-fn conflict(name: &Name, existing_hash: String) -> ServiceError {
-    ServiceError::Conflict { kind: "model", name: name.to_string(), existing_hash }
+/// Why a model with this name was not registered.
+fn conflict(name: &Name, replaces: &Replaces, existing_hash: Option<String>) -> ServiceError {
+    match existing_hash {
+        Some(existing_hash) if *replaces == Replaces::Nothing => {
+            ServiceError::Conflict { kind: "model", name: name.to_string(), existing_hash }
+        }
+        existing_hash => ServiceError::PreconditionFailed { name: name.to_string(), existing_hash },
+    }
 }
 
 impl From<ReadError> for ServiceError {

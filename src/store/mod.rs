@@ -43,7 +43,10 @@ pub use deletions::Needed;
 pub use error::{StoreError, Unavailable};
 use jiff::Timestamp;
 pub use learners::{Fold, LearnerRecord, NewLearner, RewardRecord, WeightsRecord};
-pub use models::{ModelKey, ModelRecord, ModelSize, ModelSummary, NewDefinition, NewModel, StoredDefinition};
+pub use models::{
+    ModelKey, ModelRecord, ModelRegistration, ModelSize, ModelSummary, NewDefinition, NewModel, Replaces,
+    StoredDefinition,
+};
 pub use observations::{NewObservations, Owner, SessionRefusal};
 pub use page::Page;
 pub use policies::{Links, NewPolicy, NewRefinement, PolicyRecord, pack_steps};
@@ -153,7 +156,7 @@ impl Store {
         self.readers.one().await
     }
 
-    /// A number that changes whenever a model is registered or deleted, before that is answered; `None` if it is not known now.
+    /// A number that changes whenever a model is registered, replaced or deleted, before that is answered; `None` if it is not known now.
     pub(crate) fn models_generation(&self) -> Option<u64> {
         self.writer.models_generation()
     }

@@ -8,7 +8,7 @@ use sqlx::sqlite::SqliteRow;
 use super::definitions::{self, NewPieces};
 use super::page::Rows;
 use super::writer::{MAX_LARGE_BYTES, Verb, Writing};
-use super::{Deletion, Page, Registration, Store, StoreError, as_integer, corrupt, count, page, timestamp};
+use super::{Deletion, Page, Store, StoreError, as_integer, corrupt, count, page, timestamp};
 use etude_core::attribute::AttributeDocument;
 use etude_core::model::ActionDocument;
 
@@ -58,6 +58,48 @@ pub struct NewModel {
     pub summary: ModelSummary,
     /// Its canonical text.
     pub definition: NewDefinition,
+    /// What it may take the place of.
+    pub replaces: Replaces,
+}
+
+/// Which model of the same name a new one takes the place of.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Replaces {
+    /// None: the name must be free.
+    #[default]
+    Nothing,
+    /// Whichever is there. One must be.
+    Any,
+    /// One with one of these hashes.
+    OneOf(Vec<String>),
+}
+
+impl Replaces {
+    /// Whether it may take the place of a model with this hash.
+    #[must_use]
+    pub fn admits(&self, hash: &str) -> bool {
+        match self {
+            Self::Nothing => false,
+            Self::Any => true,
+            Self::OneOf(hashes) => hashes.iter().any(|admitted| admitted == hash),
+        }
+    }
+}
+
+/// What became of the registration of a model.
+#[derive(Clone, Debug, PartialEq)]
+pub enum ModelRegistration {
+    /// It is new.
+    Created(ModelSummary),
+    /// It took the place of another one.
+    Replaced(ModelSummary),
+    /// The same content was there already, under the same name.
+    Unchanged(ModelSummary),
+    /// It may not take the place of what is there, which was left alone.
+    Conflict {
+        /// The hash of that; `None` if nothing is there, though something must be.
+        existing_hash: Option<String>,
+    },
 }
 
 /// The canonical text of a model to be registered.
@@ -91,21 +133,25 @@ pub enum StoredDefinition {
 #[derive(Debug)]
 struct DeleteModel(String);
 
-/// A model that was deleted.
+/// A model that was deleted, or replaced.
 #[derive(Debug)]
-struct DeletedModel {
+pub(super) struct DeletedModel {
     /// Of a definition in pieces.
     definition_id: Option<i64>,
 }
 
 impl Store {
-    /// Registers a model, unless its name is taken.
+    /// Registers a model, unless it may not take the place of what has its name.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn register_model(&self, model: NewModel) -> Result<Registration<ModelSummary>, StoreError> {
-        self.writer.write(model).await
+    pub async fn register_model(&self, model: NewModel) -> Result<ModelRegistration, StoreError> {
+        let (registration, replaced) = self.writer.write(model).await?;
+        if let Some(id) = replaced.and_then(|replaced| replaced.definition_id) {
+            self.sweeper.sweep(id);
+        }
+        Ok(registration)
     }
 
     /// Deletes a model.
@@ -224,7 +270,7 @@ fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
 }
 
 impl Verb for NewModel {
-    type Answer = Registration<ModelSummary>;
+    type Answer = (ModelRegistration, Option<DeletedModel>);
 
     fn n_bytes(&self) -> usize {
         match &self.definition {
@@ -234,12 +280,12 @@ impl Verb for NewModel {
         }
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Registration<ModelSummary>, StoreError> {
-        let registration = register(writing.connection, self).await?;
-        if let Registration::Created(_) = registration {
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Self::Answer, StoreError> {
+        let registered = register(writing.connection, self).await?;
+        if let ModelRegistration::Created(_) | ModelRegistration::Replaced(_) = registered.0 {
             note_change(writing).await?;
         }
-        Ok(registration)
+        Ok(registered)
     }
 }
 
@@ -247,16 +293,20 @@ impl Verb for DeleteModel {
     type Answer = Option<DeletedModel>;
 
     async fn apply(&self, writing: &mut Writing<'_>) -> Result<Option<DeletedModel>, StoreError> {
-        let query = sqlx::query_scalar("DELETE FROM models WHERE name = $1 RETURNING definition_id").bind(&self.0);
-        let deleted = query.fetch_optional(&mut *writing.connection).await?;
+        let deleted = delete(writing.connection, &self.0).await?;
         if deleted.is_some() {
             note_change(writing).await?;
         }
-        Ok(deleted.map(|definition_id| DeletedModel { definition_id }))
+        Ok(deleted)
     }
 }
 
-/// Counts a registration or deletion.
+async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<Option<DeletedModel>, StoreError> {
+    let query = sqlx::query_scalar("DELETE FROM models WHERE name = $1 RETURNING definition_id").bind(name);
+    Ok(query.fetch_optional(connection).await?.map(|definition_id| DeletedModel { definition_id }))
+}
+
+/// Counts a registration, replacement or deletion.
 async fn note_change(writing: &mut Writing<'_>) -> Result<(), StoreError> {
     let query = "UPDATE service SET models_generation = models_generation + 1 RETURNING models_generation";
     let row = sqlx::query(query).fetch_one(&mut *writing.connection).await?;
@@ -267,8 +317,19 @@ async fn note_change(writing: &mut Writing<'_>) -> Result<(), StoreError> {
 async fn register(
     connection: &mut SqliteConnection,
     model: &NewModel,
-) -> Result<Registration<ModelSummary>, StoreError> {
-    let NewModel { summary, definition } = model;
+) -> Result<(ModelRegistration, Option<DeletedModel>), StoreError> {
+    let NewModel { summary, definition, replaces } = model;
+    let mut replaced = None;
+    if *replaces != Replaces::Nothing {
+        let query = sqlx::query_scalar::<_, String>("SELECT hash FROM models WHERE name = $1").bind(&summary.name);
+        match query.fetch_optional(&mut *connection).await? {
+            None => return Ok((ModelRegistration::Conflict { existing_hash: None }, None)),
+            Some(hash) if hash != summary.hash && replaces.admits(&hash) => {
+                replaced = delete(&mut *connection, &summary.name).await?;
+            }
+            Some(_) => {}
+        }
+    }
     let (text, definition_id) = match definition {
         NewDefinition::Text(text) => (text.as_str(), None),
         NewDefinition::Pieces(pieces) => ("", Some(pieces.id)),
@@ -300,7 +361,9 @@ async fn register(
             // Takes the insertion back.
             return Err(StoreError::Lost);
         }
-        return Ok(Registration::Created(summary.clone()));
+        let summary = summary.clone();
+        let created = if replaced.is_some() { ModelRegistration::Replaced } else { ModelRegistration::Created };
+        return Ok((created(summary), replaced));
     }
     let query = sqlx::query(
         "SELECT name, hash, attributes, actions, n_states, n_transitions, n_stochastic, n_unsafe, created_at_ms
@@ -308,9 +371,10 @@ async fn register(
     );
     let query = query.bind(&summary.name);
     let existing = read_summary(&query.fetch_one(connection).await?)?;
-    Ok(if existing.hash == summary.hash {
-        Registration::Unchanged(existing)
+    let registration = if existing.hash == summary.hash {
+        ModelRegistration::Unchanged(existing)
     } else {
-        Registration::Conflict { existing_hash: existing.hash }
-    })
+        ModelRegistration::Conflict { existing_hash: Some(existing.hash) }
+    };
+    Ok((registration, None))
 }

@@ -149,7 +149,7 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::store::{ModelSummary, NewDefinition, NewLearner, NewModel, NewPolicy, Store};
+    use crate::store::{ModelSummary, NewDefinition, NewLearner, NewModel, NewPolicy, Replaces, Store};
     use etude_core::attribute::AttributeDocument;
     use etude_core::learning::Distribution;
 
@@ -192,7 +192,14 @@ mod tests {
                 n_unsafe: 0,
                 created_at: now,
             };
-            store.register_model(NewModel { summary, definition: NewDefinition::Text(String::new()) }).await.unwrap();
+            store
+                .register_model(NewModel {
+                    summary,
+                    definition: NewDefinition::Text(String::new()),
+                    replaces: Replaces::Nothing,
+                })
+                .await
+                .unwrap();
             let learner = NewLearner {
                 name: n.to_string(),
                 hash: String::new(),

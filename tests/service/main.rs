@@ -24,6 +24,7 @@ mod learning;
 mod limits;
 mod protocol;
 mod repeats;
+mod replacement;
 mod stored_policies;
 mod stream;
 mod trials;

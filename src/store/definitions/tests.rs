@@ -7,7 +7,9 @@ use sqlx::sqlite::{SqliteConnectOptions, SqlitePool};
 use tokio_util::task::TaskTracker;
 
 use super::*;
-use crate::store::{Deletion, ModelSize, ModelSummary, NewDefinition, NewModel, Registration, StoredDefinition};
+use crate::store::{
+    Deletion, ModelRegistration, ModelSize, ModelSummary, NewDefinition, NewModel, Replaces, StoredDefinition,
+};
 
 async fn open(directory: &Path) -> (Store, TaskTracker) {
     let tasks = TaskTracker::new();
@@ -56,7 +58,7 @@ fn model(name: &str, pieces: NewPieces) -> NewModel {
         n_unsafe: 0,
         created_at: Timestamp::UNIX_EPOCH,
     };
-    NewModel { summary, definition: NewDefinition::Pieces(pieces) }
+    NewModel { summary, definition: NewDefinition::Pieces(pieces), replaces: Replaces::Nothing }
 }
 
 async fn text(store: &Store, name: &str) -> Result<String, StoreError> {
@@ -76,11 +78,11 @@ async fn pieces_become_a_models_all_at_once_and_are_read_back() {
     let pieces = stored(&store, &["one, ", "two, ", "three"]).await;
     assert!(store.model("m").await.unwrap().is_none());
     let put = store.register_model(model("m", pieces)).await.unwrap();
-    assert!(matches!(put, Registration::Created(_)));
+    assert!(matches!(put, ModelRegistration::Created(_)));
     assert_eq!(text(&store, "m").await.unwrap(), "one, two, three");
     // The same again keeps what is there, and nothing else.
     let again = stored(&store, &["one, two, three"]).await;
-    assert!(matches!(store.register_model(model("m", again)).await.unwrap(), Registration::Unchanged(_)));
+    assert!(matches!(store.register_model(model("m", again)).await.unwrap(), ModelRegistration::Unchanged(_)));
     until_counts_are(&store, (1, 3)).await;
     close(store, tasks).await;
     let (store, tasks) = open(directory.path()).await;
@@ -148,7 +150,7 @@ async fn what_a_foreign_hand_has_removed_becomes_no_model() {
     assert!(store.model("m").await.unwrap().is_none());
     // Sent once more, it goes through.
     let again = stored(&store, &["one, ", "three"]).await;
-    assert!(matches!(store.register_model(model("m", again)).await.unwrap(), Registration::Created(_)));
+    assert!(matches!(store.register_model(model("m", again)).await.unwrap(), ModelRegistration::Created(_)));
     close(store, tasks).await;
 }
 
@@ -176,5 +178,30 @@ async fn what_is_not_finished_or_deleted_is_removed() {
     until_counts_are(&store, (0, 0)).await;
     // Whoever still reads it is told, instead of taking a part for the whole.
     assert!(matches!(store.piece(id, 1).await, Err(StoreError::Removed)));
+    close(store, tasks).await;
+}
+
+#[tokio::test]
+async fn a_model_that_takes_the_place_of_another_one_leaves_nothing_of_that() {
+    let directory = tempfile::tempdir().unwrap();
+    let (store, tasks) = open(directory.path()).await;
+    let old = stored(&store, &["old, ", "very old"]).await;
+    store.register_model(model("m", old)).await.unwrap();
+    let mut new = model("m", stored(&store, &["new"]).await);
+    new.summary.hash = "other".to_owned();
+    new.replaces = Replaces::OneOf(vec!["hash".to_owned()]);
+    let before = store.models_generation();
+    assert!(matches!(store.register_model(new).await.unwrap(), ModelRegistration::Replaced(_)));
+    assert_ne!(store.models_generation(), before);
+    assert_eq!(text(&store, "m").await.unwrap(), "new");
+    until_counts_are(&store, (1, 1)).await;
+    // What is not to be replaced stays, with all its pieces.
+    let mut late = model("m", stored(&store, &["late"]).await);
+    late.summary.hash = "third".to_owned();
+    late.replaces = Replaces::OneOf(vec!["hash".to_owned()]);
+    let conflict = ModelRegistration::Conflict { existing_hash: Some("other".to_owned()) };
+    assert_eq!(store.register_model(late).await.unwrap(), conflict);
+    until_counts_are(&store, (1, 1)).await;
+    assert_eq!(text(&store, "m").await.unwrap(), "new");
     close(store, tasks).await;
 }
