@@ -28,10 +28,10 @@ use axum::http::header::CONTENT_TYPE;
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::IntoResponse;
 use axum::routing::post;
-use etude::store::{NewPolicy, Store};
+use etude::store::{NewPolicy, PolicyClass, Store};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{Mapper, Problem, Request, Settings};
+use etude_core::mapping::{Mapper, Problem, Request, Settings, Status};
 use etude_core::model::{Definition, Limits, Model};
 use jiff::Timestamp;
 use serde_json::{Value, json};
@@ -191,7 +191,8 @@ impl Between {
             Self::SearchAndStore(searched, stored) => {
                 let (store, StoredPolicy { summary, steps }) = &**stored;
                 let (id, created_at) = (uuid::Uuid::now_v7().to_string(), Timestamp::now());
-                let policy = NewPolicy { id, summary: summary.clone(), steps: steps.clone(), created_at };
+                let class = PolicyClass { model: "m".to_owned(), learner: None, status: Status::Optimal };
+                let policy = NewPolicy { id, class, summary: summary.clone(), steps: steps.clone(), created_at };
                 searched.search() && store.add_policies(vec![policy], Vec::new()).await.is_ok()
             }
         }

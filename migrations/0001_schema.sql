@@ -45,12 +45,19 @@ CREATE TABLE definition_pieces (
 CREATE TABLE policies (
     sequence       INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT,
     id             TEXT    NOT NULL UNIQUE,
+    model          TEXT    NOT NULL, -- as in the summary, and so the next two: what lists are filtered by
+    learner        TEXT,
+    status         TEXT    NOT NULL,
     summary        TEXT    NOT NULL, -- JSON: the policy without its steps
     steps          BLOB    NOT NULL, -- the steps in short (postcard)
     checksum       INTEGER NOT NULL, -- CRC-32 of the summary (high half) and of the steps (low half)
     refined_by     TEXT,             -- the id of the policy that refines it
     created_at_ms  INTEGER NOT NULL
 ) STRICT;
+
+CREATE INDEX policies_by_model ON policies (model);
+CREATE INDEX policies_by_learner ON policies (learner) WHERE learner IS NOT NULL;
+CREATE INDEX policies_by_status ON policies (status);
 
 -- Keys that clients gave their requests, with what each request has made: sent again, it is answered alike. Kept for a day.
 CREATE TABLE request_keys (
@@ -96,6 +103,8 @@ CREATE TABLE sessions (
 ) STRICT;
 
 CREATE INDEX sessions_by_activity ON sessions (active_at_ms) WHERE status = 'open';
+CREATE INDEX sessions_by_model ON sessions (model);
+CREATE INDEX sessions_by_status ON sessions (status);
 CREATE INDEX sessions_by_policy ON sessions (policy_id) WHERE policy_id IS NOT NULL;
 CREATE INDEX sessions_by_trial ON sessions (trial_id) WHERE trial_id IS NOT NULL;
 

@@ -6,7 +6,7 @@ use serde::Serialize;
 use utoipa::{IntoParams, ToSchema};
 
 use super::problem::Problem;
-use crate::service::Page;
+use crate::service::{Name, Page};
 use etude_core::document::{Faults, Path};
 
 /// Which part of a list is wanted.
@@ -70,6 +70,21 @@ impl Paging {
         let parse = |after: &String| after.parse().map_err(|_| Faults::one("/after", "expected the `next` of a page"));
         Ok(self.after.as_ref().map(parse).transpose()?)
     }
+}
+
+/// A name that a list is filtered by.
+pub(super) fn name_in(value: &str) -> Result<String, String> {
+    Name::new(value).map(|name| name.to_string()).map_err(|error| format!("{error}, found {value:?}"))
+}
+
+/// That of `all` which is called `value`.
+pub(super) fn one_of<T: Copy, const N: usize>(
+    value: &str,
+    all: [T; N],
+    name: fn(T) -> &'static str,
+) -> Result<T, String> {
+    let found = all.into_iter().find(|one| name(*one) == value);
+    found.ok_or_else(|| format!("expected one of {}, found {value:?}", all.map(name).join(", ")))
 }
 
 /// Where a page begins in a list that is ordered by sequence numbers.

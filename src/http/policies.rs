@@ -1,24 +1,25 @@
 //! `/v1/policies`.
 
 use axum::Extension;
-use axum::extract::{Request, State};
+use axum::extract::{FromRequestParts, Request, State};
 use axum::http::header::LOCATION;
+use axum::http::request::Parts;
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::Response;
 use serde::Serialize;
-use utoipa::ToSchema;
+use utoipa::{IntoParams, ToSchema};
 
 use super::answer::{json, json_text};
 use super::body::{NoForm, read_json};
-use super::paging::{List, Paging, after_sequence};
+use super::paging::{List, Paging, after_sequence, name_in, one_of};
 use super::path::PathId;
 use super::problem::{BodyProblems, DeletionProblems, Problem};
 use super::repeated::Key;
 use super::request_id::RequestId;
 use super::requests::{BatchRequest, PolicyRequest};
 use super::{SharedContext, answer};
-use crate::service::{Caller, ServiceError};
-use etude_core::mapping::{Policy, PolicySummary};
+use crate::service::{Caller, PolicyFilter, ServiceError};
+use etude_core::mapping::{Policy, PolicySummary, Status};
 
 /// Follow a demonstration: the policy whose effects come closest to it, stored unless the request says otherwise.
 #[utoipa::path(
@@ -133,17 +134,52 @@ pub(super) async fn delete_policy(
     Ok(StatusCode::NO_CONTENT)
 }
 
+/// Which policies are wanted: those that have all that is given.
+#[derive(Clone, Debug, IntoParams)]
+#[into_params(parameter_in = Query)]
+pub(super) struct WhichPolicies {
+    /// Only those of the model with this name.
+    model: Option<String>,
+    /// Only those with weights of the learner with this name.
+    learner: Option<String>,
+    /// Only those with this status: `optimal`, `bounded` or `local`.
+    #[param(value_type = Option<String>)]
+    status: Option<Status>,
+}
+
+/// [`WhichPolicies`] and [`Paging`] of the same query.
+pub(super) struct PoliciesQuery(WhichPolicies, Paging);
+
+impl<S: Send + Sync> FromRequestParts<S> for PoliciesQuery {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Problem> {
+        let mut which = WhichPolicies { model: None, learner: None, status: None };
+        let paging = Paging::read(parts, "limit, after, model, learner, status", |name, value| match name {
+            "model" => Some(name_in(value).map(|name| which.model = Some(name))),
+            "learner" => Some(name_in(value).map(|name| which.learner = Some(name))),
+            "status" => Some(one_of(value, Status::ALL, Status::name).map(|status| which.status = Some(status))),
+            _ => None,
+        })?;
+        Ok(Self(which, paging))
+    }
+}
+
 /// Policies without their steps, oldest first.
 #[utoipa::path(
     get, path = "/v1/policies", tag = "policies",
-    params(Paging),
+    params(WhichPolicies, Paging),
     responses(
         (status = 200, description = "A page of policies", body = List<PolicySummary>),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn list_policies(State(context): State<SharedContext>, paging: Paging) -> Result<Response, Problem> {
-    let page = context.etude.policies(after_sequence(&paging)?, paging.limit).await?;
+pub(super) async fn list_policies(
+    State(context): State<SharedContext>,
+    PoliciesQuery(WhichPolicies { model, learner, status }, paging): PoliciesQuery,
+) -> Result<Response, Problem> {
+    let filter = PolicyFilter { model, learner, status };
+    let page = context.etude.policies(&filter, after_sequence(&paging)?, paging.limit).await?;
     Ok(json(StatusCode::OK, &List::of(page, |policy| policy)))
 }
 

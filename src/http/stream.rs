@@ -13,6 +13,7 @@ use axum::body::{Body, Bytes};
 use axum::extract::ws::WebSocketUpgrade;
 use axum::extract::{FromRequestParts, Request, State};
 use axum::http::header::CONTENT_TYPE;
+use axum::http::request::Parts;
 use axum::http::{HeaderValue, StatusCode};
 use axum::response::{IntoResponse, Response};
 use hyper_util::rt::TokioIo;
@@ -21,7 +22,7 @@ use serde::Serialize;
 use tokio::sync::mpsc;
 use tokio_stream::wrappers::ReceiverStream;
 use tracing::Instrument;
-use utoipa::ToSchema;
+use utoipa::{IntoParams, ToSchema};
 
 pub(super) use self::frames::ClientFrameDocument;
 use super::SharedContext;
@@ -29,11 +30,10 @@ use super::answer::json;
 use super::body::{NoForm, is_ndjson, refuse};
 use super::connections::IsStream;
 use super::encoding::Encoding;
-use super::paging::{List, Paging, after_sequence};
+use super::paging::{List, Paging, after_sequence, name_in, one_of};
 use super::path::PathId;
 use super::problem::{DeletionProblems, Problem, ProblemKind};
-use crate::service::Caller;
-use crate::service::SessionRecord;
+use crate::service::{Caller, SessionFilter, SessionRecord, SessionStatus};
 use crate::stream::{Gone, Incoming, PROTOCOL, Room, SMALL_FRAME_BYTES, Sender};
 use etude_core::attribute::ByAttribute;
 
@@ -221,17 +221,51 @@ impl From<SessionRecord> for SessionBody {
     }
 }
 
+/// Which sessions are wanted: those that have all that is given.
+#[derive(Clone, Debug, IntoParams)]
+#[into_params(parameter_in = Query)]
+pub(super) struct WhichSessions {
+    /// Only those of the model with this name.
+    model: Option<String>,
+    /// Only those with this status: `open`, `done` or `expired`.
+    #[param(value_type = Option<String>)]
+    status: Option<SessionStatus>,
+}
+
+/// [`WhichSessions`] and [`Paging`] of the same query.
+pub(super) struct SessionsQuery(WhichSessions, Paging);
+
+impl<S: Send + Sync> FromRequestParts<S> for SessionsQuery {
+    type Rejection = Problem;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Problem> {
+        let mut which = WhichSessions { model: None, status: None };
+        let paging = Paging::read(parts, "limit, after, model, status", |name, value| match name {
+            "model" => Some(name_in(value).map(|name| which.model = Some(name))),
+            "status" => {
+                Some(one_of(value, SessionStatus::ALL, SessionStatus::name).map(|status| which.status = Some(status)))
+            }
+            _ => None,
+        })?;
+        Ok(Self(which, paging))
+    }
+}
+
 /// Sessions, oldest first.
 #[utoipa::path(
     get, path = "/v1/sessions", tag = "streams",
-    params(Paging),
+    params(WhichSessions, Paging),
     responses(
         (status = 200, description = "A page of sessions", body = List<SessionBody>),
         (status = 422, description = "`invalid`", body = Problem, content_type = "application/problem+json"),
     ),
 )]
-pub(super) async fn list_sessions(State(context): State<SharedContext>, paging: Paging) -> Result<Response, Problem> {
-    let page = context.etude.sessions(after_sequence(&paging)?, paging.limit).await?;
+pub(super) async fn list_sessions(
+    State(context): State<SharedContext>,
+    SessionsQuery(WhichSessions { model, status }, paging): SessionsQuery,
+) -> Result<Response, Problem> {
+    let filter = SessionFilter { model, status };
+    let page = context.etude.sessions(&filter, after_sequence(&paging)?, paging.limit).await?;
     Ok(json(StatusCode::OK, &List::of(page, SessionBody::from)))
 }
 

@@ -12,7 +12,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::answer::json;
 use super::body::{NoForm, read_json, read_small_json};
-use super::paging::{List, Paging};
+use super::paging::{List, Paging, one_of};
 use super::path::{PathId, PathName};
 use super::problem::{BodyProblems, DeletionProblems, Problem};
 use super::repeated::Key;
@@ -173,10 +173,7 @@ impl<S: Send + Sync> FromRequestParts<S> for TrialsQuery {
         let mut which = WhichTrials { status: None };
         let paging = Paging::read(parts, "limit, after, status", |name, value| match name {
             "status" => {
-                which.status = TrialStatus::ALL.into_iter().find(|status| status.name() == value);
-                let names = TrialStatus::ALL.map(TrialStatus::name).join(", ");
-                let fault = which.status.is_none().then(|| format!("expected one of {names}, found {value:?}"));
-                Some(fault.map_or(Ok(()), Err))
+                Some(one_of(value, TrialStatus::ALL, TrialStatus::name).map(|status| which.status = Some(status)))
             }
             _ => None,
         })?;

@@ -63,7 +63,8 @@ use crate::memory::Memory;
 pub(crate) use crate::store::PIECE_BYTES;
 use crate::store::Store;
 pub use crate::store::{
-    AcceptedReward, ModelSummary, Page, Replaces, SessionRecord, StoreError, TrialStatus, Unavailable,
+    AcceptedReward, ModelSummary, Page, PolicyFilter, Replaces, SessionFilter, SessionRecord, SessionStatus,
+    StoreError, TrialStatus, Unavailable,
 };
 use cache::ModelNames;
 use compiler::Compiler;

@@ -9,7 +9,7 @@ use super::requests::{DEMONSTRATION, Named, SentRequest, base_weights, check_req
 use super::search::{Extent, MAX_INLINE_BYTES, Means, Searched, follow, is_quick, max_quick_observations};
 use super::{Caller, Etude, Kind, PoolError, ServiceError};
 use crate::memory::Held;
-use crate::store::{Deletion, KeyTaken, Links, Needed, NewRequestKey, Page};
+use crate::store::{Deletion, KeyTaken, Links, Needed, NewRequestKey, Page, PolicyFilter};
 use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Object};
 use etude_core::interrupt::{Cancelled, Interrupt};
@@ -160,14 +160,19 @@ impl Etude {
         }
     }
 
-    /// At most `limit` policies without their steps (JSON), in the order in which they were stored, from the first after
-    /// the sequence number `after`.
+    /// At most `limit` of the policies that are wanted, without their steps (JSON), in the order in which they were stored, from the first
+    /// after the sequence number `after`.
     ///
     /// # Errors
     ///
     /// If the store failed.
-    pub async fn policies(&self, after: i64, limit: u32) -> Result<Page<Box<RawValue>>, ServiceError> {
-        let page = self.store.policies(after, limit).await?;
+    pub async fn policies(
+        &self,
+        filter: &PolicyFilter,
+        after: i64,
+        limit: u32,
+    ) -> Result<Page<Box<RawValue>>, ServiceError> {
+        let page = self.store.policies(filter, after, limit).await?;
         Ok(page.map(|policy| policy.summary))
     }
 }
@@ -260,7 +265,7 @@ mod tests {
         let small: Vec<_> = std::iter::from_fn(|| etude.memory.try_take(SMALL_BYTES).ok()).collect();
         let refused = etude.make_policy(body.clone().into_bytes(), caller()).await;
         assert!(matches!(refused, Err(ServiceError::NoRoom(_))), "{refused:?}");
-        assert_eq!(etude.policies(0, 10).await.unwrap().items.len(), 0);
+        assert_eq!(etude.policies(&PolicyFilter::default(), 0, 10).await.unwrap().items.len(), 0);
         drop((large, small));
         let free = etude.memory.free();
         let made = etude.make_policy(body.into_bytes(), caller()).await.unwrap();
@@ -284,7 +289,7 @@ mod tests {
             NewRequestKey { key: RequestKey { scope: "policies".to_owned(), ..other.key.key.clone() }, ..other.key };
         let late = etude.make_keyed_policy(Some(&taken), body, caller()).await.unwrap();
         assert_eq!(late.unwrap_err(), KeyTaken);
-        assert_eq!(etude.policies(0, 10).await.unwrap().items.len(), 1);
+        assert_eq!(etude.policies(&PolicyFilter::default(), 0, 10).await.unwrap().items.len(), 1);
         assert_eq!(Some(etude.made_meanwhile(&taken).await.unwrap()), first.id);
     }
 

@@ -258,7 +258,7 @@ fn optimum(
         return Ok(Ok(None));
     }
     let written = WrittenPolicy::new(&stamp, &request.problem, &mapping).map_err(ServiceError::from);
-    Ok(written.and_then(|written| PolicyText::of(stamp, written)).map(Some))
+    Ok(written.and_then(|written| PolicyText::of(stamp, mapping.status, written)).map(Some))
 }
 
 #[cfg(test)]

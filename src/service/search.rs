@@ -12,7 +12,7 @@ use super::ServiceError;
 use super::refined::RefinedRequest;
 use crate::clock::Clock;
 use crate::memory::{Held, Memory, NoRoom, SMALL_BYTES};
-use crate::store::{NewPolicy, NewRefinement, pack_steps};
+use crate::store::{NewPolicy, NewRefinement, PolicyClass, pack_steps};
 use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Path};
 use etude_core::interrupt::{Cancelled, Interrupt};
@@ -91,20 +91,23 @@ pub(super) struct Searched {
 /// A policy as it will be stored.
 pub(super) struct PolicyText {
     id: String,
+    class: PolicyClass,
     summary: String,
     steps: Vec<u8>,
 }
 
 impl PolicyText {
-    /// That of the policy `written`, which has the id of `stamp`.
-    pub(super) fn of(stamp: Stamp, written: WrittenPolicy<'_>) -> Result<Self, ServiceError> {
+    /// That of the policy `written`, which has the id of `stamp` and this status.
+    pub(super) fn of(stamp: Stamp, status: Status, written: WrittenPolicy<'_>) -> Result<Self, ServiceError> {
         let (summary, steps) = written.into_stored();
-        Ok(Self { id: stamp.id.unwrap_or_default(), summary, steps: pack_steps(&steps)? })
+        let Stamp { id, model, learner, .. } = stamp;
+        let class = PolicyClass { model, learner, status };
+        Ok(Self { id: id.unwrap_or_default(), class, summary, steps: pack_steps(&steps)? })
     }
 
     pub(super) fn at(self, created_at: Timestamp) -> NewPolicy {
-        let Self { id, summary, steps } = self;
-        NewPolicy { id, summary, steps, created_at }
+        let Self { id, class, summary, steps } = self;
+        NewPolicy { id, class, summary, steps, created_at }
     }
 }
 
@@ -154,7 +157,7 @@ pub(super) fn follow(
     let written = refinement.transpose().and_then(|refinement| {
         let written = WrittenPolicy::new(&stamp, &request.problem, &mapping)?;
         let policy = written.answer(None)?;
-        let row = stamp.id.is_some().then(|| PolicyText::of(stamp, written)).transpose()?;
+        let row = stamp.id.is_some().then(|| PolicyText::of(stamp, mapping.status, written)).transpose()?;
         // What was estimated may have been too little.
         memory.hold(&mut held, N_COPIES * policy.len() + n_refined_bytes)?;
         let weights = request.problem.weights().clone();

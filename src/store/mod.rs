@@ -49,10 +49,12 @@ pub use models::{
 };
 pub use observations::{NewObservations, Owner, SessionRefusal};
 pub use page::Page;
-pub use policies::{Links, NewPolicy, NewRefinement, PolicyRecord, pack_steps};
+pub use policies::{Links, NewPolicy, NewRefinement, PolicyClass, PolicyFilter, PolicyRecord, pack_steps};
 pub use refinements::{Attempt, MAX_ATTEMPTS, RefinementEnd};
 pub use request_keys::{AnsweredRequest, KeyTaken, NewRequestKey, RequestKey};
-pub use sessions::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, SessionRecord, SessionStatus, Taken};
+pub use sessions::{
+    ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, SessionFilter, SessionRecord, SessionStatus, Taken,
+};
 
 use sqlx::Sqlite;
 use sqlx::pool::PoolConnection;
@@ -276,10 +278,7 @@ mod tests {
     async fn a_log_that_goes_with_the_last_connection_is_not_taken_for_a_deleted_database() {
         let directory = tempfile::tempdir().unwrap();
         let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
-        let policy = |id: &str| {
-            let (id, summary) = (id.to_owned(), "{}".to_owned());
-            vec![NewPolicy { id, summary, steps: Vec::new(), created_at: Timestamp::UNIX_EPOCH }]
-        };
+        let policy = |id: &str| vec![NewPolicy::plain(id, "{}", Timestamp::UNIX_EPOCH)];
         store.add_policies(policy("a"), Vec::new()).await.unwrap();
         // Nobody has it open any more but the writer, which opens it anew after an error.
         store.readers.close().await;

@@ -76,6 +76,14 @@ impl<T> Rows<T> {
     }
 }
 
+/// The statement that lists rows of `table` in the order of their sequence numbers, from the first after `$1`, at most `$2`. The columns
+/// of the filter are to be `$3` and so on. Each has an index, whose entries with the same value are in the order of the list.
+pub(super) fn listing(listed: &str, table: &str, filter: &[(&'static str, &str)]) -> String {
+    let conditions = filter.iter().enumerate().map(|(n, (column, _))| format!(" AND {column} = ${}", n + 3));
+    let conditions: String = conditions.collect();
+    format!("SELECT {listed} FROM {table} WHERE sequence > $1{conditions} ORDER BY sequence LIMIT $2")
+}
+
 /// What comes after the rows of a query.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Rest {
@@ -149,7 +157,7 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::store::{ModelSummary, NewDefinition, NewLearner, NewModel, NewPolicy, Replaces, Store};
+    use crate::store::{ModelSummary, NewDefinition, NewLearner, NewModel, NewPolicy, PolicyFilter, Replaces, Store};
     use etude_core::attribute::AttributeDocument;
     use etude_core::learning::Distribution;
 
@@ -179,8 +187,7 @@ mod tests {
         let attribute: AttributeDocument =
             serde_json::from_value(serde_json::json!({"name": "x", "kind": "cyclic", "labels": [long]})).unwrap();
         for n in 0..N {
-            let policy =
-                NewPolicy { id: n.to_string(), summary: format!("\"{long}\""), steps: Vec::new(), created_at: now };
+            let policy = NewPolicy::plain(&n.to_string(), &format!("\"{long}\""), now);
             store.add_policies(vec![policy], Vec::new()).await.unwrap();
             let summary = ModelSummary {
                 name: n.to_string(),
@@ -210,7 +217,10 @@ mod tests {
             store.register_learner(learner).await.unwrap();
         }
         let number = |after: Option<String>| after.map_or(0, |after| after.parse().unwrap());
-        assert_eq!(n_items(async |after| store.policies(number(after), 1000).await).await, [2, 2, 1]);
+        assert_eq!(
+            n_items(async |after| store.policies(&PolicyFilter::default(), number(after), 1000).await).await,
+            [2, 2, 1]
+        );
         assert_eq!(n_items(async |after| store.models(after.as_deref(), 1000).await).await, [2, 2, 1]);
         assert_eq!(n_items(async |after| store.learners(after.as_deref(), 1000).await).await, [2, 2, 1]);
         // Fewer may be asked for, or be longer than a page.
@@ -220,5 +230,31 @@ mod tests {
             (fitting(&[], 10), fitting(&[1, 1], 2), fitting(&[1, 1, 1], 2)),
             ((0, Rest::IsNone), (2, Rest::IsNone), (2, Rest::IsMore))
         );
+    }
+
+    #[tokio::test]
+    async fn whatever_a_list_is_filtered_by_has_an_index_in_the_order_of_the_list() {
+        let directory = tempfile::tempdir().unwrap();
+        let store = Store::open(&directory.path().join("etude.db"), &TaskTracker::new()).await.unwrap();
+        for (table, columns) in [("policies", &["model", "learner", "status"][..]), ("sessions", &["model", "status"])]
+        {
+            // Every choice of them but none.
+            for chosen in 1..1_u32 << columns.len() {
+                let filter = columns.iter().enumerate().filter(|(n, _)| chosen & 1 << n != 0);
+                let filter: Vec<_> = filter.map(|(_, column)| (*column, "")).collect();
+                let explain = format!("EXPLAIN QUERY PLAN {}", listing("*", table, &filter));
+                let mut query = sqlx::query(sqlx::AssertSqlSafe(explain)).bind(0).bind(100);
+                for (_, value) in &filter {
+                    query = query.bind(*value);
+                }
+                let plan = query.fetch_all(&mut *store.reader().await.unwrap()).await.unwrap();
+                let plan: Vec<String> = plan.iter().map(|row| row.get("detail")).collect();
+                let is_indexed = |(column, _): &(&str, &str)| {
+                    plan[0]
+                        .starts_with(&format!("SEARCH {table} USING INDEX {table}_by_{column} ({column}=? AND rowid>?"))
+                };
+                assert!(plan.len() == 1 && filter.iter().any(is_indexed), "{filter:?}: {plan:?}");
+            }
+        }
     }
 }

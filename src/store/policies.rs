@@ -3,29 +3,64 @@
 //! The text and the steps of a policy have a checksum, and are never changed, but that the text forgets a policy that it refines and that is
 //! deleted. The id of the policy that refines it is a column of its own, and is put into the text when that is read.
 
-use std::sync::OnceLock;
+mod insertion;
 
 use jiff::Timestamp;
 use serde_json::value::RawValue;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{AssertSqlSafe, Row, SqlSafeStr, SqlStr, SqliteConnection};
+use sqlx::{AssertSqlSafe, Row, SqliteConnection};
 
-use super::page::{Rest, Rows};
+use super::page::{self, Rest, Rows};
 use super::{Page, Store, StoreError, as_integer};
 use crate::memory::{Held, Memory};
-use etude_core::mapping::{ShortSteps, WrittenPolicy};
+use etude_core::mapping::{ShortSteps, Status, WrittenPolicy};
+pub(super) use insertion::{add, add_all, add_at_once};
 
 /// A policy to be stored.
 #[derive(Clone, Debug)]
 pub struct NewPolicy {
     /// Its id, unique.
     pub id: String,
+    /// What lists are filtered by.
+    pub class: PolicyClass,
     /// JSON: the policy without its steps.
     pub summary: String,
     /// Its steps in short, packed by [`pack_steps`].
     pub steps: Vec<u8>,
     /// When it was made.
     pub created_at: Timestamp,
+}
+
+/// What lists of policies are filtered by, as the summary has it.
+#[derive(Clone, Debug)]
+pub struct PolicyClass {
+    /// Name of its model.
+    pub model: String,
+    /// The learner whose weights were used, if any.
+    pub learner: Option<String>,
+    /// What was proven of it.
+    pub status: Status,
+}
+
+/// Which policies are listed: those that have all that is given.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct PolicyFilter {
+    /// Name of their model.
+    pub model: Option<String>,
+    /// The learner whose weights were used.
+    pub learner: Option<String>,
+    /// What was proven of them.
+    pub status: Option<Status>,
+}
+
+impl PolicyFilter {
+    /// The columns that are to have a value.
+    fn columns(&self) -> Vec<(&'static str, &str)> {
+        let Self { model, learner, status } = self;
+        let columns =
+            [("model", model.as_deref()), ("learner", learner.as_deref()), ("status", status.map(Status::name))];
+        columns.into_iter().filter_map(|(column, value)| Some((column, value?))).collect()
+    }
 }
 
 impl NewPolicy {
@@ -183,18 +218,26 @@ impl Store {
         Ok((link(answer)?, held))
     }
 
-    /// At most `limit` policies in the order in which they became durable, from the first after the sequence number
+    /// At most `limit` of the policies that are wanted, in the order in which they became durable, from the first after the sequence number
     /// `after`.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn policies(&self, after: i64, limit: u32) -> Result<Page<PolicyRecord>, StoreError> {
-        let query = sqlx::query(
-            "SELECT sequence, id, summary, checksum, refined_by FROM policies WHERE sequence > $1 ORDER BY sequence LIMIT $2",
-        );
+    pub async fn policies(
+        &self,
+        filter: &PolicyFilter,
+        after: i64,
+        limit: u32,
+    ) -> Result<Page<PolicyRecord>, StoreError> {
+        let columns = filter.columns();
+        let mut query = sqlx::query(AssertSqlSafe(page::listing(LISTED, TABLE, &columns)));
+        query = query.bind(after).bind(i64::from(limit) + 1);
+        for (_, value) in &columns {
+            query = query.bind(*value);
+        }
         let mut reader = self.reader().await?;
-        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch(&mut *reader);
+        let rows = query.fetch(&mut *reader);
         Rows { table: TABLE, key: "sequence", name: "id", long: &["summary"], read: read_summary }
             .page(rows, limit, Rest::IsNone)
             .await
@@ -202,6 +245,9 @@ impl Store {
 }
 
 const TABLE: &str = "policies";
+
+/// What a list has of each.
+const LISTED: &str = "sequence, id, summary, checksum, refined_by";
 
 fn corrupt<E: Into<Box<dyn std::error::Error + Send + Sync>>>(column: &'static str) -> impl FnOnce(E) -> StoreError {
     super::corrupt(TABLE, column)
@@ -304,79 +350,18 @@ pub(super) async fn forget_refined(
     Ok(())
 }
 
-pub(super) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -> Result<(), StoreError> {
-    add_all(connection, &[policy]).await
-}
-
 /// Policies that are stored in up to so many bytes are read at once, without asking for their size first.
 const MAX_INLINE_BYTES: usize = 32 * 1024;
 
 /// Policies of up to so many bytes are written on the caller's thread, which takes a millisecond or so; larger ones on a blocking thread.
 const MAX_INLINE_ANSWER_BYTES: usize = 1 << 20;
 
-/// Most policies that one statement inserts. For each number of policies there is a statement, which is prepared once and kept.
-const MAX_ROWS: usize = 64;
-
-/// Most bytes of the policies of one statement, unless one policy alone has more: the driver copies them.
-const MAX_ROWS_BYTES: usize = 1 << 20;
-
-/// Adds policies in this order, within a transaction.
-pub(super) async fn add_all(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
-    let mut rest = policies;
-    while !rest.is_empty() {
-        let (rows, after) = rest.split_at(n_fitting(rest));
-        insert(connection, rows).await?;
-        rest = after;
-    }
-    Ok(())
-}
-
-/// How many of these, of which there are some, a statement inserts.
-fn n_fitting(policies: &[&NewPolicy]) -> usize {
-    let mut n_bytes = 0;
-    let fits = |policy: &&&NewPolicy| {
-        n_bytes += policy.n_bytes();
-        n_bytes <= MAX_ROWS_BYTES
-    };
-    policies.iter().take(MAX_ROWS).take_while(fits).count().max(1)
-}
-
-/// Adds policies in this order, all of them or none, outside of a transaction: one statement, which is durable when this returns.
-/// Says whether they were added; they are not if they are none, or too much.
-pub(super) async fn add_at_once(
-    connection: &mut SqliteConnection,
-    policies: &[&NewPolicy],
-) -> Result<bool, StoreError> {
-    let fits = !policies.is_empty() && n_fitting(policies) == policies.len();
-    if fits {
-        insert(connection, policies).await?;
-    }
-    Ok(fits)
-}
-
-/// Adds some policies. Each statement costs the driver a change of threads, so there is only one.
-async fn insert(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
-    let mut insert = sqlx::query(insert_of(policies.len()));
-    for policy in policies {
-        let checksum = checksum(&policy.summary, &policy.steps);
-        insert = insert.bind(&policy.id).bind(&policy.summary).bind(&policy.steps).bind(checksum);
-        insert = insert.bind(policy.created_at.as_millisecond());
-    }
-    insert.execute(connection).await?;
-    Ok(())
-}
-
-/// The statement that inserts so many policies, which is put together once.
-fn insert_of(n_rows: usize) -> SqlStr {
-    static INSERTS: [OnceLock<SqlStr>; MAX_ROWS + 1] = [const { OnceLock::new() }; MAX_ROWS + 1];
-    let put_together = || {
-        let rows = vec!["(?, ?, ?, ?, ?)"; n_rows].join(", ");
-        let insert = format!("INSERT INTO policies (id, summary, steps, checksum, created_at_ms) VALUES {rows}");
-        AssertSqlSafe(insert).into_sql_str()
-    };
-    match INSERTS.get(n_rows) {
-        Some(insert) => insert.get_or_init(put_together).clone(),
-        None => put_together(),
+#[cfg(test)]
+impl NewPolicy {
+    /// An optimal policy of the model "m", with this summary and without steps.
+    pub(crate) fn plain(id: &str, summary: &str, created_at: Timestamp) -> Self {
+        let class = PolicyClass { model: "m".to_owned(), learner: None, status: Status::Optimal };
+        Self { id: id.to_owned(), class, summary: summary.to_owned(), steps: Vec::new(), created_at }
     }
 }
 

@@ -169,6 +169,7 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
+    use crate::store::PolicyFilter;
 
     fn at(hour: i64) -> Timestamp {
         Timestamp::from_second(1_000_000 + 3600 * hour).unwrap()
@@ -180,7 +181,7 @@ mod tests {
 
     /// Stores the policy `id`, asked for with the key at this hour.
     async fn add(store: &Store, id: &str, hour: i64) -> Result<(), KeyTaken> {
-        let policy = NewPolicy { id: id.to_owned(), summary: "{}".to_owned(), steps: Vec::new(), created_at: at(hour) };
+        let policy = NewPolicy::plain(id, "{}", at(hour));
         let key = NewRequestKey { key: key(), body_hash: format!("hash of {id}"), at: at(hour) };
         store.add_keyed_policy(key, policy, None).await.unwrap()
     }
@@ -196,13 +197,13 @@ mod tests {
         assert_eq!(add(&store, "a", 0).await, Ok(()));
         assert_eq!((made(&store, 23).await, made(&store, 24).await), (Some("a".to_owned()), None));
         assert_eq!(add(&store, "b", 23).await, Err(KeyTaken));
-        assert_eq!(store.policies(0, 10).await.unwrap().items.len(), 1, "nothing was done");
+        assert_eq!(store.policies(&PolicyFilter::default(), 0, 10).await.unwrap().items.len(), 1, "nothing was done");
         assert_eq!(add(&store, "c", 24).await, Ok(()));
         assert_eq!(made(&store, 47).await.as_deref(), Some("c"));
         store.remove_outdated_keys(at(47)).await.unwrap();
         assert_eq!(made(&store, 47).await.as_deref(), Some("c"));
         store.remove_outdated_keys(at(48)).await.unwrap();
         assert_eq!(made(&store, 24).await, None, "it is gone");
-        assert_eq!(store.policies(0, 10).await.unwrap().items.len(), 2, "the policies stay");
+        assert_eq!(store.policies(&PolicyFilter::default(), 0, 10).await.unwrap().items.len(), 2, "the policies stay");
     }
 }

@@ -45,7 +45,8 @@ impl Request {
     pub(crate) fn header(self, name: impl reqwest::header::IntoHeaderName, value: impl AsRef<str>) -> Self {
         let mut headers = HeaderMap::new();
         headers.insert(name, value.as_ref().parse().unwrap());
-        Self(self.0, self.1.headers(headers))
+        // One of the same name stays.
+        Self(self.0, headers.iter().fold(self.1, |request, (name, value)| request.header(name, value)))
     }
 
     pub(crate) fn json(self, body: &impl Serialize) -> Self {

@@ -17,6 +17,7 @@ mod problems;
 mod batch;
 mod contract;
 mod deletion;
+mod filters;
 mod front;
 mod http;
 mod inputs;

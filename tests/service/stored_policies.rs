@@ -1,10 +1,10 @@
 //! Policies as they are stored.
 
 use crate::problems::{example, mapper, problem};
-use etude::store::{NewPolicy, NewRefinement, RefinementEnd, Store, pack_steps};
+use etude::store::{NewPolicy, NewRefinement, PolicyClass, PolicyFilter, RefinementEnd, Store, pack_steps};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{Mapper, Policy, Request, Stamp, WrittenPolicy};
+use etude_core::mapping::{Mapper, Policy, Request, Stamp, Status, WrittenPolicy};
 use jiff::Timestamp;
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -41,7 +41,8 @@ fn figure_4(stamp: &Stamp) -> (Policy, Written) {
 }
 
 fn new(id: &str, Written { summary, steps, .. }: Written) -> NewPolicy {
-    NewPolicy { id: id.to_owned(), summary, steps, created_at: Timestamp::UNIX_EPOCH }
+    let class = PolicyClass { model: "m".to_owned(), learner: None, status: Status::Optimal };
+    NewPolicy { id: id.to_owned(), class, summary, steps, created_at: Timestamp::UNIX_EPOCH }
 }
 
 proptest! {
@@ -110,7 +111,7 @@ async fn a_refined_policy_is_read_and_listed_with_its_link() {
     policy.refined_by = Some("q".to_owned());
     assert_eq!(store.policy("p").await.unwrap().unwrap(), serde_json::to_string(&policy).unwrap());
     assert_eq!(store.policy("q").await.unwrap().unwrap(), answer);
-    let listed = store.policies(0, 100).await.unwrap().items;
+    let listed = store.policies(&PolicyFilter::default(), 0, 100).await.unwrap().items;
     let listed: Vec<Value> = listed.iter().map(|row| serde_json::from_str(row.summary.get()).unwrap()).collect();
     assert_eq!(listed.iter().map(|summary| &summary["id"]).collect::<Vec<_>>(), ["p", "q"]);
     assert_eq!(listed[0]["refined_by"], "q");
@@ -141,7 +142,7 @@ async fn policies_that_come_together_are_stored_together_and_one_that_cannot_be_
     let added = futures_util::future::join_all(policies).await;
     let refused: Vec<_> = added.iter().enumerate().filter(|(_, added)| added.is_err()).map(|(n, _)| n).collect();
     assert_eq!(refused, [100], "its id is taken");
-    let listed = store.policies(0, 1000).await.unwrap().items;
+    let listed = store.policies(&PolicyFilter::default(), 0, 1000).await.unwrap().items;
     assert_eq!(listed.len(), N_POLICIES);
     for n in 0..N_POLICIES {
         assert_eq!(store.policy(&n.to_string()).await.unwrap().as_ref(), Some(&written.answer));

@@ -4,7 +4,7 @@ use tokio_util::task::TaskTracker;
 
 use super::*;
 use crate::service::{Caller, Client, ModelText, Name};
-use crate::store::NewPolicy;
+use crate::store::{NewPolicy, PolicyFilter};
 use etude_core::model::Format;
 
 const NOW: Timestamp = Timestamp::UNIX_EPOCH;
@@ -44,7 +44,7 @@ async fn what_can_never_be_refined_is_dropped_and_does_not_hold_up_the_others() 
         ("garbled", "{}", "{".to_owned()),
         ("gone", "{}", "{}".to_owned()),
     ] {
-        let policy = NewPolicy { id: id.to_owned(), summary: policy.to_owned(), steps: Vec::new(), created_at: NOW };
+        let policy = NewPolicy::plain(id, policy, NOW);
         let refinement =
             NewRefinement { policy_id: id.to_owned(), model_hash: hash.clone(), session_id: None, request };
         etude.store.add_policies(vec![policy], vec![refinement]).await.unwrap();
@@ -159,7 +159,7 @@ async fn a_policy_that_is_deleted_while_it_waits_or_is_refined_leaves_nothing_to
     let refined = etude.refine(refinement).await.unwrap().map(|refined| refined.at(NOW));
     assert!(refined.is_some());
     etude.store.end_refinement(RefinementEnd { policy_id: early, refined }).await.unwrap();
-    assert_eq!(etude.policies(0, 10).await.unwrap().items.len(), 0);
+    assert_eq!(etude.policies(&PolicyFilter::default(), 0, 10).await.unwrap().items.len(), 0);
     // Others are refined as before.
     let next = made(&etude, &request()).await;
     assert_eq!(etude.refine_next(&mut 0, &mut None).await.unwrap(), Some(Outcome::Ended));

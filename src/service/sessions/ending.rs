@@ -102,6 +102,6 @@ pub(super) fn conclude(
     let refinement = (mapping.status == Status::Local)
         .then(|| RefinedRequest::of(&stamp.model, &problem, mapping.cost).waiting(&stamp, Some(id)));
     let refinement = refinement.transpose()?;
-    let row = PolicyText::of(stamp, written)?;
+    let row = PolicyText::of(stamp, mapping.status, written)?;
     Ok((steps, policy, row, refinement))
 }

@@ -28,7 +28,7 @@ use super::requests::Named;
 use super::{Caller, Etude, Kind, PoolError, ServiceError};
 use crate::memory::{Held, Memory};
 use crate::store::{
-    Deletion, MAX_EXPIRED_AT_ONCE, NewSession, Opened, Owner, Page, SessionRecord, SessionStatus, Taken,
+    Deletion, MAX_EXPIRED_AT_ONCE, NewSession, Opened, Owner, Page, SessionFilter, SessionRecord, SessionStatus, Taken,
 };
 use etude_core::attribute::{ByAttribute, Schema, Weights};
 use etude_core::document::{Faults, Place};
@@ -273,13 +273,19 @@ impl Etude {
         }
     }
 
-    /// At most `limit` sessions in the order in which they were opened, from the first after the sequence number `after`.
+    /// At most `limit` of the sessions that are wanted, in the order in which they were opened, from the first after the sequence number
+    /// `after`.
     ///
     /// # Errors
     ///
     /// If the store failed.
-    pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRecord>, ServiceError> {
-        Ok(self.store.sessions(after, limit).await?)
+    pub async fn sessions(
+        &self,
+        filter: &SessionFilter,
+        after: i64,
+        limit: u32,
+    ) -> Result<Page<SessionRecord>, ServiceError> {
+        Ok(self.store.sessions(filter, after, limit).await?)
     }
 
     /// Expires open sessions that have been idle for too long, and removes keys of requests that are too old, now and then, until `stopping`

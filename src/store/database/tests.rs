@@ -8,7 +8,7 @@ use tokio_util::task::TaskTracker;
 
 use super::files::keep_from_others;
 use super::*;
-use crate::store::Store;
+use crate::store::{PolicyFilter, Store};
 
 #[tokio::test]
 async fn a_database_whose_migration_was_not_completed_is_migrated_but_not_by_whoever_only_reads() {
@@ -46,7 +46,7 @@ async fn a_service_keeps_others_from_files_that_they_could_read_and_whoever_only
     assert_eq!(modes(), [0o644; 4]);
     let _store = Store::open_alone(&path, &TaskTracker::new()).await.unwrap();
     assert_eq!(modes(), [0o600; 4]);
-    reading.policies(0, 1).await.unwrap();
+    reading.policies(&PolicyFilter::default(), 0, 1).await.unwrap();
 
     let foreign = directory.path().join("foreign.db");
     let mut other = options(&foreign).create_if_missing(true).connect().await.unwrap();

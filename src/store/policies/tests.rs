@@ -45,7 +45,7 @@ async fn a_policy_is_read_only_if_there_is_memory_for_it() {
         let created_at = Timestamp::UNIX_EPOCH;
         let is_small = summary.len() + steps.len() <= MAX_INLINE_BYTES;
         assert_eq!((is_small, answer.len() > MAX_INLINE_ANSWER_BYTES), (n_states < 7000, n_states > 3));
-        let new = NewPolicy { id: id.clone(), summary, steps, created_at };
+        let new = NewPolicy { steps, ..NewPolicy::plain(&id, &summary, created_at) };
         store.add_policies(vec![new], Vec::new()).await.unwrap();
         let memory = Memory::with_room(1 << 30);
         let (read, held) = store.policy_within(&id, Links::Now, &memory).await.unwrap().unwrap();

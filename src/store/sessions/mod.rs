@@ -6,13 +6,13 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
+use sqlx::{AssertSqlSafe, Row};
 
 use super::alive::NoteAlive;
 use super::arrivals;
 use super::observations::{Arrived, NewObservations, Owner, SessionRefusal};
-use super::page::{Rest, Rows};
+use super::page::{self, Rest, Rows};
 use super::policies::{NewPolicy, NewRefinement};
 use super::trials::{NewTrial, Opened};
 use super::{Page, Store, StoreError, corrupt, timestamp};
@@ -43,8 +43,28 @@ impl SessionStatus {
         }
     }
 
+    /// Every status.
+    pub const ALL: [Self; 3] = [Self::Open, Self::Done, Self::Expired];
+
     fn named(name: &str) -> Option<Self> {
-        [Self::Open, Self::Done, Self::Expired].into_iter().find(|status| status.name() == name)
+        Self::ALL.into_iter().find(|status| status.name() == name)
+    }
+}
+
+/// Which sessions are listed: those that have all that is given.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct SessionFilter {
+    /// Name of their model.
+    pub model: Option<String>,
+    /// How far they have come.
+    pub status: Option<SessionStatus>,
+}
+
+impl SessionFilter {
+    /// The columns that are to have a value.
+    fn columns(&self) -> Vec<(&'static str, &str)> {
+        let columns = [("model", self.model.as_deref()), ("status", self.status.map(SessionStatus::name))];
+        columns.into_iter().filter_map(|(column, value)| Some((column, value?))).collect()
     }
 }
 
@@ -268,16 +288,27 @@ impl Store {
         Ok(session.map(|session| session.with(&arrived)))
     }
 
-    /// At most `limit` sessions in the order in which they were opened, from the first after the sequence number `after`.
+    /// At most `limit` of the sessions that are wanted, in the order in which they were opened, from the first after the sequence number
+    /// `after`.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn sessions(&self, after: i64, limit: u32) -> Result<Page<SessionRecord>, StoreError> {
+    pub async fn sessions(
+        &self,
+        filter: &SessionFilter,
+        after: i64,
+        limit: u32,
+    ) -> Result<Page<SessionRecord>, StoreError> {
         let arrived = self.settle().await?;
-        let query = sqlx::query("SELECT * FROM sessions WHERE sequence > $1 ORDER BY sequence LIMIT $2");
+        let columns = filter.columns();
+        let mut query = sqlx::query(AssertSqlSafe(page::listing("*", "sessions", &columns)));
+        query = query.bind(after).bind(i64::from(limit) + 1);
+        for (_, value) in &columns {
+            query = query.bind(*value);
+        }
         let mut reader = self.reader().await?;
-        let rows = query.bind(after).bind(i64::from(limit) + 1).fetch(&mut *reader);
+        let rows = query.fetch(&mut *reader);
         let rows_of = Rows { table: "sessions", key: "sequence", name: "id", long: &["weights"], read: read_session };
         let mut page = rows_of.page(rows, limit, Rest::IsNone).await?;
         page.items = page.items.into_iter().map(|session| session.with(&arrived)).collect();

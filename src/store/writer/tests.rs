@@ -17,8 +17,7 @@ use crate::store::{NewObservations, NewSession, Opened, Owner, SessionEnd, Store
 
 fn policy(id: &str, n_bytes: usize) -> AddPolicies {
     let steps = vec![0; n_bytes];
-    let (id, summary) = (id.to_owned(), "{}".to_owned());
-    let policies = vec![NewPolicy { id, summary, steps, created_at: Timestamp::UNIX_EPOCH }];
+    let policies = vec![NewPolicy { steps, ..NewPolicy::plain(id, "{}", Timestamp::UNIX_EPOCH) }];
     AddPolicies { policies, refinements: Vec::new() }
 }
 

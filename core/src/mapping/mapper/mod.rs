@@ -50,6 +50,9 @@ pub enum Status {
 }
 
 impl Status {
+    /// Every status.
+    pub const ALL: [Self; 3] = [Self::Optimal, Self::Bounded, Self::Local];
+
     /// The status, as in JSON.
     #[must_use]
     pub fn name(self) -> &'static str {
