@@ -8,10 +8,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use super::input::{Cells, Observations, Spot};
-use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags};
+use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags, parse_within};
 use super::{CliError, render};
 use crate::clock::Clock;
 use crate::config::parse_whole;
@@ -37,6 +37,9 @@ pub(super) struct Map {
     /// Map as a stream with this lookahead would; none, as if left out: the global optimum.
     #[arg(long, value_name = "OBSERVATIONS|none")]
     lookahead: Option<Lookahead>,
+    /// Drop observations that stay within this of the last one kept in an attribute, and are equal to it in all others; may be given for several.
+    #[arg(long, value_name = "ATTRIBUTE=WITHIN", value_parser = parse_within)]
+    collapse: Vec<(String, f64)>,
     /// What guides the search.
     #[arg(long, value_enum)]
     heuristic: Option<HeuristicArg>,
@@ -130,6 +133,9 @@ impl Map {
             request.insert("model", stem.unwrap_or_default().into());
         }
         self.options.add_to(&mut request)?;
+        for (attribute, within) in &self.collapse {
+            request.set(&format!("--collapse {attribute}={within}"), &["collapse", attribute], json!(within))?;
+        }
         let heuristic = self.heuristic.and_then(|heuristic| heuristic.to_possible_value());
         for (flag, name, value) in [
             ("--lookahead", "lookahead", self.lookahead.map(Lookahead::document)),

@@ -206,6 +206,10 @@ fn parse_weight(text: &str) -> Result<(String, f64), String> {
     parse_named_number(text, "expected ATTRIBUTE=WEIGHT, such as x=2")
 }
 
+pub(super) fn parse_within(text: &str) -> Result<(String, f64), String> {
+    parse_named_number(text, "expected ATTRIBUTE=WITHIN, such as x=0.5")
+}
+
 fn parse_action_cost(text: &str) -> Result<(String, f64), String> {
     parse_named_number(text, "expected ACTION=COST, such as forward=2")
 }

@@ -28,6 +28,10 @@ pub struct Conditions {
     /// Actions that cost this instead: finite, at least 0.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub action_costs: Vec<(ActionIdx, f64)>,
+    /// If there: observations are dropped that stay within this of the last one kept, by positions of attributes, and are equal to it in all
+    /// other attributes. What they count is lost.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub collapse: Option<Vec<(usize, f64)>>,
 }
 
 impl Default for Conditions {
@@ -39,6 +43,7 @@ impl Default for Conditions {
             end_weight: Self::DEFAULT_END_WEIGHT,
             without: Vec::new(),
             action_costs: Vec::new(),
+            collapse: None,
         }
     }
 }
@@ -90,6 +95,16 @@ impl Conditions {
         self.starts.iter().flatten().all(has_state)
             && self.without.iter().all(has_action)
             && self.action_costs.iter().map(|(action, _)| action).all(has_action)
+            && self.collapse.iter().flatten().all(|(position, _)| *position < model.schema().len())
+    }
+
+    /// These conditions for the observations with these numbers alone.
+    pub(super) fn of_kept(&self, numbers: &[u32]) -> Self {
+        let weights = match self.observation_weights.as_slice() {
+            [] => Vec::new(),
+            _ => numbers.iter().map(|number| self.observation_weight(*number as usize)).collect(),
+        };
+        Self { observation_weights: weights, ..self.clone() }
     }
 
     pub(super) fn recurrence(&self) -> Recurrence {

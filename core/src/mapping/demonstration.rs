@@ -1,5 +1,6 @@
 //! What was seen of the demonstrator.
 
+mod collapsed;
 mod well_formed;
 
 pub use well_formed::WellFormed;

@@ -11,7 +11,7 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 
 use super::{Budget, Conditions, Demonstration, HeuristicName, Settings, longest_lookahead};
-use crate::attribute::{Scalar, Weights};
+use crate::attribute::{Kind, Scalar, Weights};
 use crate::document::{Faults, Object, Path, Place, Range};
 use crate::model::{ActionIdx, Model, Origin, StateIdx};
 
@@ -53,12 +53,30 @@ impl RequestKind {
         }
         match self {
             Self::Policy => {
-                following!("model", "demonstration", "learner", "heuristic", "max_expansions", "deadline_ms", "store")
+                following!(
+                    "model",
+                    "demonstration",
+                    "learner",
+                    "heuristic",
+                    "max_expansions",
+                    "deadline_ms",
+                    "collapse",
+                    "store"
+                )
             }
             Self::Batch => {
-                following!("model", "items", "learner", "heuristic", "max_expansions", "deadline_ms", "store")
+                following!(
+                    "model",
+                    "items",
+                    "learner",
+                    "heuristic",
+                    "max_expansions",
+                    "deadline_ms",
+                    "collapse",
+                    "store"
+                )
             }
-            Self::Item => following!("demonstration", "heuristic", "max_expansions"),
+            Self::Item => following!("demonstration", "heuristic", "max_expansions", "collapse"),
             Self::Trial => following!("model", "demonstration", "heuristic", "max_expansions", "deadline_ms"),
             Self::Session => following!("type", "model", "learner", "explore"),
         }
@@ -113,6 +131,12 @@ pub struct Options {
     /// that.
     #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, f64>>))]
     pub action_costs: Option<Vec<(ActionIdx, f64)>>,
+    /// Leaves out what repeats itself: by attribute name, within what of the last observation kept an observation is dropped, if it is equal
+    /// to it in all other attributes. The first and the last stay. What dropped ones count (`observation_weights`) is lost, `observation` in steps
+    /// counts the original ones, a lookahead those that are kept. Each at least 0, in the attribute's units; not for categories.
+    // By the attributes' positions.
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, f64>>, example = json!({"x": 0.5})))]
+    pub collapse: Option<Vec<(usize, f64)>>,
     /// What an unsafe outcome of an action costs; only for stochastic models. `null`: actions with unsafe outcomes are not taken.
     pub unsafe_cost: Option<f64>,
     /// What guides the search.
@@ -133,8 +157,8 @@ impl Options {
     pub fn read(object: &Object<'_, '_>, model: &Model, base: &Self, faults: &mut Faults) -> Option<Self> {
         let of_model = base.read_of_model(object, model, faults);
         let general = Self::read_general(object, base, faults);
-        let Self { weights, start, without, action_costs, .. } = of_model?;
-        Some(Self { weights, start, without, action_costs, ..general? })
+        let Self { weights, start, without, action_costs, collapse, .. } = of_model?;
+        Some(Self { weights, start, without, action_costs, collapse, ..general? })
     }
 
     /// These options, with those of `object` that depend on the model.
@@ -155,6 +179,10 @@ impl Options {
             Some(place) => model.read_action_costs(&place, faults).map(Some),
             None => Some(self.action_costs.clone()),
         };
+        let collapse = match object.optional("collapse") {
+            Some(place) => read_collapse(&place, model, faults).map(Some),
+            None => Some(self.collapse.clone()),
+        };
         if let Some(place) = object.optional("unsafe_cost") {
             faults.note(
                 &place,
@@ -163,8 +191,8 @@ impl Options {
             return None;
         }
         let weights = self.weights.iter().copied().chain(weights?).collect();
-        let (start, without, action_costs) = (start?, without?, action_costs?);
-        Some(Self { weights, start, without, action_costs, ..self.clone() })
+        let (start, without, action_costs, collapse) = (start?, without?, action_costs?, collapse?);
+        Some(Self { weights, start, without, action_costs, collapse, ..self.clone() })
     }
 
     /// Reads the options that do not depend on the model.
@@ -233,6 +261,7 @@ impl Options {
             end_weight: self.end_weight.unwrap_or(Conditions::DEFAULT_END_WEIGHT),
             without: self.without.clone().unwrap_or_default(),
             action_costs: self.action_costs.clone().unwrap_or_default(),
+            collapse: self.collapse.clone(),
         }
     }
 
@@ -299,6 +328,19 @@ impl Options {
 fn read_lookahead(place: &Place<'_, '_>, faults: &mut Faults) -> Option<NonZeroU32> {
     let lookahead = place.integer(1, Demonstration::MAX_OBSERVATIONS as u64, faults)?;
     u32::try_from(lookahead).ok().and_then(NonZeroU32::new)
+}
+
+/// Reads within what observations are dropped: by attribute that is no category.
+fn read_collapse(place: &Place<'_, '_>, model: &Model, faults: &mut Faults) -> Option<Vec<(usize, f64)>> {
+    let schema = model.schema();
+    let within = schema.read_named_weights(place, faults)?;
+    let of_category = within.iter().find(|(position, _)| matches!(schema.attributes()[*position].kind, Kind::Category));
+    if let Some((position, _)) = of_category {
+        let path = Path::Member(&place.path, &schema.attributes()[*position].name);
+        faults.note_at(&path, "two values of a category are equal or not: leave it out, and they must be equal");
+        return None;
+    }
+    Some(within)
 }
 
 fn read_heuristic(place: &Place<'_, '_>, faults: &mut Faults) -> Option<HeuristicName> {

@@ -19,16 +19,35 @@ pub struct Problem<'m> {
     /// What ending costs; `None` if it is free.
     pub(crate) end: Option<EndDistances>,
     pub(super) body: Body,
+    collapsed: Option<Box<Collapsed>>,
+}
+
+/// What was collapsed.
+#[derive(Debug)]
+struct Collapsed {
+    /// The conditions for the whole demonstration.
+    conditions: Conditions,
+    /// By observation that is kept, its number in the whole.
+    numbers: Vec<u32>,
 }
 
 impl<'m> Problem<'m> {
-    /// A problem.
+    /// A problem. Of a demonstration that is to be [collapsed](Conditions::collapse), only the observations that are kept are followed; they
+    /// are counted anew here, and in policies as they were.
     ///
     /// # Panics
     ///
     /// If the conditions name states or actions that the model does not have.
     #[must_use]
     pub fn new(model: &'m Model, demonstration: Demonstration, weights: Weights, conditions: Conditions) -> Self {
+        let (demonstration, conditions, collapsed) = match &conditions.collapse {
+            None => (demonstration, conditions, None),
+            Some(within) => {
+                let (kept, numbers) = demonstration.collapsed(model.schema(), within);
+                let of_kept = conditions.of_kept(&numbers);
+                (kept, of_kept, Some(Box::new(Collapsed { conditions, numbers })))
+            }
+        };
         let starts = Starts::of(model, conditions.starts.as_deref());
         let body = conditions.body(model);
         let (schema, states) = (model.schema(), model.states());
@@ -36,7 +55,7 @@ impl<'m> Problem<'m> {
         let last = demonstration.observation(demonstration.len() - 1);
         let end = (conditions.end_weight > 0.0)
             .then(|| EndDistances::new(schema, states, last, &weights, conditions.end_weight));
-        Self { model, demonstration, weights, conditions, starts, distances, end, body }
+        Self { model, demonstration, weights, conditions, starts, distances, end, body, collapsed }
     }
 
     /// The weights of the distance, by attribute.
@@ -45,7 +64,7 @@ impl<'m> Problem<'m> {
         self.model.schema().by_attribute(self.weights.as_slice().iter().copied())
     }
 
-    /// The demonstration.
+    /// The demonstration, as far as it is followed.
     #[must_use]
     pub fn demonstration(&self) -> &Demonstration {
         &self.demonstration
@@ -57,10 +76,15 @@ impl<'m> Problem<'m> {
         &self.weights
     }
 
-    /// The conditions.
+    /// The conditions for the whole demonstration, as they were given.
     #[must_use]
     pub fn conditions(&self) -> &Conditions {
-        &self.conditions
+        self.collapsed.as_ref().map_or(&self.conditions, |collapsed| &collapsed.conditions)
+    }
+
+    /// The number in the whole demonstration of an observation that is followed.
+    pub(super) fn number_of(&self, observation: u32) -> u32 {
+        self.collapsed.as_ref().map_or(observation, |collapsed| collapsed.numbers[observation as usize])
     }
 
     /// The start state that is closest to the first observation, the first among equals: its number in a search of this problem.

@@ -286,8 +286,8 @@ impl Problem<'_> {
     #[must_use]
     pub fn warnings(&self, path: &Path<'_>) -> Vec<Warning> {
         let mut watch = Watch::new(&self.weights);
-        for (index, observation) in self.demonstration.iter().enumerate() {
-            watch.observe(self.model, index, observation);
+        for (index, observation) in (0..).zip(self.demonstration.iter()) {
+            watch.observe(self.model, self.number_of(index) as usize, observation);
         }
         let mut warnings = watch.warnings(self.model, path);
         warnings.extend(self.dear_actions(path));

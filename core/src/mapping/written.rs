@@ -323,7 +323,7 @@ impl<'a> ShortSteps<'a> {
                 })
             });
             short.steps.push(ShortStep {
-                observation: step.observation,
+                observation: problem.number_of(step.observation),
                 action,
                 state_index: step.state,
                 cost: sum.total(),

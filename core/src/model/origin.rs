@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::explored::Unexplored;
 use super::{ActionIdx, Model, StateIdx};
 use crate::attribute::{MAX_COST, Value};
-use crate::document::{Faults, Path, Place, Quoted, Range, list_known};
+use crate::document::{Faults, Path, Place, Quoted, Range, list_known, normal};
 
 /// A state that a request says the imitator may start in.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -86,7 +86,7 @@ impl Model {
         path: &Path<'_>,
         faults: &mut Faults,
     ) -> Option<ActionIdx> {
-        let action = known.get(name).copied();
+        let action = known.get(normal(name).as_ref()).copied();
         if action.is_none() {
             let names = list_known(self.actions.iter().map(|action| &action.name));
             faults.note_at(path, format!("unknown action {}; the model has {names}", Quoted(name)));

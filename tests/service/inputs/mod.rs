@@ -1,5 +1,7 @@
 //! How inputs are read: what is taken, and what is told of what is not.
 
+mod meaning;
+
 use reqwest::Method;
 use reqwest::header::CONTENT_TYPE;
 use serde_json::{Value, json};
@@ -28,50 +30,6 @@ async fn stream_text(service: &Service, text: impl Into<reqwest::Body>) -> Vec<V
     let request = service.client.post(service.url("/v1/stream")).header(CONTENT_TYPE, "application/x-ndjson");
     let answered = request.body(text).send().await.unwrap().text().await.unwrap();
     answered.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
-}
-
-#[tokio::test]
-async fn a_model_of_several_outcomes_is_kept_and_refused_where_it_would_be_searched() {
-    let service = Service::start(&[]).await;
-    let mut slippery = line();
-    slippery["dynamics"]["transitions"] =
-        json!([[0, "on", 1, 0.9, 2.5], [0, "on", 0, 0.1], [1, "on", 2, 1, 0.5], [2, "back", 1]]);
-    let (status, made) = service.put("/v1/models/slippery", &slippery).await;
-    assert_eq!(
-        (status, &made["counts"]["stochastic"], &made["counts"]["transitions"]),
-        (201, &json!(1), &json!(4)),
-        "{made}"
-    );
-    let (_, read) = service.get("/v1/models/slippery").await;
-    let written = json!([[0, "on", 1, 0.9, 2.5], [0, "on", 0, 0.1], [1, "on", 2, 1.0, 0.5], [2, "back", 1]]);
-    assert_eq!((&read["definition"]["dynamics"]["transitions"], &read["counts"]), (&written, &made["counts"]));
-    assert_eq!(service.put("/v1/models/slippery", &read["definition"]).await.0, 200);
-    let (_, page) = service.get("/v1/models").await;
-    assert_eq!(page["items"][0]["counts"], made["counts"]);
-    for other in
-        [json!([[0, "on", 1, 0.9], [0, "on", 0, 0.1], [1, "on", 2, 1, 0.5], [2, "back", 1]]), json!([[0, "on", 1]])]
-    {
-        let mut model = slippery.clone();
-        model["dynamics"]["transitions"] = other;
-        let (_, made_otherwise) = service.put("/v1/models/other", &model).await;
-        assert_ne!(made_otherwise["hash"], made["hash"]);
-        service.delete("/v1/models/other").await;
-    }
-
-    service.put("/v1/learners/l", &json!({"attributes": ["x"]})).await;
-    let demonstration = json!([{"x": 0}, {"x": 2}]);
-    let request = json!({"model": "slippery", "demonstration": demonstration});
-    let batch = json!({"model": "slippery", "items": [{"demonstration": demonstration}]});
-    for (path, body) in [("policies", &request), ("policies:batch", &batch), ("learners/l/trials", &request)] {
-        let (status, problem) = service.post(&format!("/v1/{path}"), body).await;
-        let [fault] = &problem["errors"].as_array().unwrap()[..] else { panic!("{problem}") };
-        assert_eq!((status, &fault["pointer"]), (422, &json!("/model")), "{path}: {problem}");
-        assert!(fault["detail"].as_str().unwrap().starts_with("this model is stochastic"), "{path}: {problem}");
-    }
-    let frames = stream(&service, &[json!({"type": "open", "model": "slippery"})]).await;
-    let told = &frames[1]["problem"]["errors"][0];
-    assert!(told["pointer"] == "/model" && told["detail"].as_str().unwrap().contains("stochastic"), "{frames:?}");
-    service.stop().await;
 }
 
 /// Sends text as JSON.
@@ -250,36 +208,6 @@ async fn a_fault_at_every_observation_is_told_once_with_how_often() {
     let frames = [json!({"type": "open", "model": "line"}), json!({"type": "observe", "seq": 0, "states": seen})];
     let frames = stream(&service, &frames).await;
     assert_eq!(pointers(&frames[2]["problem"]["errors"]), ["/states/2/gold", "/states/2/x"], "{frames:?}");
-    service.stop().await;
-}
-
-#[tokio::test]
-async fn policies_warn_of_what_can_hardly_be_meant_and_keep_it() {
-    let service = Service::start(&[]).await;
-    service.put("/v1/models/line", &line()).await;
-    service.put("/v1/learners/l", &json!({"attributes": ["x"]})).await;
-    let odd = json!([{"x": 0, "door": "Open"}, {"x": 2, "door": "shut"}]);
-    let request = json!({"model": "line", "demonstration": odd});
-    let at = |pointer: &str| {
-        json!([{
-            "pointer": pointer,
-            "detail": "no state has \"Open\": it differs from all of them alike; is \"open\" meant? (in 1 observation)",
-        }])
-    };
-    let (status, policy) = service.post("/v1/policies", &request).await;
-    assert_eq!((status, &policy["warnings"]), (201, &at("/demonstration/0/door")), "{policy}");
-    let (_, read) = service.get(&format!("/v1/policies/{}", policy["id"].as_str().unwrap())).await;
-    assert_eq!(read, policy);
-    let (_, trial) = service.post("/v1/learners/l/trials", &request).await;
-    assert_eq!(trial["policy"]["warnings"], at("/demonstration/0/door"), "{trial}");
-    let right = json!([{"x": 0, "door": "open"}]);
-    let batch = json!({"model": "line", "items": [{"demonstration": right}, {"demonstration": odd}]});
-    let (_, answers) = service.post("/v1/policies:batch", &batch).await;
-    let warnings: Vec<_> = answers["items"].as_array().unwrap().iter().map(|item| &item["warnings"]).collect();
-    assert_eq!(warnings, [&json!([]), &at("/items/1/demonstration/0/door")], "{answers}");
-    // The answer is the same as if nothing had been said.
-    let told_of = json!({"model": "line", "demonstration": [{"x": 0, "door": "ajar"}, {"x": 2, "door": "shut"}]});
-    assert_eq!(service.post("/v1/policies", &told_of).await.1["steps"], policy["steps"]);
     service.stop().await;
 }
 
