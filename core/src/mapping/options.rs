@@ -365,9 +365,29 @@ pub enum ObservationDocument {
 
 /// An observed value; `null` was not observed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[cfg_attr(feature = "openapi", schema(as = Observed))]
 pub struct ObservedDocument(pub Option<Scalar>);
+
+// Derived, it would be one of a reference and null, of which generators of clients make a class without members.
+#[cfg(feature = "openapi")]
+impl utoipa::PartialSchema for ObservedDocument {
+    fn schema() -> utoipa::openapi::RefOr<utoipa::openapi::Schema> {
+        use utoipa::openapi::RefOr;
+        use utoipa::openapi::schema::{ObjectBuilder, Schema, Type};
+        let mut schema = Scalar::schema();
+        if let RefOr::T(Schema::AnyOf(any)) = &mut schema {
+            any.description = Some("An observed value; `null` was not observed.".to_owned());
+            any.items.push(ObjectBuilder::new().schema_type(Type::Null).into());
+        }
+        schema
+    }
+}
+
+#[cfg(feature = "openapi")]
+impl utoipa::ToSchema for ObservedDocument {
+    fn name() -> std::borrow::Cow<'static, str> {
+        "Observed".into()
+    }
+}
 
 /// A state, or a list of states: an index, or attribute values that exactly one state has. In a world that is searched lazily, all
 /// attribute values but that of `gold`, which may be left out; there, only the start has an index, 0.
