@@ -79,7 +79,7 @@ pub use heuristic::HeuristicName;
 pub use mapper::{Mapper, Mapping, Settings, Status};
 pub(crate) use online::longest_lookahead;
 pub use online::{CommittedStep, OnlineMapping, Stopped};
-pub use options::{ObservationDocument, ObservedDocument, Options, RequestKind, StartReference};
+pub use options::{ObservationDocument, ObservedDocument, Options, RequestKind, StartReference, StateReference};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
 pub use problem::Problem;
 pub use request::Request;

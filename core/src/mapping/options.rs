@@ -401,6 +401,17 @@ pub enum StartReference {
     /// Values by attribute name.
     Values(BTreeMap<String, Scalar>),
     /// Several states, at least one.
-    #[cfg_attr(feature = "openapi", schema(no_recursion))]
-    Several(Vec<StartReference>),
+    Several(Vec<StateReference>),
+}
+
+/// A state: its index, or attribute values that exactly one state has.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(untagged)]
+pub enum StateReference {
+    /// The state's index.
+    #[cfg_attr(feature = "openapi", schema(value_type = u32))]
+    Index(StateIdx),
+    /// Values by attribute name.
+    Values(BTreeMap<String, Scalar>),
 }
