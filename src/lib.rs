@@ -11,7 +11,7 @@
 //! used without the rest. This one is the service and the program around it. Each module uses only those to its left, which a test holds:
 //!
 //! ```text
-//! etude_core <- clock, memory, telemetry, experiment <- store <- service <- stream <- http <- config <- server <- cli
+//! etude_core <- clock, memory, telemetry, picture <- experiment <- store <- service <- stream <- http <- config <- server <- cli
 //! ```
 //!
 //! | module | is |
@@ -19,6 +19,7 @@
 //! | [`etude_core`] | the core, with an architecture of its own |
 //! | [`clock`] | what time it is, and new ids, as the server hands them in |
 //! | [`memory`] | the one budget of memory |
+//! | [`picture`] | paths and timelines of policies, as SVG |
 //! | [`experiment`] | the paper's figures |
 //! | [`store`] | all SQL: one writer that groups commits, a pool of readers |
 //! | [`service`] | the application: models, policies, sessions, learners, trials, the bounded pool that searches run on |
@@ -54,6 +55,7 @@ pub mod config;
 pub mod experiment;
 pub mod http;
 pub mod memory;
+pub mod picture;
 pub mod server;
 pub mod service;
 pub mod store;

@@ -10,6 +10,7 @@ use std::time::Duration;
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 
+use super::drawing::PictureFlags;
 use super::input::{Cells, Observations, Spot};
 use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags, parse_within};
 use super::{CliError, render};
@@ -52,6 +53,8 @@ pub(super) struct Map {
     /// Print the policy as JSON instead of a table.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    picture: PictureFlags,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -100,6 +103,7 @@ impl Map {
             ..Stamp::default()
         };
         let policy = Policy::new(&stamp, &asked.problem, &mapping)?;
+        self.picture.draw(&policy, mapper.model(), &asked.problem)?;
         let warnings = policy.warnings.iter();
         let mut warnings =
             warnings.map(|Warning { pointer, detail }| request.tell(pointer, detail, observations.source(), &spots));

@@ -2,6 +2,7 @@
 
 mod client;
 mod demo;
+mod drawing;
 mod experiment;
 mod healthcheck;
 mod input;
@@ -119,9 +120,9 @@ enum CliError {
     /// An experiment failed.
     #[error(transparent)]
     Experiment(crate::experiment::LocalError),
-    /// A figure could not be drawn.
+    /// A picture could not be drawn.
     #[error(transparent)]
-    Plot(#[from] crate::experiment::plot::PlotError),
+    Picture(#[from] crate::picture::PictureError),
     /// A stream ended without a policy.
     #[error("the stream ended without a policy: {0}")]
     Stream(String),

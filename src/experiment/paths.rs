@@ -16,6 +16,31 @@ pub struct Paths {
     pub cost: f64,
     /// What it earns.
     pub reward: f64,
+    /// What either did on the way.
+    pub marks: Vec<Mark>,
+}
+
+/// Something that was done on the way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Mark {
+    /// Where.
+    pub cell: Cell,
+    /// What.
+    pub deed: Deed,
+    /// By whom: the imitator, or the demonstrator.
+    pub by_imitator: bool,
+}
+
+/// What may be done on the way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Deed {
+    /// A piece of gold was grabbed.
+    Grab,
+    /// A wumpus was shot.
+    Shot {
+        /// Where it was.
+        hit: Cell,
+    },
 }
 
 /// Maps the demonstration of figure 4 with default weights.
@@ -28,5 +53,11 @@ pub fn figure_4<L: Laboratory>(laboratory: &mut L) -> Result<Paths, L::Error> {
     let Followed { actions, cost } = laboratory.map(&scene, None)?;
     let imitator = (0..=actions.len()).map(|n| scene.execute(&actions[..n]).state.cell).collect();
     let reward = scene.execute(&actions).reward;
-    Ok(Paths { demonstrator: scene.observed_cells(), imitator, actions, cost, reward })
+    let imitated = |n: usize| scene.execute(&actions[..n]).state;
+    let grabs = (0..actions.len()).filter(|n| imitated(*n).lying != imitated(n + 1).lying);
+    let grabs = grabs.map(|n| Mark { cell: imitated(n).cell, deed: Deed::Grab, by_imitator: true });
+    let shots = scene.shot().map(|(cell, hit)| Mark { cell, deed: Deed::Shot { hit }, by_imitator: false });
+    let grabbed = scene.grabbed_at().map(|cell| Mark { cell, deed: Deed::Grab, by_imitator: false });
+    let marks = shots.into_iter().chain(grabbed).chain(grabs).collect();
+    Ok(Paths { demonstrator: scene.observed_cells(), imitator, actions, cost, reward, marks })
 }

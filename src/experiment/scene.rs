@@ -82,9 +82,33 @@ impl Scene {
     /// Where the demonstrator was seen, observation by observation.
     #[must_use]
     pub fn observed_cells(&self) -> Vec<Cell> {
-        let coordinate = |seen: &Value, name: &str| u16::try_from(seen[name].as_u64()?).ok();
         let seen = self.demonstration.as_array().map(Vec::as_slice).unwrap_or_default();
-        seen.iter().filter_map(|seen| coordinate(seen, "x").zip(coordinate(seen, "y"))).collect()
+        seen.iter().filter_map(cell_of).collect()
+    }
+
+    /// The first observation after which something changed: of it and the next one, `is_change` holds.
+    fn first_change(&self, is_change: impl Fn(&Value, &Value) -> bool) -> Option<&Value> {
+        let seen = self.demonstration.as_array()?;
+        seen.windows(2).find(|pair| is_change(&pair[0], &pair[1])).map(|pair| &pair[0])
+    }
+
+    /// Where the demonstrator was seen to grab gold for the first time.
+    #[must_use]
+    pub fn grabbed_at(&self) -> Option<Cell> {
+        let gold = |seen: &Value| seen["gold"].as_u64();
+        cell_of(self.first_change(|before, after| gold(before) < gold(after))?)
+    }
+
+    /// Where the demonstrator was seen to shoot a wumpus for the first time, and where that was.
+    #[must_use]
+    pub fn shot(&self) -> Option<(Cell, Cell)> {
+        let is_alive = |seen: &Value, n: usize| seen[format!("wumpus_{}", n + 1)].as_bool();
+        let wumpi = self.cave().wumpi();
+        let (hit, seen) = wumpi.iter().enumerate().find_map(|(n, cell)| {
+            let seen = self.first_change(|before, after| is_alive(before, n) > is_alive(after, n))?;
+            Some((*cell, seen))
+        })?;
+        Some((cell_of(seen)?, hit))
     }
 
     /// What becomes of an imitator that executes these actions. Those that are none have no place in this world.
@@ -92,4 +116,10 @@ impl Scene {
     pub fn execute(&self, actions: &[String]) -> Execution {
         self.world.execute(actions.iter().filter_map(|name| Act::named(name)))
     }
+}
+
+/// The cell of an observation.
+fn cell_of(seen: &Value) -> Option<Cell> {
+    let coordinate = |name: &str| u16::try_from(seen[name].as_u64()?).ok();
+    coordinate("x").zip(coordinate("y"))
 }

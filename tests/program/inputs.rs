@@ -201,3 +201,49 @@ fn a_stream_of_a_world_that_is_searched_lazily_is_refused_at_once() {
         etude(&["map", "--model", "cave.json", "--demonstration", "seen.csv"]).current_dir(files.0.path()).output();
     assert!(mapped.unwrap().status.success());
 }
+
+#[test]
+fn a_picture_shows_both_paths_or_the_alignment() {
+    let files = Files::new();
+    let arguments = |picture: &str| -> Vec<String> {
+        let model = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/figure-4/model.json");
+        let demonstration = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/figure-4/demonstration.json");
+        let arguments = ["map", "--model", model, "--demonstration", demonstration, "--picture", picture];
+        arguments.map(str::to_owned).to_vec()
+    };
+    let drawn = |name: &str, arguments: &[&str]| {
+        let drawn = etude(arguments).current_dir(files.0.path()).output().unwrap();
+        assert!(drawn.status.success(), "{}", text(&drawn.stderr));
+        std::fs::read_to_string(files.0.path().join(name)).unwrap()
+    };
+    let of_cave = arguments("cave.svg");
+    let of_cave: Vec<&str> = of_cave.iter().map(String::as_str).collect();
+    let has = |svg: &str, words: &str| svg.contains(&format!("\n{words}\n"));
+    let svg = drawn("cave.svg", &of_cave);
+    for words in
+        ["x", "y", "demonstrator", "imitator", "grab", "climb", "model: cost 48.2 = actions 7.2 + distance 41.0"]
+    {
+        assert!(has(&svg, words), "{words}");
+    }
+    let swapped = drawn("cave.svg", &[&of_cave[..], &["--picture-x", "y", "--picture-y", "gold"]].concat());
+    assert!(has(&swapped, "y") && has(&swapped, "gold") && !has(&swapped, "x"));
+
+    let seen = files.file("seen.csv", FORMS[0].1);
+    let of_corridor = ["map", "--model", "corridor.json", "--demonstration", &seen, "--picture", "corridor.svg"];
+    let svg = drawn("corridor.svg", &of_corridor);
+    for words in [
+        "observed",
+        "done",
+        "0 x=0 heading=east lit=true",
+        "1 x=1",
+        "on",
+        "start",
+        "match: an action, and the next observation",
+    ] {
+        assert!(has(&svg, words), "{words} is not in\n{svg}");
+    }
+    let told = files.told(&[&of_corridor[..], &["--picture-x", "lit"]].concat());
+    assert!(told.contains("--picture-x lit: \"lit\" is no number attribute; the model has \"x\""), "{told}");
+    let told = files.told(&[&of_corridor[..6], &["missing/corridor.svg"]].concat());
+    assert!(told.contains("cannot write missing/corridor.svg: No such file"), "{told}");
+}

@@ -9,8 +9,9 @@ const CORE: [&[&str]; 6] =
     [&["interrupt", "document"], &["attribute"], &["model"], &["mapping"], &["learning"], &["world"]];
 
 /// Modules of the service.
-const SERVICE: [&[&str]; 9] = [
-    &["clock", "memory", "telemetry", "experiment"],
+const SERVICE: [&[&str]; 10] = [
+    &["clock", "memory", "telemetry", "picture"],
+    &["experiment"],
     &["store"],
     &["service"],
     &["stream"],
