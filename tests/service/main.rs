@@ -14,6 +14,7 @@ mod oracle;
 #[path = "../../core/tests/suite/problems.rs"]
 mod problems;
 
+mod agreement;
 mod batch;
 mod contract;
 mod deletion;

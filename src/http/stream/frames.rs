@@ -22,6 +22,8 @@ pub(in crate::http) enum ClientFrameDocument {
         seq: u32,
         /// Observed states: objects, or arrays in attribute order.
         states: Vec<ObservationDocument>,
+        /// What a distance to each of these counts, at least 0, as many as there are states; `null`, or left out: what `open` says.
+        observation_weights: Option<Vec<Option<f64>>>,
     },
     /// The demonstration has ended.
     #[schema(title = "EndFrame")]
