@@ -1,19 +1,22 @@
 //! Mapping: the imitator's best way to follow a demonstration.
 //!
-//! A node is a pair `(i, s)` of an observation index and an imitator's state. A mapping starts at `(0, s_0)` at cost
-//! `D(o_0, s_0)`, ends at any `(n, s)`, and consists of these moves:
+//! A node is a pair `(i, s)` of an observation index and an imitator's state. A mapping starts at any `(0, s_0)`, with `s_0` among the
+//! start states, at cost `e_0 D(o_0, s_0)`, ends at any `(n, s)` at cost `w D(o_n, s)`, and consists of these moves:
 //!
 //! | move | from -> to | cost |
 //! |---|---|---|
-//! | `match` | action a: `(i, s) -> (i+1, s')` | `A(a) + D(o_{i+1}, s')` |
-//! | `extra` | action a: `(i, s) -> (i, s')` | `A(a) + D(o_i, s')` |
-//! | `skip` | no action: `(i, s) -> (i+1, s)` | `D(o_{i+1}, s)` |
+//! | `match` | action a: `(i, s) -> (i+1, s')` | `A(s, a, s') + e_{i+1} D(o_{i+1}, s')` |
+//! | `extra` | action a: `(i, s) -> (i, s')` | `A(s, a, s') + x e_i D(o_i, s')` |
+//! | `skip` | no action: `(i, s) -> (i+1, s)` | `e_{i+1} D(o_{i+1}, s)` |
+//!
+//! The weights of observations `e`, the part x of the distance that extra actions pay, and the weight w of the end are 1, 1 and 0 unless
+//! the [`Conditions`] say otherwise; `A` is what the transition costs itself, or else its action.
 //!
 //! That is dynamic time warping of a sequence against a walk in a graph (Gudla & Huber, "Cost-Based Policy Mapping for
 //! Imitation", FLAIRS 2003). Skipping everything is always possible, so a mapping always exists.
 //!
 //! ```text
-//! Problem (model, demonstration, weights, start)
+//! Problem (model, demonstration, weights, conditions)
 //!    |                     Projections (per model) --> Projected (per problem: distances, costs-to-go)
 //!    v                                                     |
 //! Mapper::map ---- search (layer by layer, best first) <---+
@@ -28,7 +31,7 @@
 //!
 //! | search | chosen when | why |
 //! |---|---|---|
-//! | `search::layered` | default heuristic; at most 65,536 nodes (observations times states); expansions allowed for twice as many, and memory for all | an expansion takes less than half of the time: figure 4 takes 13 microseconds rather than 24 |
+//! | `search::layered` | default heuristic; extra actions pay whole distances and ending is free; at most 65,536 nodes (observations times states); expansions allowed for twice as many, and memory for all | an expansion takes less than half of the time: figure 4 takes 13 microseconds rather than 24 |
 //! | `search::best_first` | default heuristic, in all other problems, also where states are found as it goes; and no heuristic, where it has no estimates | it looks at a small part of the nodes |
 //! | `search::sweep` | best first has expanded 65,536 nodes, or one in 16 if that is more, or memory is used up; all states are known | it takes a sixteenth of the time for a node and two bytes of memory |
 //! | `search::astar` | the paper's heuristic | that one is not consistent, and which of its mappings is found is part of what is reproduced |

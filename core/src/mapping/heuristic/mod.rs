@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 /// move does it fall by more than the move's cost; a search with it expands no node twice.
 pub(super) trait Heuristic {
     /// Estimated cost from the node of `observation` and the state with this row to the end. At least 0; 0 at the last
-    /// observation.
+    /// observation if ending is free.
     fn cost_to_go(&self, observation: usize, row: &[u32]) -> f64;
 
     /// How much work an estimate for a node at `observation` is, in looks at a distance. At least 1.

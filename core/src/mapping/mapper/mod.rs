@@ -154,8 +154,8 @@ impl Mapper {
     }
 
     /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the
-    /// search by default. Consistent, for nodes that the start leads to; 0 at the last observation. For other searches, and to
-    /// look at.
+    /// search by default. Consistent, for nodes that the start states lead to; 0 at the last observation if ending is free. For other
+    /// searches, and to look at.
     ///
     /// # Panics
     ///
