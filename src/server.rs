@@ -20,7 +20,7 @@ use crate::config::ServeConfig;
 use crate::http::{self, Access, ConnectionLimits, Context};
 use crate::memory::Memory;
 use crate::service::Etude;
-use crate::service::StoreError;
+use crate::service::ServiceError;
 use crate::stream::Rooms;
 use crate::telemetry;
 
@@ -49,7 +49,7 @@ pub enum ServerError {
         database: String,
         /// Why not.
         #[source]
-        source: StoreError,
+        source: ServiceError,
     },
     /// Measurements cannot be set up.
     #[error("cannot set up measurements")]

@@ -229,7 +229,7 @@ async fn with_database<T>(
         Use::Read => Etude::open_to_read(&settings, &tasks).await,
         Use::Write => Etude::open(&settings, &tasks, CancellationToken::new()).await,
     };
-    let etude = etude.map_err(crate::service::ServiceError::from)?;
+    let etude = etude?;
     let done = work(&etude).await;
     etude.close().await;
     tasks.close();

@@ -10,7 +10,7 @@ use utoipa_swagger_ui::{Config, SwaggerUi};
 
 use super::SharedContext;
 use super::problem::{Problem, ProblemKind};
-use crate::service::StoreError;
+use crate::service::ServiceError;
 
 /// Whether the process is alive.
 #[utoipa::path(
@@ -37,7 +37,7 @@ pub(super) async fn readyz(State(context): State<SharedContext>) -> Result<&'sta
     context.etude.check().await.map_err(|error| {
         tracing::warn!(error = &error as &dyn std::error::Error, "not ready");
         match error {
-            StoreError::Unavailable(_) => error.into(),
+            ServiceError::Unavailable(_) => error.into(),
             _ => Problem::new(ProblemKind::NotReady, "the database does not answer, or nothing can be written to it"),
         }
     })?;

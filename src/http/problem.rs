@@ -12,8 +12,7 @@ use utoipa::{IntoResponses, ToSchema};
 use super::encoding::{BodyError, Encoding};
 use super::request_id::RequestId;
 use crate::memory::NoRoom;
-use crate::service::{self, Kind, PoolError, ServiceError};
-use crate::service::{StoreError, Unavailable};
+use crate::service::{self, Kind, Outage, OutageKind, PoolError, ServiceError};
 use etude_core::document::{Fault, Faults, ParseError};
 
 /// What kind of problem it is: its `type`, title and status.
@@ -296,12 +295,6 @@ impl From<Faults> for Problem {
     }
 }
 
-impl From<StoreError> for Problem {
-    fn from(error: StoreError) -> Self {
-        ServiceError::from(error).into()
-    }
-}
-
 impl From<ServiceError> for Problem {
     fn from(error: ServiceError) -> Self {
         let detail = error.to_string();
@@ -333,17 +326,14 @@ impl From<ServiceError> for Problem {
             ServiceError::Pool(PoolError::Busy) | ServiceError::NoRoom(_) | ServiceError::Compiling { .. } => {
                 Self::new(ProblemKind::Busy, detail)
             }
-            ServiceError::Store(StoreError::Unavailable(Unavailable::Full)) => {
+            ServiceError::Unavailable(Outage { kind: OutageKind::Full, .. }) => {
                 Self::new(ProblemKind::StorageFull, detail)
             }
-            ServiceError::Store(StoreError::Unavailable(_) | StoreError::Lost) => {
-                Self::new(ProblemKind::NotReady, detail)
-            }
-            ServiceError::Store(StoreError::Closed) | ServiceError::Pool(PoolError::Stopped) => {
-                Self::new(ProblemKind::Stopping, detail)
-            }
+            ServiceError::Unavailable(_) | ServiceError::Lost => Self::new(ProblemKind::NotReady, detail),
+            ServiceError::Closed | ServiceError::Pool(PoolError::Stopped) => Self::new(ProblemKind::Stopping, detail),
             ServiceError::Pool(PoolError::Panicked)
-            | ServiceError::Store(_)
+            | ServiceError::Storage(_)
+            | ServiceError::Removed
             | ServiceError::Unreadable { .. }
             | ServiceError::Write(_)
             | ServiceError::WritePolicy(_) => {

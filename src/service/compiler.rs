@@ -26,7 +26,7 @@ use super::pool::Admission;
 use super::{Client, Etude, PipeWriter, PoolError, SearchPool, ServiceError, Settings, pipe};
 use crate::clock::Clock;
 use crate::memory::{Held, Memory, NoRoom};
-use crate::store::{ModelKey, ModelSize, ModelSummary, Store, StoreError, StoredDefinition};
+use crate::store::{ModelKey, ModelSize, ModelSummary, Store, StoredDefinition};
 use etude_core::document::Faults;
 use etude_core::interrupt::{Interrupt, Interrupted, Signal};
 use etude_core::mapping::Mapper;
@@ -207,7 +207,7 @@ impl Compiler {
         let (mapper, fed) = tokio::join!(compile, OptionFuture::from(feed));
         match fed {
             // It was deleted meanwhile.
-            Some(Err(ServiceError::Store(StoreError::Removed))) => return Err(unknown()),
+            Some(Err(ServiceError::Removed)) => return Err(unknown()),
             Some(Err(error)) => return Err(error),
             Some(Ok(())) | None => {}
         }
@@ -231,14 +231,10 @@ fn shared(error: &ServiceError, name: &str, pointer: &'static str) -> ServiceErr
         ServiceError::Faults(faults) => faults.clone().into(),
         ServiceError::Pool(error) => (*error).into(),
         ServiceError::NoRoom(error) => (*error).into(),
-        ServiceError::Store(StoreError::Unavailable(error)) => StoreError::from(*error).into(),
-        ServiceError::Store(StoreError::Closed) => StoreError::Closed.into(),
-        ServiceError::Store(StoreError::Database(error)) => {
-            StoreError::Database(sqlx::Error::Protocol(error.to_string())).into()
-        }
-        ServiceError::Store(StoreError::Corrupt { source, .. }) | ServiceError::Unreadable { source, .. } => {
-            corrupt_definition(name, source.to_string().into())
-        }
+        ServiceError::Unavailable(outage) => ServiceError::Unavailable(outage.clone()),
+        ServiceError::Closed => ServiceError::Closed,
+        ServiceError::Storage(error) => ServiceError::Storage(Arc::clone(error)),
+        ServiceError::Unreadable { source, .. } => corrupt_definition(name, source.to_string().into()),
         // Compiling fails in no other way.
         error => corrupt_definition(name, error.to_string().into()),
     }

@@ -1,8 +1,11 @@
 //! The errors of the service, by what the caller can do about them.
 
+use std::error::Error;
+use std::sync::Arc;
+
 use super::{Kind, PoolError};
 use crate::memory::NoRoom;
-use crate::store::StoreError;
+use crate::store::{StoreError, Unavailable};
 use etude_core::document::{Faults, ParseError, Quoted};
 use etude_core::mapping::WriteError;
 
@@ -105,21 +108,33 @@ pub enum ServiceError {
         /// The model.
         name: String,
     },
-    /// The store failed.
+    /// What is durable cannot be used now.
     #[error(transparent)]
-    Store(StoreError),
-    /// What the store holds cannot be read as what was stored.
-    #[error("table {table} holds an invalid {column} in the row of {row:?}")]
+    Unavailable(Outage),
+    /// Some of what was sent was lost meanwhile; sent once more, it may go through.
+    #[error("what was stored so far was removed meanwhile; send it again")]
+    Lost,
+    /// What is read was deleted while it was.
+    #[error("it was removed while it was read")]
+    Removed,
+    /// The service is shutting down, and stores nothing more.
+    #[error("the store takes no more writes")]
+    Closed,
+    /// What is durable cannot be used, for a reason that only its operator can do something about.
+    #[error(transparent)]
+    Storage(Arc<dyn Error + Send + Sync>),
+    /// What is durable cannot be read as what was stored.
+    #[error("table {table} holds an invalid {column}{}", of_row(row.as_deref()))]
     Unreadable {
         /// Where.
         table: &'static str,
-        /// In which column.
+        /// Of what.
         column: &'static str,
-        /// In which row, by its name or id.
-        row: String,
+        /// Of which name or id, if that is known.
+        row: Option<String>,
         /// What is wrong with it.
         #[source]
-        source: Box<dyn std::error::Error + Send + Sync>,
+        source: Box<dyn Error + Send + Sync>,
     },
     /// What was made could not be written as JSON: a defect.
     #[error("an answer could not be written")]
@@ -127,6 +142,42 @@ pub enum ServiceError {
     /// A policy could not be written: a defect.
     #[error("a policy could not be written")]
     WritePolicy(#[from] WriteError),
+}
+
+/// Why what is durable cannot be used now, though nothing is wrong with what was asked. Later it may go through.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{detail}")]
+pub struct Outage {
+    /// What kind it is.
+    pub kind: OutageKind,
+    /// What is the matter, in words.
+    detail: String,
+}
+
+/// What those who wait can expect of an outage.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OutageKind {
+    /// No room is left. What is there can be read.
+    Full,
+    /// It takes too long, or somebody else holds it: it may be over soon.
+    Slow,
+    /// Nothing can be written before somebody mends it.
+    Broken,
+}
+
+impl From<Unavailable> for Outage {
+    fn from(unavailable: Unavailable) -> Self {
+        let kind = match unavailable {
+            Unavailable::Full => OutageKind::Full,
+            Unavailable::Locked | Unavailable::Slow => OutageKind::Slow,
+            Unavailable::ReadOnly | Unavailable::Failing { .. } | Unavailable::Gone => OutageKind::Broken,
+        };
+        Self { kind, detail: unavailable.to_string() }
+    }
+}
+
+fn of_row(row: Option<&str>) -> String {
+    row.map(|row| format!(" in the row of {row:?}")).unwrap_or_default()
 }
 
 fn mismatch(name: &str, existing_hash: Option<&str>) -> String {
@@ -144,9 +195,9 @@ impl ServiceError {
         table: &'static str,
         column: &'static str,
         row: impl Into<String>,
-        source: impl Into<Box<dyn std::error::Error + Send + Sync>>,
+        source: impl Into<Box<dyn Error + Send + Sync>>,
     ) -> Self {
-        Self::Unreadable { table, column, row: row.into(), source: source.into() }
+        Self::Unreadable { table, column, row: Some(row.into()), source: source.into() }
     }
 }
 
@@ -154,7 +205,12 @@ impl From<StoreError> for ServiceError {
     fn from(error: StoreError) -> Self {
         match error {
             StoreError::NoRoom(no_room) => Self::NoRoom(no_room),
-            error => Self::Store(error),
+            StoreError::Unavailable(unavailable) => Self::Unavailable(unavailable.into()),
+            StoreError::Lost => Self::Lost,
+            StoreError::Removed => Self::Removed,
+            StoreError::Closed => Self::Closed,
+            StoreError::Corrupt { table, column, row, source } => Self::Unreadable { table, column, row, source },
+            error => Self::Storage(Arc::new(error)),
         }
     }
 }

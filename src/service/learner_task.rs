@@ -12,7 +12,6 @@ use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
 use super::{Etude, ServiceError};
-use crate::store::StoreError;
 
 impl Etude {
     /// Folds pending rewards into the weights of their learners, `every` so often, until `stopping` is cancelled.
@@ -31,7 +30,7 @@ impl Etude {
             }
             match self.learn_all(self.clock.now()).await {
                 // The writer has told of it, once.
-                Ok(()) | Err(ServiceError::Store(StoreError::Unavailable(_))) => {}
+                Ok(()) | Err(ServiceError::Unavailable(_)) => {}
                 Err(error) => tracing::error!(error = &error as &dyn std::error::Error, "learning failed"),
             }
         }
@@ -44,7 +43,7 @@ impl Etude {
                 // Deleted since.
                 Ok(_) | Err(ServiceError::Unknown { .. }) => {}
                 // The others would fare no better.
-                Err(error @ ServiceError::Store(StoreError::Unavailable(_))) => return Err(error),
+                Err(error @ ServiceError::Unavailable(_)) => return Err(error),
                 // What is wrong with one learner is no concern of the others. What is pending stays pending, and is tried again.
                 Err(error) => {
                     tracing::error!(

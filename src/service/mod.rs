@@ -41,7 +41,7 @@ use jiff::{Timestamp, Unit};
 pub use batch::{MAX_BATCH_ITEMS, MadePolicies};
 pub use caller::{Caller, Client};
 pub use definitions::{DefinitionReader, ModelText, OpenText};
-pub use error::ServiceError;
+pub use error::{Outage, OutageKind, ServiceError};
 pub use hash::hash_of;
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, Registered};
@@ -64,7 +64,7 @@ pub(crate) use crate::store::PIECE_BYTES;
 use crate::store::Store;
 pub use crate::store::{
     AcceptedReward, ModelSummary, Page, PolicyFilter, Replaces, SessionFilter, SessionRecord, SessionStatus,
-    StoreError, TrialStatus, Unavailable,
+    TrialStatus,
 };
 use cache::ModelNames;
 use compiler::Compiler;
@@ -164,7 +164,11 @@ impl Etude {
     /// # Errors
     ///
     /// If the database cannot be opened.
-    pub async fn open(settings: &Settings, tasks: &TaskTracker, abort: CancellationToken) -> Result<Self, StoreError> {
+    pub async fn open(
+        settings: &Settings,
+        tasks: &TaskTracker,
+        abort: CancellationToken,
+    ) -> Result<Self, ServiceError> {
         Ok(Self::with(Store::open_alone(&settings.database, tasks).await?, settings, tasks, abort))
     }
 
@@ -173,7 +177,7 @@ impl Etude {
     /// # Errors
     ///
     /// If the database cannot be opened, or has the schema of an earlier version.
-    pub async fn open_to_read(settings: &Settings, tasks: &TaskTracker) -> Result<Self, StoreError> {
+    pub async fn open_to_read(settings: &Settings, tasks: &TaskTracker) -> Result<Self, ServiceError> {
         let store = Store::open_to_read(&settings.database, tasks).await?;
         Ok(Self::with(store, settings, tasks, CancellationToken::new()))
     }
@@ -206,8 +210,8 @@ impl Etude {
     /// # Errors
     ///
     /// If not.
-    pub async fn check(&self) -> Result<(), StoreError> {
-        self.store.check(&self.clock, self.alive_every()).await
+    pub async fn check(&self) -> Result<(), ServiceError> {
+        Ok(self.store.check(&self.clock, self.alive_every()).await?)
     }
 
     /// Begins to serve at `now`: time since the service was last alive does not count for open sessions, and what a killed service has
@@ -216,10 +220,10 @@ impl Etude {
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn begin(&self, now: Timestamp) -> Result<(), StoreError> {
+    pub async fn begin(&self, now: Timestamp) -> Result<(), ServiceError> {
         match self.note_alive(now).await {
-            Ok(()) => self.store.sweep_left_behind().await,
-            Err(StoreError::Unavailable(_)) => Ok(()),
+            Ok(()) => Ok(self.store.sweep_left_behind().await?),
+            Err(ServiceError::Unavailable(_)) => Ok(()),
             Err(error) => Err(error),
         }
     }
@@ -229,8 +233,8 @@ impl Etude {
     /// # Errors
     ///
     /// If it cannot be written.
-    pub async fn note_alive(&self, now: Timestamp) -> Result<(), StoreError> {
-        self.store.note_alive(now, self.alive_every()).await
+    pub async fn note_alive(&self, now: Timestamp) -> Result<(), ServiceError> {
+        Ok(self.store.note_alive(now, self.alive_every()).await?)
     }
 
     /// Closes the store. Whoever still asks for something gets an error.

@@ -230,8 +230,12 @@ impl Etude {
 fn is_passing(error: &ServiceError) -> bool {
     match error {
         ServiceError::Pool(error) => *error != PoolError::Panicked,
-        ServiceError::NoRoom(_) => true,
-        ServiceError::Store(error) => !matches!(error, StoreError::Corrupt { .. }),
+        ServiceError::NoRoom(_)
+        | ServiceError::Unavailable(_)
+        | ServiceError::Storage(_)
+        | ServiceError::Closed
+        | ServiceError::Lost
+        | ServiceError::Removed => true,
         _ => false,
     }
 }

@@ -3,7 +3,7 @@
 use std::error::Error;
 
 use super::frames::StreamProblem;
-use crate::service::{PoolError, ServiceError, SessionError, StoreError, Unavailable};
+use crate::service::{Outage, OutageKind, PoolError, ServiceError, SessionError};
 
 /// Why a connection ended: a websocket close code.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -86,19 +86,19 @@ pub(super) fn ends(error: &SessionError) -> Over {
         SessionError::Service(ServiceError::Unknown { kind, .. }) => {
             Over::because(Closed::Unknown, StreamProblem::new(&format!("unknown-{}", kind.name()), detail))
         }
-        SessionError::Service(ServiceError::Pool(PoolError::Stopped) | ServiceError::Store(StoreError::Closed)) => {
+        SessionError::Service(ServiceError::Pool(PoolError::Stopped) | ServiceError::Closed) => {
             Over::because(Closed::GoingAway, StreamProblem::new("stopping", detail))
         }
         SessionError::Service(
             ServiceError::Pool(PoolError::Busy)
             | ServiceError::NoRoom(_)
             | ServiceError::Compiling { .. }
-            | ServiceError::Store(StoreError::Unavailable(Unavailable::Locked | Unavailable::Slow)),
+            | ServiceError::Unavailable(Outage { kind: OutageKind::Slow, .. }),
         ) => Over::because(Closed::Overloaded, StreamProblem::new("overloaded", detail)),
-        SessionError::Service(ServiceError::Store(StoreError::Unavailable(Unavailable::Full))) => {
+        SessionError::Service(ServiceError::Unavailable(Outage { kind: OutageKind::Full, .. })) => {
             Over::because(Closed::Failed, StreamProblem::new("storage-full", detail))
         }
-        SessionError::Service(ServiceError::Store(StoreError::Unavailable(_))) => {
+        SessionError::Service(ServiceError::Unavailable(_)) => {
             Over::because(Closed::Failed, StreamProblem::new("not-ready", detail))
         }
         SessionError::Service(_) => {
