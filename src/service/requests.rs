@@ -28,6 +28,9 @@ use etude_core::model::Model;
 /// Where a request has its demonstration.
 pub(super) const DEMONSTRATION: Path<'static> = Path::Member(&Path::Root, "demonstration");
 
+/// Where a frame has the states that were observed.
+pub(super) const STATES: Path<'static> = Path::Member(&Path::Root, "states");
+
 /// Text up to this size takes little once it is parsed, whatever is in it: some 300 KiB.
 const MAX_UNCOUNTED_TEXT_BYTES: usize = 4096;
 

@@ -2,7 +2,7 @@
 
 use std::error::Error;
 
-use super::frames::StreamProblem;
+use super::problem::StreamProblem;
 use crate::service::{Outage, OutageKind, PoolError, ServiceError, SessionError};
 
 /// Why a connection ended: a websocket close code.

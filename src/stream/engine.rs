@@ -8,8 +8,9 @@ use tokio_util::bytes::Bytes;
 use tokio_util::sync::CancellationToken;
 
 use super::closing::{Closed, Over, ends, not_allowed};
-use super::frames::{ClientFrame, HelloLimits, ServerFrame, StreamProblem, WriteError};
+use super::frames::{ClientFrame, HelloLimits, ServerFrame, WriteError};
 use super::limits::Limits;
+use super::problem::StreamProblem;
 use super::queue::{Gone, Receiver, Sender, Weighed};
 use super::room::{Crowded, SMALL_FRAME_BYTES, Taken};
 use crate::service::{
@@ -224,7 +225,8 @@ impl Connection<'_> {
                 };
                 // Nobody waits for a search with what it does not need.
                 drop((frame, memory));
-                let frame = ServerFrame::Received { seq: session.n_received() };
+                let warnings = session.news(seq);
+                let frame = ServerFrame::Received { seq: session.n_received(), warnings: &warnings };
                 send(self.outgoing, self.limits, &frame).await?;
                 let steps = match received {
                     Received::Mapped(steps) => steps,

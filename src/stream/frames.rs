@@ -6,10 +6,11 @@ use serde::Serialize;
 use serde_json::Value;
 use utoipa::ToSchema;
 
+use super::problem::StreamProblem;
 use crate::service::SessionPolicy;
 use etude_core::attribute::{ByAttribute, Scalar};
-use etude_core::document::{Fault, Faults, Place};
-use etude_core::mapping::{CommittedStep, Cost, MoveKind, PolicyEnd, Status, Step};
+use etude_core::document::{Faults, Place};
+use etude_core::mapping::{CommittedStep, Cost, MoveKind, PolicyEnd, Status, Step, Warning};
 
 /// What a client sends.
 #[derive(Clone, Debug, PartialEq)]
@@ -133,6 +134,10 @@ pub enum ServerFrame<'f> {
     Received {
         /// How many.
         seq: u32,
+        /// What there is to warn of for the first time; left out if there is nothing. Places are those in the frame that was received.
+        #[serde(skip_serializing_if = "<[_]>::is_empty")]
+        #[schema(required = false)]
+        warnings: &'f [Warning],
     },
     /// A step that will not be revised.
     #[schema(title = "StepFrame")]
@@ -148,6 +153,8 @@ pub enum ServerFrame<'f> {
         cost: Cost,
         /// How it ends: whether it succeeded.
         end: &'f PolicyEnd,
+        /// What was observed and can hardly be meant, each kind once for an attribute. Places are those in all states of the session.
+        warnings: &'f [Warning],
         /// Its actions, in order; `None` where they are left out, as the frame would be too long.
         #[serde(skip_serializing_if = "Option::is_none")]
         #[schema(value_type = Vec<String>, required = false)]
@@ -183,7 +190,7 @@ pub enum WriteError {
 }
 
 impl ServerFrame<'_> {
-    /// Its JSON, of at most `max_bytes`. Where it would take more, a policy's actions, or faults beyond the first ones, are left out.
+    /// Its JSON, of at most `max_bytes`. Where it would take more, a policy's actions, or faults and warnings beyond the first ones, are left out.
     ///
     /// # Errors
     ///
@@ -191,9 +198,16 @@ impl ServerFrame<'_> {
     pub fn text_within(&self, max_bytes: usize) -> Result<String, WriteError> {
         let written = write_within(self, max_bytes);
         match (self, written) {
-            (Self::Done { actions: Some(_), policy_id, status, cost, end }, Err(WriteError::TooLong)) => {
-                let shorter = Self::Done { actions: None, policy_id: *policy_id, status: *status, cost: *cost, end };
-                write_within(&shorter, max_bytes)
+            (Self::Done { policy_id, status, cost, end, warnings, actions }, Err(WriteError::TooLong))
+                if actions.is_some() || !warnings.is_empty() =>
+            {
+                // Actions first.
+                let warnings = if actions.is_some() { warnings } else { &warnings[..warnings.len() / 2] };
+                let (policy_id, status, cost) = (*policy_id, *status, *cost);
+                Self::Done { policy_id, status, cost, end, warnings, actions: None }.text_within(max_bytes)
+            }
+            (Self::Received { seq, warnings }, Err(WriteError::TooLong)) if !warnings.is_empty() => {
+                Self::Received { seq: *seq, warnings: &warnings[..warnings.len() / 2] }.text_within(max_bytes)
             }
             (Self::Error { problem }, Err(WriteError::TooLong)) if !problem.errors.is_empty() => {
                 let errors = problem.errors[..problem.errors.len() / 2].to_vec();
@@ -305,40 +319,8 @@ impl<'f> From<&'f CommittedStep> for StepFrame<'f> {
 
 impl<'f> From<&'f SessionPolicy> for ServerFrame<'f> {
     fn from(policy: &'f SessionPolicy) -> Self {
-        let SessionPolicy { id, status, cost, end, actions } = policy;
-        Self::Done { policy_id: id.as_deref(), status: *status, cost: *cost, end, actions: Some(actions) }
-    }
-}
-
-/// What is wrong, as in HTTP but for what only HTTP has.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, ToSchema)]
-pub struct StreamProblem {
-    /// `/problems/` and what kind of problem it is.
-    #[serde(rename = "type")]
-    pub kind: String,
-    /// What happened.
-    pub detail: String,
-    /// Every fault of the frame, with its place.
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    #[schema(required = false)]
-    pub errors: Vec<Fault>,
-}
-
-impl StreamProblem {
-    /// A problem of the kind `slug`.
-    #[must_use]
-    pub fn new(slug: &str, detail: impl Into<String>) -> Self {
-        Self { kind: format!("/problems/{slug}"), detail: detail.into(), errors: Vec::new() }
-    }
-
-    /// A problem of the kind `slug` that consists of faults.
-    #[must_use]
-    pub fn of(slug: &str, faults: &Faults) -> Self {
-        let detail = match faults.listed() {
-            [fault] => fault.detail.clone(),
-            _ => format!("{} faults", faults.count()),
-        };
-        Self { errors: faults.listed().to_vec(), ..Self::new(slug, detail) }
+        let SessionPolicy { id, status, cost, end, warnings, actions } = policy;
+        Self::Done { policy_id: id.as_deref(), status: *status, cost: *cost, end, warnings, actions: Some(actions) }
     }
 }
 
@@ -347,20 +329,33 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
+    use etude_core::document::Fault;
 
     #[test]
     fn a_frame_that_would_be_too_long_leaves_out_what_can_be_had_otherwise() {
         let actions: Vec<Arc<str>> = vec!["forward".into(); 100];
         let cost = Cost { total: 0.0, actions: 0.0, distance: 0.0, end: 0.0 };
         let end = PolicyEnd { distance: 1.0, distance_by_attribute: [("x".into(), 1.0)].into_iter().collect() };
-        let done =
-            |actions| ServerFrame::Done { policy_id: Some("7"), status: Status::Local, cost, end: &end, actions };
+        let done = |actions| ServerFrame::Done {
+            policy_id: Some("7"),
+            status: Status::Local,
+            cost,
+            end: &end,
+            warnings: &[],
+            actions,
+        };
         let (done, without) = (done(Some(&actions[..])), done(None));
         let whole = serde_json::to_string(&done).unwrap();
         assert_eq!(done.text_within(whole.len()).unwrap(), whole);
         let shorter = done.text_within(whole.len() - 1).unwrap();
         assert_eq!(shorter, serde_json::to_string(&without).unwrap());
         assert!(matches!(done.text_within(shorter.len() - 1), Err(WriteError::TooLong)));
+
+        let warning = |n| Warning { pointer: format!("/states/{n}/door"), detail: "x".repeat(1000) };
+        let warnings: Vec<_> = (0..100).map(warning).collect();
+        let received = ServerFrame::Received { seq: 7, warnings: &warnings }.text_within(10_000).unwrap();
+        let told: Value = serde_json::from_str(&received).unwrap();
+        assert_eq!((&told["seq"], told["warnings"].as_array().unwrap().len()), (&serde_json::json!(7), 6));
 
         let faults = (0..1000).map(|n| Fault { line: None, pointer: format!("/states/{n}"), detail: "far".to_owned() });
         let problem = StreamProblem { errors: faults.collect(), ..StreamProblem::new("invalid", "1000 faults") };

@@ -15,6 +15,7 @@ mod closing;
 mod engine;
 pub mod frames;
 mod limits;
+pub mod problem;
 mod queue;
 mod room;
 

@@ -301,7 +301,8 @@ impl Problem<'_> {
             return None;
         }
         // Whichever start it is of: what does not stay there pays an action, and the least distances at least.
-        let row = self.starts.iter(self.model).find(|(state, _)| *state == self.closest_start())?.1;
+        let closest = self.closest_start();
+        let row = self.starts.iter(self.model).find(|(state, _)| *state == closest)?.1;
         let end_weight = self.conditions.end_weight;
         let mut gain =
             self.end_cost(row) - end_weight * self.least_distance(self.demonstration.observation(self.last()));

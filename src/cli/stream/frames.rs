@@ -10,18 +10,32 @@ use crate::cli::input::Spot;
 use crate::cli::options::faulty;
 use etude_core::attribute::{ByAttribute, Scalar};
 use etude_core::document::Fault;
-use etude_core::mapping::{Cost, MoveKind, Status};
+use etude_core::mapping::{Cost, MoveKind, Status, Warning};
 
 /// A frame of the server.
 #[derive(Debug, Deserialize)]
 #[serde(tag = "type", rename_all = "lowercase")]
 pub(in crate::cli) enum Frame {
     Hello,
-    Opened { session: String, weights: ByAttribute<f64>, received: u32 },
-    Received { seq: u32 },
+    Opened {
+        session: String,
+        weights: ByAttribute<f64>,
+        received: u32,
+    },
+    Received {
+        seq: u32,
+    },
     Step(StepFrame),
-    Done { policy_id: Option<String>, status: Status, cost: Cost },
-    Error { problem: Problem },
+    Done {
+        policy_id: Option<String>,
+        status: Status,
+        cost: Cost,
+        #[serde(default)]
+        warnings: Vec<Warning>,
+    },
+    Error {
+        problem: Problem,
+    },
 }
 
 /// A committed step.

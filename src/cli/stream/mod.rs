@@ -31,9 +31,9 @@ use super::{CliError, client as http, runtime};
 use crate::config::parse_whole;
 use crate::stream::frames::ServerFrame;
 use etude_core::attribute::AttributeDocument;
-use etude_core::document::{Faults, Place};
+use etude_core::document::{Faults, Path, Place};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Options, RequestKind};
+use etude_core::mapping::{CommittedStep, Demonstration, Mapper, OnlineMapping, Options, RequestKind, Watch};
 
 #[derive(Args, Debug)]
 pub(super) struct Stream {
@@ -113,6 +113,7 @@ impl Stream {
 
         let weights = options.weights_over(schema.weights());
         printer.weights = Some(schema.by_attribute(weights.as_slice().iter().copied()));
+        let mut watch = Watch::new(&weights);
         let mut online = OnlineMapping::new(&mapper, weights, options.conditions(), options.lookahead);
         let mut actions = Vec::new();
         let mut print = |printer: &mut Printer<'_, _>, steps: &[CommittedStep]| {
@@ -133,7 +134,9 @@ impl Stream {
                 let told = faults.listed().iter().map(|fault| spot.tell(&fault.pointer, &fault.detail));
                 faulty(told.collect(), faults.count() - faults.listed().len())
             };
-            let steps = online.observe(&faults.check(read).map_err(told)?, None, &mut Uninterrupted)?;
+            let observed = faults.check(read).map_err(told)?;
+            watch.observe(mapper.model(), online.n_observed() as usize, &observed);
+            let steps = online.observe(&observed, None, &mut Uninterrupted)?;
             printer.received(online.n_observed());
             print(printer, &steps)?;
         }
@@ -144,6 +147,7 @@ impl Stream {
             status: mapping.status,
             cost: mapping.cost,
             end: &mapping.end,
+            warnings: &watch.warnings(mapper.model(), &Path::Member(&Path::Root, "states")),
             actions: Some(&actions),
         };
         printer.frame(&text_of(&done)?).map(drop)

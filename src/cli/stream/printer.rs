@@ -10,6 +10,7 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use super::frames::{Frame, Problem, StepFrame};
 use crate::cli::{CliError, render};
 use etude_core::attribute::{ByAttribute, Scalar};
+use etude_core::mapping::Warning;
 
 /// What a frame was, once it was printed.
 pub(super) enum Answer {
@@ -101,7 +102,7 @@ impl<'o, W: Write> Printer<'o, W> {
                 self.line(&line)?;
                 Answer::Step
             }
-            Frame::Done { policy_id, status, cost } => {
+            Frame::Done { policy_id, status, cost, warnings } => {
                 let line = if self.is_json {
                     text.to_owned()
                 } else {
@@ -109,6 +110,14 @@ impl<'o, W: Write> Printer<'o, W> {
                     format!("{}status    {}{policy}", render::cost(&cost), status.name())
                 };
                 self.line(&line)?;
+                for Warning { pointer, detail } in warnings {
+                    if self.is_json {
+                        // Those who read the output by a program see it here.
+                        self.progress.suspend(|| writeln!(std::io::stderr(), "warning: {pointer}: {detail}"))?;
+                    } else {
+                        self.line(&format!("warning   {pointer}: {detail}"))?;
+                    }
+                }
                 Answer::Done
             }
             Frame::Error { problem } => Answer::Error { problem },

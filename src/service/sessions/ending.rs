@@ -4,17 +4,18 @@ use std::sync::Arc;
 
 use etude_core::attribute::Weights;
 use etude_core::mapping::{
-    Conditions, Cost, Mapper, Mapping, OnlineMapping, Policy, PolicyEnd, Problem, Stamp, Status, WrittenPolicy,
+    Conditions, Cost, Mapper, Mapping, OnlineMapping, Policy, PolicyEnd, Problem, Stamp, Status, Warning, WrittenPolicy,
 };
 use etude_core::model::Model;
 
+use super::SessionError;
 use super::committed::CommittedSteps;
-use super::{SessionError, read_stored};
+use super::reading::read_stored;
 use crate::clock::Clock;
 use crate::memory::{Memory, NoRoom};
 use crate::service::ServiceError;
 use crate::service::refined::RefinedRequest;
-use crate::service::requests::DEMONSTRATION;
+use crate::service::requests::{DEMONSTRATION, STATES};
 use crate::service::search::{PolicyText, as_micros, report};
 use crate::store::NewRefinement;
 
@@ -38,16 +39,18 @@ pub struct SessionPolicy {
     pub cost: Cost,
     /// How it ends.
     pub end: PolicyEnd,
+    /// What was observed and can hardly be meant. Places are those in all states of the session.
+    pub warnings: Vec<Warning>,
     /// Its actions, in order.
     pub actions: Vec<Arc<str>>,
 }
 
 impl SessionPolicy {
     /// The policy of `mapping`, which must be of `model`.
-    pub(super) fn of(id: Option<String>, model: &Model, mapping: &Mapping) -> Self {
+    pub(super) fn of(id: Option<String>, model: &Model, mapping: &Mapping, warnings: Vec<Warning>) -> Self {
         let actions = mapping.moves.iter().filter_map(|step| step.action);
         let actions = actions.map(|action| model.action_name(action)).collect();
-        Self { id, status: mapping.status, cost: mapping.cost, end: mapping.end.clone(), actions }
+        Self { id, status: mapping.status, cost: mapping.cost, end: mapping.end.clone(), warnings, actions }
     }
 
     /// Most bytes that it takes if it has so many steps.
@@ -97,7 +100,7 @@ pub(super) fn conclude(
     let warnings = problem.warnings(&DEMONSTRATION);
     let stamp = Stamp { elapsed_us: as_micros(clock.elapsed(started)), warnings, ..stamp };
     report(&stamp, &mapping);
-    let policy = SessionPolicy::of(stamp.id.clone(), mapper.model(), &mapping);
+    let policy = SessionPolicy::of(stamp.id.clone(), mapper.model(), &mapping, problem.warnings(&STATES));
     let written = WrittenPolicy::new(&stamp, &problem, &mapping).map_err(ServiceError::from)?;
     let refinement = (mapping.status == Status::Local)
         .then(|| RefinedRequest::of(&stamp.model, &problem, mapping.cost).waiting(&stamp, Some(id)));

@@ -6,6 +6,7 @@
 mod committed;
 mod ending;
 mod error;
+mod reading;
 mod session;
 
 use std::num::NonZeroU32;
@@ -19,6 +20,7 @@ use tokio_util::sync::CancellationToken;
 pub use committed::CommittedSteps;
 pub use ending::{Ended, SessionPolicy};
 pub use error::SessionError;
+use reading::read_again;
 use session::Source;
 pub use session::{Observation, Received, RewardState, Session};
 
@@ -33,7 +35,7 @@ use crate::store::{
 use etude_core::attribute::{ByAttribute, Schema, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, time_until_finish};
-use etude_core::mapping::{Budget, Demonstration, Mapper, OnlineMapping, RequestKind};
+use etude_core::mapping::{Budget, Demonstration, OnlineMapping, RequestKind, Warning, Watch};
 use etude_core::model::Model;
 
 /// A session that was resumed.
@@ -116,12 +118,13 @@ impl Etude {
             model,
             model_hash,
             mapper,
-            weights,
             lookahead,
             conditions,
             source,
             n_received: 0,
             n_steps: 0,
+            watch: Watch::new(&weights),
+            weights,
             online,
             held: self.memory.try_take(0).map_err(ServiceError::from)?,
             client: caller.client,
@@ -177,6 +180,7 @@ impl Etude {
             source: Source { learner: row.learner, weights_version: row.weights_version, trial_id: row.trial_id },
             n_received: row.n_observations,
             n_steps: 0,
+            watch: Watch::new(&weights),
             online: Some(OnlineMapping::new(&mapper, weights, row.conditions, lookahead)),
             mapper,
             held: self.memory.try_take(0).map_err(ServiceError::from)?,
@@ -184,37 +188,35 @@ impl Etude {
             owner: row.owner,
             ownership,
         };
-        let mut steps = CommittedSteps::default();
+        let (mut steps, mut warnings) = (CommittedSteps::default(), Vec::new());
+        let is_done = row.status == SessionStatus::Done;
         if session.n_received > 0 {
             let (texts, _held) =
                 self.stored_observations(&session.id, session.n_received, session.mapper.model()).await?;
             let reading = {
                 let (mapper, id, n_received) = (Arc::clone(&session.mapper), session.id.clone(), session.n_received);
-                move || -> Result<Vec<Observation>, SessionError> {
-                    let (demonstration, weights) = read_stored(&mapper, &texts, (&id, n_received))?;
-                    let mut weights = weights.into_iter();
-                    let observed = demonstration
-                        .iter()
-                        .map(|values| Observation { values: values.to_vec(), weight: weights.next().flatten() });
-                    Ok(observed.collect())
-                }
+                let (weights, conditions) = (session.weights.clone(), session.conditions.clone());
+                move || read_again(&mapper, &texts, (&id, n_received), is_done, weights, conditions)
             };
             let n_values = session.n_received as usize * session.mapper.model().schema().len();
-            let observations = if n_values <= MAX_INLINE_VALUES {
+            let again = if n_values <= MAX_INLINE_VALUES {
                 reading()?
             } else {
                 // About what a value takes.
                 self.pool.read_patiently(caller.client, 8 * n_values, reading).await??
             };
-            steps = session.advance(self, observations).await?;
+            session.watch = again.watch;
+            warnings = again.warnings;
+            steps = session.advance(self, again.observations).await?;
         }
         let policy = match (row.status, session.online.take()) {
             (SessionStatus::Done, Some(online)) => {
                 // Whoever ended it may have been gone before there was something to refine.
                 self.refiner.wake();
                 let (mapper, memory) = (Arc::clone(&session.mapper), self.memory.clone());
-                let end =
-                    move |_: &mut dyn Interrupt| Ok(end_again(online, steps, row.policy_id, mapper.model(), &memory));
+                let end = move |_: &mut dyn Interrupt| {
+                    Ok(end_again(online, steps, (row.policy_id, warnings), mapper.model(), &memory))
+                };
                 let (ended, policy) = self.pool.run_patiently(caller.client, end).await??;
                 steps = ended;
                 session.n_steps = steps.len();
@@ -369,7 +371,7 @@ const MAX_INLINE_VALUES: usize = 8192;
 fn end_again(
     online: OnlineMapping,
     mut steps: CommittedSteps,
-    policy_id: Option<String>,
+    (policy_id, warnings): (Option<String>, Vec<Warning>),
     model: &Model,
     memory: &Memory,
 ) -> Result<(CommittedSteps, SessionPolicy), SessionError> {
@@ -380,18 +382,7 @@ fn end_again(
         .map_err(ServiceError::from)?;
     let (rest, mapping) = online.end().ok_or(SessionError::Empty)?;
     steps.extend(rest);
-    Ok((steps, SessionPolicy::of(policy_id, model, &mapping)))
-}
-
-/// Reads observations of the session `id` that were stored, which were read without faults before.
-fn read_stored(
-    mapper: &Mapper,
-    texts: &[String],
-    (id, n_observations): (&str, u32),
-) -> Result<(Demonstration, Vec<Option<f64>>), SessionError> {
-    let read = Demonstration::read_stored(mapper.model().schema(), texts, n_observations as usize);
-    let read = read.map_err(|error| ServiceError::unreadable("observations", "states", id, error))?;
-    read.ok_or(SessionError::Empty)
+    Ok((steps, SessionPolicy::of(policy_id, model, &mapping, warnings)))
 }
 
 #[cfg(test)]

@@ -11,13 +11,16 @@ use super::committed::CommittedSteps;
 use super::ending::{Ended, conclude, take_for_end, written_bytes};
 use crate::memory::{Held, NoRoom, SMALL_BYTES};
 use crate::service::owners::Ownership;
+use crate::service::requests::STATES;
 use crate::service::search::take_beyond_small;
 use crate::service::{Client, Etude, PoolError, ServiceError};
 use crate::store::{AcceptedReward, NewObservations, Owner, SessionEnd, TrialRecord};
 use etude_core::attribute::{ByAttribute, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Interrupt, Uninterrupted};
-use etude_core::mapping::{Conditions, Demonstration, Mapper, OnlineMapping, Options, Policy, Stamp, Stopped};
+use etude_core::mapping::{
+    Conditions, Demonstration, Mapper, OnlineMapping, Options, Policy, Stamp, Stopped, Warning, Watch,
+};
 
 /// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
 /// in the pool.
@@ -38,6 +41,8 @@ pub struct Session {
     pub(super) n_steps: usize,
     /// `None` once the session has ended.
     pub(super) online: Option<OnlineMapping>,
+    /// What was observed and can hardly be meant.
+    pub(super) watch: Watch,
     /// What the mapping takes.
     pub(super) held: Held,
     /// Who drives it.
@@ -194,6 +199,9 @@ impl Session {
         let mut weights = weights.into_iter().skip(n_known);
         let observations: Vec<Observation> =
             observations.into_iter().map(|values| Observation { values, weight: weights.next().flatten() }).collect();
+        for (index, observation) in (self.n_received as usize..).zip(&observations) {
+            self.watch.observe(self.mapper.model(), index, &observation.values);
+        }
         #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
         let n_states = new.len() as u32;
         let appending = etude.store.append_observations(NewObservations {
@@ -216,6 +224,11 @@ impl Session {
         appended??;
         self.n_received += n_states;
         mapped
+    }
+
+    /// What there is to warn of since the last time that this was asked; the frame that was received begins with the state `seq`.
+    pub fn news(&mut self, seq: u32) -> Vec<Warning> {
+        self.watch.news(self.mapper.model(), seq as usize, &STATES)
     }
 
     /// Whether so many observations are mapped where they arrive.

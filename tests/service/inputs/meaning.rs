@@ -136,3 +136,78 @@ async fn what_repeats_itself_is_left_out_where_a_request_says_so() {
     assert_eq!((status, pointers(&problem["errors"])), (422, vec!["/collapse"]), "{problem}");
     service.stop().await;
 }
+
+#[tokio::test]
+async fn streams_warn_when_there_is_something_new_to_say_and_in_the_end_of_all() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/line", &line()).await;
+    let observe = |seq: u32, states: Value| json!({"type": "observe", "seq": seq, "states": states});
+    let frames = [
+        json!({"type": "open", "model": "line"}),
+        observe(0, json!([{"x": 0}, {"x": 1, "door": "Open"}])),
+        observe(2, json!([{"x": 1, "door": "Open"}])),
+        observe(2, json!([{"x": 1, "door": "Open"}, {"x": 2, "door": "Open"}])),
+        json!({"type": "end", "seq": 4}),
+    ];
+    let answered = stream(&service, &frames).await;
+    let received: Vec<_> = answered.iter().filter(|frame| frame["type"] == "received").collect();
+    assert_eq!(pointers(&received[0]["warnings"]), ["/states/1/door"], "{answered:?}");
+    assert_eq!(received[1..].iter().map(|frame| frame.get("warnings")).collect::<Vec<_>>(), [None, None]);
+    let done = answered.last().unwrap();
+    let told = "no state has \"Open\": it differs from all of them alike; is \"open\" meant? (in 3 observations)";
+    assert_eq!(done["warnings"], json!([{"pointer": "/states/1/door", "detail": told}]), "{done}");
+    let (_, policy) = service.get(&format!("/v1/policies/{}", done["policy_id"].as_str().unwrap())).await;
+    assert_eq!(policy["warnings"], json!([{"pointer": "/demonstration/1/door", "detail": told}]));
+    // A session that is taken up again is told the same in the end, and nothing twice before.
+    let session = answered[1]["session"].clone();
+    let again = stream(&service, &[json!({"type": "resume", "session": session, "step": 0})]).await;
+    assert_eq!(again.last().unwrap(), done);
+
+    let opened = stream(&service, &frames[..2]).await;
+    let resumed = [
+        json!({"type": "resume", "session": opened[1]["session"], "step": 0}),
+        frames[2].clone(),
+        frames[3].clone(),
+        frames[4].clone(),
+    ];
+    let resumed = stream(&service, &resumed).await;
+    assert!(resumed.iter().all(|frame| frame["type"] != "received" || frame.get("warnings").is_none()), "{resumed:?}");
+    assert_eq!(resumed.last().unwrap()["warnings"], done["warnings"]);
+    service.stop().await;
+}
+
+/// A body that may fall: the fall costs much by the transition, not by the action.
+#[tokio::test]
+async fn a_fall_that_costs_much_is_no_cheap_way_home() {
+    let service = Service::start(&[]).await;
+    let fall = |from: u32, action: &str| json!([from, action, 0, 1, 100]);
+    let cliff = json!({
+        "attributes": [{"name": "x", "kind": "number"}, {"name": "y", "kind": "number"}],
+        "actions": [{"name": "right", "cost": 0.3}, {"name": "up", "cost": 0.3}, {"name": "down", "cost": 0.3}],
+        "dynamics": {
+            "kind": "table", "start": 0,
+            "states": [[0, 0], [1, 0], [2, 0], [3, 0], [0, 1], [1, 1], [2, 1], [3, 1]],
+            "transitions": [
+                fall(0, "right"), [0, "up", 4], [4, "right", 5], [5, "right", 6], [6, "right", 7], [7, "down", 3],
+                fall(5, "down"), fall(6, "down"),
+            ],
+        },
+    });
+    assert_eq!(service.put("/v1/models/cliff", &cliff).await.0, 201);
+    let mut request =
+        json!({"model": "cliff", "demonstration": [{"x": 0, "y": 0}, {"x": 3, "y": 0}], "extra_weight": 0});
+    let (_, policy) = service.post("/v1/policies", &request).await;
+    let last = policy["steps"].as_array().unwrap().last().unwrap();
+    assert_eq!((&policy["cost"]["total"], &last["state"]), (&json!(1.5), &json!({"x": 3, "y": 0})), "{policy}");
+    // From above and back to the start, it falls, as there is no other way; the fall is what it pays for.
+    request["start"] = json!({"x": 1, "y": 1});
+    request["demonstration"] = json!([{"x": 1, "y": 1}, {"x": 0, "y": 0}]);
+    request["weights"] = json!({"x": 1000, "y": 1000});
+    let (_, policy) = service.post("/v1/policies", &request).await;
+    assert_eq!(
+        (&policy["cost"]["actions"], &policy["steps"][1]["action_cost"]),
+        (&json!(100.0), &json!(100.0)),
+        "{policy}"
+    );
+    service.stop().await;
+}
