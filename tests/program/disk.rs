@@ -520,7 +520,7 @@ fn not_started(database: &Path) -> String {
 fn a_database_that_cannot_be_created_says_what_it_needs() {
     let directory = tempfile::tempdir().unwrap();
     let told = not_started(&directory.path().join("nowhere/etude.db"));
-    assert!(told.contains("its directory must exist"), "{told}");
+    assert!(told.contains("there is no directory"), "{told}");
     let Some(disk) = Disk::mount() else { return };
     disk.fill();
     for _ in 0..2 {
