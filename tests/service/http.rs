@@ -789,3 +789,38 @@ async fn a_policy_that_is_not_to_be_stored_is_answered_and_nothing_of_it_is_kept
     let (status, problem) = service.post("/v1/policies", &request).await;
     assert_eq!((status, pointers(&problem)), (422, vec!["/store", "/start"]), "{problem}");
 }
+
+#[tokio::test]
+async fn all_that_is_wrong_with_what_a_request_says_of_starts_weights_and_the_body_is_told_at_once() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/figure-4", &example("figure-4/model.json")).await;
+    let faults = async |request: Value| {
+        let (status, problem) = service.post("/v1/policies", &request).await;
+        assert_eq!(status, 422, "{problem}");
+        let errors = problem["errors"].as_array().unwrap();
+        let mut pointers: Vec<String> =
+            errors.iter().map(|error| error["pointer"].as_str().unwrap().to_owned()).collect();
+        pointers.sort_unstable();
+        pointers
+    };
+    let request = json!({
+        "model": "figure-4", "demonstration": [{"x": 0}, {"x": 1}], "observation_weights": [1, -1, 1], "extra_weight": 1.5,
+        "end_weight": -1, "without": ["fly", 7], "action_costs": {"forward": -1, "fly": 1}, "start": [0, "x", 99999], "unsafe_cost": 3,
+    });
+    let expected = [
+        "/action_costs/fly",
+        "/action_costs/forward",
+        "/end_weight",
+        "/extra_weight",
+        "/observation_weights",
+        "/observation_weights/1",
+        "/start/1",
+        "/start/2",
+        "/unsafe_cost",
+        "/without/0",
+        "/without/1",
+    ];
+    assert_eq!(faults(request).await, expected);
+    let empty = json!({"model": "figure-4", "demonstration": [{}], "start": [], "observation_weights": 1});
+    assert_eq!(faults(empty).await, ["/observation_weights", "/start"]);
+}

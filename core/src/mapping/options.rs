@@ -265,16 +265,19 @@ impl Options {
         }
     }
 
-    /// Notes that there are not as many weights of observations as these.
+    /// Notes that `object`, or else these options, which it shares, have not as many weights of observations as these.
     pub(super) fn check_observation_weights(
         &self,
         n_observations: usize,
         object: &Object<'_, '_>,
         faults: &mut Faults,
     ) {
-        if let Some(weights) = self.observation_weights.as_ref().filter(|weights| weights.len() != n_observations) {
+        let own = object.optional("observation_weights").map(|place| place.value.as_array().map(Vec::len));
+        let shared = || self.observation_weights.as_ref().map(Vec::len);
+        // What is no array is a fault already.
+        if let Some(n_weights) = own.unwrap_or_else(shared).filter(|n_weights| *n_weights != n_observations) {
             let path = Path::Member(&object.path, "observation_weights");
-            let detail = format!("expected one for each of the {n_observations} observations, found {}", weights.len());
+            let detail = format!("expected one for each of the {n_observations} observations, found {n_weights}");
             faults.note_at(&path, detail);
         }
     }

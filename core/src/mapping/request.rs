@@ -60,12 +60,12 @@ impl<'m> Request<'m> {
         let options = Options::read(object, model, shared, faults);
         Options::check_model(model, object, faults);
         Options::check_lookahead_is_possible(model, object, faults);
+        let n_observations = demonstration.as_ref().map_or(0, Demonstration::len);
         if let Some(options) = &options {
-            let n_observations = demonstration.as_ref().map_or(0, Demonstration::len);
             options.check_lookahead(model, n_observations, Budget::DEFAULT.max_bytes, object, faults);
-            if demonstration.is_some() {
-                options.check_observation_weights(n_observations, object, faults);
-            }
+        }
+        if demonstration.is_some() {
+            shared.check_observation_weights(n_observations, object, faults);
         }
         let weights = weights(faults)?;
         let options = options?;
