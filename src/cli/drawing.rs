@@ -74,9 +74,7 @@ impl PictureFlags {
 }
 
 fn title(policy: &Policy) -> String {
-    let cost = &policy.cost;
-    let [total, actions, distance] = [cost.total, cost.actions, cost.distance].map(render::decimal);
-    format!("{}: cost {total} = actions {actions} + distance {distance}", policy.model)
+    format!("{}: cost {}", policy.model, render::sum(&policy.cost))
 }
 
 fn subtitle(policy: &Policy) -> String {
@@ -115,16 +113,22 @@ fn paths(
         Some(Stop { at, observation: step.observation as usize, action })
     });
     let imitation: Option<Vec<_>> = stops.collect();
+    let mut demonstration = Vec::new();
+    for (number, observation) in observed(problem) {
+        demonstration.resize(number, None);
+        demonstration.push(seen(observation, axes[0]).zip(seen(observation, axes[1])));
+    }
     Ok(Paths {
         title,
-        demonstration: problem
-            .demonstration()
-            .iter()
-            .map(|observation| seen(observation, axes[0]).zip(seen(observation, axes[1])))
-            .collect(),
+        demonstration,
         imitation: imitation.ok_or_else(|| CliError::Faulty("--picture: a number of the policy is none".to_owned()))?,
         axes: names,
     })
+}
+
+/// The observations that are followed, each with its number in the whole demonstration.
+fn observed<'p>(problem: &'p Problem<'_>) -> impl Iterator<Item = (usize, &'p [Option<Value>])> {
+    (0..).zip(problem.demonstration().iter()).map(|(n, observation)| (problem.number_of(n) as usize, observation))
 }
 
 fn timeline(policy: &Policy, model: &Model, problem: &Problem<'_>, title: [String; 2]) -> Timeline {
@@ -133,10 +137,14 @@ fn timeline(policy: &Policy, model: &Model, problem: &Problem<'_>, title: [Strin
         let values = observation.iter().zip(schema.attributes());
         schema.by_some_attributes(values.map(|(value, attribute)| Some(attribute.write_value(value.as_ref()?))))
     };
-    let observed: Vec<_> = problem.demonstration().iter().map(written).collect();
-    let before = std::iter::once(None).chain(observed.iter().map(Some));
-    let observations =
-        before.zip(&observed).map(|(before, seen)| shortened(render::changes(Some(&policy.weights), before, seen)));
+    let mut observations = Vec::new();
+    let mut before = None;
+    for (number, observation) in observed(problem) {
+        let state = written(observation);
+        observations.resize(number, String::new());
+        observations.push(shortened(render::changes(Some(&policy.weights), before.as_ref(), &state)));
+        before = Some(state);
+    }
     let steps = policy.steps.iter().map(|step| Moment {
         observation: step.observation as usize,
         kind: render::name(step.kind),
@@ -147,7 +155,7 @@ fn timeline(policy: &Policy, model: &Model, problem: &Problem<'_>, title: [Strin
         },
         is_exact: step.distance == 0.0,
     });
-    Timeline { title, observations: observations.collect(), steps: steps.collect() }
+    Timeline { title, observations, steps: steps.collect() }
 }
 
 /// So much of a text that there is room for it.

@@ -6,7 +6,7 @@ use comfy_table::{CellAlignment, ContentArrangement, Table, TableComponent, pres
 use serde_json::Value;
 
 use etude_core::attribute::{ByAttribute, Scalar};
-use etude_core::mapping::{Cost, MoveKind, Policy, Step};
+use etude_core::mapping::{Cost, MoveKind, Policy, PolicyEnd, Step};
 
 /// How wide what is printed may be: as the terminal, or [`WIDTH`] where there is none.
 pub(super) fn width() -> usize {
@@ -121,10 +121,11 @@ pub(super) fn totals(policy: &Policy) -> String {
     #[expect(clippy::cast_precision_loss, reason = "a time that is shown to three digits")]
     let elapsed_ms = search.elapsed_us as f64 / 1000.0;
     format!(
-        "{}status    {}, {bound}\ncoverage  {} of {} observations met exactly\nsearch    \
+        "{}status    {}, {bound}\nend       {}\ncoverage  {} of {} observations met exactly\nsearch    \
          {} nodes expanded, {} generated, {elapsed_ms:.2} ms\n",
         self::cost(cost),
         policy.status.name(),
+        end(&policy.end),
         coverage.exact,
         coverage.observed,
         search.expanded,
@@ -134,8 +135,23 @@ pub(super) fn totals(policy: &Policy) -> String {
 
 /// The line of a cost.
 pub(super) fn cost(cost: &Cost) -> String {
-    let Cost { total, actions, distance, .. } = cost;
-    format!("cost      {} = actions {} + distance {}\n", decimal(*total), decimal(*actions), decimal(*distance))
+    format!("cost      {}\n", sum(cost))
+}
+
+/// A cost and what it is the sum of.
+pub(super) fn sum(cost: &Cost) -> String {
+    let Cost { total, actions, distance, end } = cost;
+    let end = if *end > 0.0 { format!(" + end {}", decimal(*end)) } else { String::new() };
+    format!("{} = actions {} + distance {}{end}", decimal(*total), decimal(*actions), decimal(*distance))
+}
+
+/// How far a policy ends from the last observation, and in what.
+fn end(end: &PolicyEnd) -> String {
+    let differing: Vec<_> = end.distance_by_attribute.iter().map(|(name, _)| name).collect();
+    match &*differing {
+        [] => "as observed".to_owned(),
+        names => format!("{} from the last observation, by {}", decimal(end.distance), names.join(", ")),
+    }
 }
 
 pub(super) fn name(kind: MoveKind) -> &'static str {

@@ -11,5 +11,6 @@ mod disk;
 mod inputs;
 mod kill_rewards;
 mod kill_streams;
+mod readme;
 mod signals;
 mod terminal;

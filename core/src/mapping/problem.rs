@@ -83,7 +83,8 @@ impl<'m> Problem<'m> {
     }
 
     /// The number in the whole demonstration of an observation that is followed.
-    pub(super) fn number_of(&self, observation: u32) -> u32 {
+    #[must_use]
+    pub fn number_of(&self, observation: u32) -> u32 {
         self.collapsed.as_ref().map_or(observation, |collapsed| collapsed.numbers[observation as usize])
     }
 
