@@ -63,7 +63,7 @@ fn explain_parse_error(text: &[u8]) -> ParseError {
     }
 }
 
-/// Reads a value as serde_json does, but for members that stand twice, which it refuses.
+/// Reads a value as `serde_json` does, but for members that stand twice, which it refuses.
 struct Whole;
 
 impl<'de> DeserializeSeed<'de> for Whole {

@@ -43,11 +43,12 @@ impl Repeated {
     /// Tells all of them; `things` is what they are of, more than one.
     pub fn tell(self, things: &str, faults: &mut Faults) {
         for (mut fault, n_more) in self.first {
-            match n_more {
-                0 => {}
-                1 => fault.detail.push_str(" (and in 1 more)"),
-                n => fault.detail.push_str(&format!(" (and in {n} more {things})")),
-            }
+            let more = match n_more {
+                0 => String::new(),
+                1 => " (and in 1 more)".to_owned(),
+                n => format!(" (and in {n} more {things})"),
+            };
+            fault.detail.push_str(&more);
             faults.list(fault);
         }
         faults.count_unlisted(self.n_unlisted);

@@ -229,26 +229,21 @@ impl Strange {
     fn detail(&self, attribute: &Attribute, model: &Model, position: usize) -> String {
         /// A near match is looked for among so many values.
         const MAX_LOOKED_AT: usize = 10_000;
+        const MAX_SHOWN: usize = 8;
         let domain = model.states().domain(position);
         let found = shown(attribute, &self.value);
         let several = if self.are_several { ", nor others that were observed" } else { "" };
         let forms = forms(&self.value);
         let resembles = |own: &&Value| self::forms(own).iter().any(|form| forms.contains(form));
-        match domain.iter().take(MAX_LOOKED_AT).find(resembles) {
-            Some(near) => {
-                let near = shown(attribute, near);
-                format!("no state has {found}{several}: it differs from all of them alike; is {near} meant?")
-            }
-            None => {
-                const MAX_SHOWN: usize = 8;
-                let mut known: Vec<_> = domain.iter().take(MAX_SHOWN).map(|own| shown(attribute, own)).collect();
-                if domain.len() > MAX_SHOWN {
-                    known.push("..".to_owned());
-                }
-                let known = known.join(", ");
-                format!("no state has {found}{several}: it differs from all of them alike; they have {known}")
-            }
+        let differs = format!("no state has {found}{several}: it differs from all of them alike");
+        if let Some(near) = domain.iter().take(MAX_LOOKED_AT).find(resembles) {
+            return format!("{differs}; is {} meant?", shown(attribute, near));
         }
+        let mut known: Vec<_> = domain.iter().take(MAX_SHOWN).map(|own| shown(attribute, own)).collect();
+        if domain.len() > MAX_SHOWN {
+            known.push("..".to_owned());
+        }
+        format!("{differs}; they have {}", known.join(", "))
     }
 }
 

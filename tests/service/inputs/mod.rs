@@ -211,13 +211,14 @@ async fn a_fault_at_every_observation_is_told_once_with_how_often() {
     service.stop().await;
 }
 
+/// Each letter with an accent as one, and as the letter and the accent.
+fn forms(text: &str) -> [String; 2] {
+    [text.replace("o\u{308}", "\u{f6}").replace("u\u{308}", "\u{fc}"), text.to_owned()]
+}
+
 #[tokio::test]
 async fn names_and_texts_that_differ_by_normalization_alone_are_equal() {
     let service = Service::start(&[]).await;
-    /// Each letter with an accent as one, and as the letter and the accent.
-    fn forms(text: &str) -> [String; 2] {
-        [text.replace("o\u{308}", "\u{f6}").replace("u\u{308}", "\u{fc}"), text.to_owned()]
-    }
     let model = |form: usize| {
         let text = json!({
             "attributes": [
