@@ -157,3 +157,28 @@ fn every_file_of_the_examples_is_valid_against_the_schema_of_what_it_is() {
     }
     assert!(n_files >= 20, "{n_files} files");
 }
+
+#[tokio::test]
+async fn the_distance_is_what_the_description_of_attributes_says() {
+    let told = CONTRACT.document["components"]["schemas"]["Attribute"]["description"].as_str().unwrap();
+    for part in
+        ["weight * delta^2", "|o - s| / scale", "min(d mod p, p - d mod p) / scale", "0 if they are equal, else 1"]
+    {
+        assert!(told.contains(part), "{part}: {told}");
+    }
+    let service = Service::start(&[]).await;
+    let model = json!({
+        "attributes": [
+            {"name": "x", "kind": "number", "scale": 2},
+            {"name": "heading", "kind": "cyclic", "labels": ["east", "north", "west", "south"]},
+            {"name": "door", "kind": "category", "weight": 5},
+        ],
+        "actions": [],
+        "dynamics": {"kind": "table", "states": [[3, "south", "shut"]], "transitions": []},
+    });
+    assert_eq!(service.put("/v1/models/still", &model).await.0, 201);
+    let request = json!({"model": "still", "demonstration": [{"x": 0, "heading": "east", "door": "open"}]});
+    let (_, policy) = service.post("/v1/policies", &request).await;
+    assert!(told.contains(&format!("= {}`", policy["cost"]["distance"])), "{}: {told}", policy["cost"]);
+    assert_eq!(policy["steps"][0]["distance_by_attribute"], json!({"x": 2.25, "heading": 1.0, "door": 5.0}));
+}

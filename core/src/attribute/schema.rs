@@ -243,7 +243,7 @@ fn read_labels(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Labels> {
     (labels.len() == items.len()).then(|| Labels::new(labels.into_iter()))
 }
 
-/// How the values of an attribute are compared.
+/// How the values of an attribute are compared: as numbers, as numbers or labels on a circle, or as equal or not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(rename_all = "lowercase")]
@@ -257,6 +257,17 @@ pub enum KindName {
 }
 
 /// An attribute, as it is written in JSON.
+///
+/// The distance between an observation `o` and a state `s` is the sum of `weight * delta^2` over all attributes, where `delta` is
+///
+/// - of a `number`: `|o - s| / scale`;
+/// - of a `cyclic`: `min(d mod p, p - d mod p) / scale`, where `d = |o - s|` and `p` is the `period`, or how many `labels` there are, which
+///   count as 0, 1, 2, .. in their order;
+/// - of a `category`: 0 if they are equal, else 1.
+///
+/// What was not observed adds nothing. An example: `x` is a `number` of `scale` 2, `heading` a `cyclic` with the `labels` east, north, west and
+/// south, and `door` a `category` of `weight` 5. Between the observation x = 0, east, open and the state x = 3, south, shut, the distance is
+/// `1 * (3 / 2)^2 + 1 * 1^2 + 5 * 1^2 = 8.25`: from east to south it is one step around the circle.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[cfg_attr(feature = "openapi", schema(as = Attribute))]
