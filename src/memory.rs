@@ -150,12 +150,12 @@ impl Memory {
         self.try_take_for(u64::MAX, n_bytes)
     }
 
-    /// Takes what `held` lacks to hold `n_bytes`, unless they are so few that they need not be counted.
+    /// Makes `held` at least `n_bytes`; fewer than are worth counting take nothing.
     ///
     /// # Errors
     ///
     /// [`NoRoom`] if it is not free; then this holds what it did before.
-    pub fn hold(&self, held: &mut Option<Held>, n_bytes: usize) -> Result<(), NoRoom> {
+    pub fn reserve(&self, held: &mut Option<Held>, n_bytes: usize) -> Result<(), NoRoom> {
         let n_bytes = n_bytes as u64;
         match held {
             _ if n_bytes <= UNCOUNTED_BYTES => {}

@@ -62,7 +62,7 @@ pub(super) fn json_stream(parts: impl Stream<Item = Result<Bytes, ServiceError>>
 pub(super) fn count(response: &mut Response, memory: &Memory) -> Result<(), NoRoom> {
     let n_bytes = HttpBody::size_hint(response.body()).exact().unwrap_or(0);
     if n_bytes > UNCOUNTED_BYTES as u64 && response.extensions_mut().remove::<IsCounted>().is_none() {
-        hold(response, memory.try_take(n_bytes)?);
+        keep_until_sent(response, memory.try_take(n_bytes)?);
     }
     Ok(())
 }
@@ -75,13 +75,13 @@ struct IsCounted;
 pub(super) fn counted(mut response: Response, held: Option<Held>) -> Response {
     if let Some(mut held) = held {
         held.shrink_to(HttpBody::size_hint(response.body()).exact().unwrap_or(u64::MAX));
-        hold(&mut response, held);
+        keep_until_sent(&mut response, held);
         response.extensions_mut().insert(IsCounted);
     }
     response
 }
 
-fn hold(response: &mut Response, held: Held) {
+fn keep_until_sent(response: &mut Response, held: Held) {
     let body = std::mem::take(response.body_mut());
     *response.body_mut() = Body::new(Paced { held: Some(held), ..Paced::new(body) });
 }

@@ -89,10 +89,10 @@ async fn read_json_within(limit: SentLimit, request: Request, context: &Context)
             decoder.consume(n_bytes);
             // The decoder looks back at as much.
             let n_seen = decoded.n_bytes().min(Encoding::MAX_WINDOW_BYTES);
-            decoded.hold(decoded.capacity() + n_seen).map_err(BodyError::NoRoom)?;
+            decoded.reserve(decoded.capacity() + n_seen).map_err(BodyError::NoRoom)?;
         }
     };
-    let decoded = context.etude.pool().read_patiently(client, limit.n_bytes, decode).await;
+    let decoded = context.etude.pool().read_in_turn(client, limit.n_bytes, decode).await;
     decoded.map_err(ServiceError::from)?.map_err(|error| Problem::unreadable(&error))
 }
 

@@ -32,7 +32,7 @@ impl<'m> Collected<'m> {
     /// Adds a chunk that may be kept as it is.
     pub(super) fn add(&mut self, chunk: Bytes) -> Result<(), NoRoom> {
         if self.n_bytes() == 0 {
-            self.hold(chunk.len())?;
+            self.reserve(chunk.len())?;
             self.first = chunk;
             return Ok(());
         }
@@ -48,7 +48,7 @@ impl<'m> Collected<'m> {
         if n_bytes > self.bytes.capacity() {
             // By what has arrived: a client need not send what it has announced.
             let capacity = n_bytes.next_power_of_two();
-            self.hold(capacity)?;
+            self.reserve(capacity)?;
             self.bytes.reserve_exact(capacity - self.bytes.len());
         }
         self.bytes.extend_from_slice(chunk);
@@ -56,7 +56,7 @@ impl<'m> Collected<'m> {
     }
 
     /// Takes memory until `n_bytes` are held, if that is much.
-    pub(super) fn hold(&mut self, n_bytes: usize) -> Result<(), NoRoom> {
+    pub(super) fn reserve(&mut self, n_bytes: usize) -> Result<(), NoRoom> {
         match &mut self.held {
             Some(held) => held.grow_to(n_bytes as u64)?,
             None if n_bytes > UNCOUNTED_BYTES => self.held = Some(self.memory.try_take(n_bytes as u64)?),

@@ -238,9 +238,9 @@ impl Batch {
         let mut held = None;
         let most_bytes = most_demonstration_bytes(model, sent.observed());
         // Where all demonstrations have no room together, they are read one by one, once it is their turn.
-        let have_room = memory.hold(&mut held, most_bytes).is_ok();
+        let have_room = memory.reserve(&mut held, most_bytes).is_ok();
         let most_bytes = if have_room { most_bytes } else { document::parsed_bytes(sent.observed().as_bytes()) };
-        memory.hold(&mut held, most_bytes)?;
+        memory.reserve(&mut held, most_bytes)?;
         let (mut items, mut n_bytes) = (Vec::with_capacity(texts.len()), 0);
         let (mut n_left, mut n_values) = (Policy::max_observations(model), 0);
         for text in texts {
@@ -256,7 +256,7 @@ impl Batch {
             // Most are about as long as the one before.
             n_values = item.n_observations() * model.schema().len();
             n_bytes += item.size_bytes();
-            memory.hold(&mut held, most_bytes + n_bytes)?;
+            memory.reserve(&mut held, most_bytes + n_bytes)?;
             items.push(item);
         }
         if let Some(held) = &mut held {

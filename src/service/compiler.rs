@@ -201,7 +201,7 @@ impl Compiler {
         let compile = async {
             match &place {
                 Some(place) => place.run(None, job).await,
-                None => self.pool.run_patiently(Client::LOCAL, job).await,
+                None => self.pool.run_in_turn(Client::LOCAL, job).await,
             }
         };
         let (mapper, fed) = tokio::join!(compile, OptionFuture::from(feed));

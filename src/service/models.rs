@@ -135,7 +135,7 @@ impl Etude {
             let _place = self.uploads.admit(caller.client)?;
             let read = self.pool.run_aside(move |interrupt| Ok(text.read(format, limits, interrupt))).await?;
             let job = move |interrupt: &mut dyn Interrupt| Ok(prepare(read, interrupt));
-            tokio::join!(self.pool.run_patiently(caller.client, job), self.store_pieces(pieces))
+            tokio::join!(self.pool.run_in_turn(caller.client, job), self.store_pieces(pieces))
         } else if !is_new && text.is_small() {
             // The name is taken, so nothing is compiled or stored.
             let job = |interrupt: &mut dyn Interrupt| Ok(prepare(text.read(format, limits, interrupt), interrupt));

@@ -188,7 +188,7 @@ impl Etude {
             (None, Some(text)) => {
                 let mut held = None;
                 let n_bytes = request.len() + text.get().len() + most_demonstration_bytes(mapper.model(), text.get());
-                self.memory.hold(&mut held, n_bytes)?;
+                self.memory.reserve(&mut held, n_bytes)?;
                 (vec![text.get().to_owned()], held)
             }
             (None, None) => (Vec::new(), None),

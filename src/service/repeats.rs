@@ -116,7 +116,7 @@ impl Etude {
             hash_of(body)
         } else {
             let text = body.clone();
-            self.pool.read_patiently(caller.client, body.len(), move || hash_of(&text)).await?
+            self.pool.read_in_turn(caller.client, body.len(), move || hash_of(&text)).await?
         };
         let key = RequestKey { scope, key: key.clone() };
         let turn = self.turns.take(&key).await;

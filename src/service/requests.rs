@@ -77,7 +77,7 @@ impl SentRequest {
     ) -> Result<Option<(Demonstration, Option<Held>)>, ServiceError> {
         let max_len = Policy::max_observations(model).min(Demonstration::MAX_OBSERVATIONS);
         let mut held = None;
-        memory.hold(&mut held, most_demonstration_bytes(model, self.observed()))?;
+        memory.reserve(&mut held, most_demonstration_bytes(model, self.observed()))?;
         let Some(demonstration) = self.demonstration(model, max_len) else { return Ok(None) };
         if let Some(held) = &mut held {
             held.shrink_to(Demonstration::bytes_of(model.schema(), demonstration.len()) as u64);

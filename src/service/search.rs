@@ -52,7 +52,7 @@ pub(super) fn take_for_demonstration(
 ) -> Result<Option<Held>, NoRoom> {
     let mut held = None;
     if n_observations <= Policy::max_observations(model).min(Demonstration::MAX_OBSERVATIONS) {
-        memory.hold(&mut held, Demonstration::bytes_of(model.schema(), n_observations))?;
+        memory.reserve(&mut held, Demonstration::bytes_of(model.schema(), n_observations))?;
     }
     Ok(held)
 }
@@ -144,7 +144,7 @@ pub(super) fn follow(
     let is_refined = mapping.status == Status::Local && stamp.id.is_some();
     let n_refined_bytes = if is_refined { RefinedRequest::most_bytes(mapper.model(), observed) } else { 0 };
     let mut held = None;
-    if let Err(no_room) = memory.hold(&mut held, n_bytes + n_refined_bytes) {
+    if let Err(no_room) = memory.reserve(&mut held, n_bytes + n_refined_bytes) {
         return Ok(Err(no_room.into()));
     }
     if is_counted && memory.free_for_large() < memory.room() / 4 {
@@ -159,7 +159,7 @@ pub(super) fn follow(
         let policy = written.answer(None)?;
         let row = stamp.id.is_some().then(|| PolicyText::of(stamp, mapping.status, written)).transpose()?;
         // What was estimated may have been too little.
-        memory.hold(&mut held, N_COPIES * policy.len() + n_refined_bytes)?;
+        memory.reserve(&mut held, N_COPIES * policy.len() + n_refined_bytes)?;
         let weights = request.problem.weights().clone();
         Ok(Searched { policy, row, weights, refinement, held })
     });

@@ -237,7 +237,7 @@ impl Etude {
         let policy = policy.map(|policy| read_policy(policy, &trial.policy_id)).transpose()?;
         // Once more in the answer.
         let mut held = held.flatten();
-        self.memory.hold(&mut held, 2 * policy.as_ref().map_or(0, |policy| policy.get().len()))?;
+        self.memory.reserve(&mut held, 2 * policy.as_ref().map_or(0, |policy| policy.get().len()))?;
         Ok(TrialAnswer { policy, held, ..TrialAnswer::of(trial, now)? })
     }
 

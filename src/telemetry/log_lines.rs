@@ -33,10 +33,10 @@ const FLUSH_TIMEOUT: Duration = Duration::from_secs(1);
 
 /// Where log lines are written to.
 #[derive(Clone)]
-pub(super) struct LogLines(Arc<Lines>);
+pub(super) struct LogLines(Arc<Queue>);
 
 #[derive(Default)]
-struct Lines {
+struct Queue {
     waiting: Mutex<Waiting>,
     /// Some wait that are to be written.
     has_some: Condvar,
@@ -62,7 +62,7 @@ impl LogLines {
     ///
     /// If there can be no thread that writes them.
     pub(super) fn start(mut writer: impl Write + Send + 'static) -> io::Result<Self> {
-        let lines = Arc::new(Lines::default());
+        let lines = Arc::new(Queue::default());
         let writing = Arc::clone(&lines);
         // It ends with the process.
         std::thread::Builder::new().name("log".to_owned()).spawn(move || {
@@ -85,7 +85,7 @@ impl LogLines {
     }
 }
 
-impl Lines {
+impl Queue {
     /// Adds a line if there is room for it. Never waits for a writer.
     fn add(&self, line: &[u8], is_urgent: bool) {
         let mut waiting = self.lock();
@@ -148,7 +148,7 @@ fn count_dropped(n_lines: u64) {
 
 /// Writes a line.
 pub(super) struct LineWriter<'l> {
-    lines: &'l Lines,
+    lines: &'l Queue,
     is_urgent: bool,
 }
 

@@ -38,7 +38,7 @@ impl Answer {
             Err(_) => (0, PROBLEM_BYTES),
         };
         let (n_bytes, n_other_bytes) = (self.n_bytes + n_bytes, self.n_other_bytes + n_other_bytes);
-        let no_room = memory.hold(&mut self.held, N_COPIES * n_bytes + n_other_bytes).is_err();
+        let no_room = memory.reserve(&mut self.held, N_COPIES * n_bytes + n_other_bytes).is_err();
         self.is_full |= no_room || n_bytes > MAX_ANSWER_BYTES;
         match searched {
             Ok(searched) if !self.is_full => {

@@ -46,7 +46,7 @@ async fn keep_all_threads(etude: &Etude) -> Vec<std::sync::mpsc::Sender<()>> {
                 let _ = ends.recv();
                 Ok(())
             };
-            pool.run_patiently(Client::LOCAL, job).await
+            pool.run_in_turn(Client::LOCAL, job).await
         });
         begun.await.unwrap();
         kept.push(until);

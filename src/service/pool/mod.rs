@@ -120,7 +120,7 @@ impl SearchPool {
     /// # Errors
     ///
     /// [`PoolError::Stopped`] if the job was told to stop.
-    pub async fn run_patiently<T, F>(&self, client: Client, job: F) -> Result<T, PoolError>
+    pub async fn run_in_turn<T, F>(&self, client: Client, job: F) -> Result<T, PoolError>
     where
         T: Send + 'static,
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
@@ -135,7 +135,7 @@ impl SearchPool {
     /// # Errors
     ///
     /// [`PoolError::Stopped`] if the service ends before it has begun.
-    pub async fn read_patiently<T, F>(&self, client: Client, n_bytes: usize, job: F) -> Result<T, PoolError>
+    pub async fn read_in_turn<T, F>(&self, client: Client, n_bytes: usize, job: F) -> Result<T, PoolError>
     where
         T: Send + 'static,
         F: FnOnce() -> T + Send + 'static,

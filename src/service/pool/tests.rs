@@ -105,7 +105,7 @@ async fn a_small_job_is_done_while_any_number_of_large_ones_run() {
         let place = pool.admit(client(n)).unwrap();
         assert_eq!(place.run(None, |_| Ok(7)).await, Ok(7));
         assert_eq!(place.run_reading(1, || 7).await, Ok(7));
-        assert_eq!(pool.run_patiently(client(n), |_| Ok(7)).await, Ok(7));
+        assert_eq!(pool.run_in_turn(client(n), |_| Ok(7)).await, Ok(7));
     }
     until_long(&pool, 8).await;
     assert_eq!(pool.admit(client(0)).unwrap().run(None, |_| Ok(7)).await, Ok(7));
@@ -187,7 +187,7 @@ async fn what_nobody_waits_for_makes_way_for_whoever_does() {
 #[tokio::test]
 async fn what_nobody_waits_for_leaves_a_thread_free() {
     let (pool, _abort) = pool(2, 0);
-    let mut running = Box::pin(pool.run_patiently(client(0), until_cancelled));
+    let mut running = Box::pin(pool.run_in_turn(client(0), until_cancelled));
     assert!(futures_util::poll!(&mut running).is_pending());
     assert_eq!(pool.run_to_spare(|_| Ok(())).await, Err(PoolError::Busy));
     drop(running);
@@ -197,7 +197,7 @@ async fn what_nobody_waits_for_leaves_a_thread_free() {
     }
     let mut spare = Box::pin(pool.run_to_spare(until_cancelled));
     assert!(futures_util::poll!(&mut spare).is_pending());
-    let mut running = Box::pin(pool.run_patiently(client(0), until_cancelled));
+    let mut running = Box::pin(pool.run_in_turn(client(0), until_cancelled));
     assert!(futures_util::poll!(&mut running).is_pending());
     assert_eq!(spare.await, Err(PoolError::Busy), "it had the last one for a while");
 }

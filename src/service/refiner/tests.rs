@@ -65,7 +65,7 @@ async fn who_waits_for_a_thread_comes_before_a_refinement_which_is_taken_up_agai
     let etude = etude(directory.path()).await;
     let id = made(&etude, &request()).await;
     let mut after = 0;
-    let mut running = Box::pin(etude.pool.run_patiently(Client::LOCAL, |interrupt| {
+    let mut running = Box::pin(etude.pool.run_in_turn(Client::LOCAL, |interrupt| {
         while interrupt.poll() != Signal::Cancel {
             std::thread::yield_now();
         }

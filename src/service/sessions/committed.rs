@@ -25,7 +25,7 @@ impl CommittedSteps {
     /// Takes `n_bytes` more, for what comes with the steps.
     pub(super) fn take_more(&mut self, n_bytes: usize, memory: &Memory) -> Result<(), NoRoom> {
         let n_bytes = self.n_bytes.saturating_add(n_bytes);
-        memory.hold(&mut self.held, n_bytes)?;
+        memory.reserve(&mut self.held, n_bytes)?;
         self.n_bytes = n_bytes;
         Ok(())
     }

@@ -203,7 +203,7 @@ impl Etude {
                 reading()?
             } else {
                 // About what a value takes.
-                self.pool.read_patiently(caller.client, 8 * n_values, reading).await??
+                self.pool.read_in_turn(caller.client, 8 * n_values, reading).await??
             };
             session.watch = again.watch;
             warnings = again.warnings;
@@ -217,7 +217,7 @@ impl Etude {
                 let end = move |_: &mut dyn Interrupt| {
                     Ok(end_again(online, steps, (row.policy_id, warnings), mapper.model(), &memory))
                 };
-                let (ended, policy) = self.pool.run_patiently(caller.client, end).await??;
+                let (ended, policy) = self.pool.run_in_turn(caller.client, end).await??;
                 steps = ended;
                 session.n_steps = steps.len();
                 Some(policy)
@@ -246,7 +246,7 @@ impl Etude {
         let read_bytes =
             2 * Demonstration::bytes_of(schema, n_observations) + n_observations * size_of::<Observation>();
         let mut held = None;
-        self.memory.hold(&mut held, COPIES.saturating_mul(n_bytes) + read_bytes)?;
+        self.memory.reserve(&mut held, COPIES.saturating_mul(n_bytes) + read_bytes)?;
         Ok((self.store.observations(session).await?, held))
     }
 

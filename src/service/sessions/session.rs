@@ -276,17 +276,17 @@ impl Session {
         let advanced = if is_inline {
             job(&mut Uninterrupted).map_err(|_| PoolError::Stopped)?
         } else {
-            etude.pool.run_patiently(self.client, job).await?
+            etude.pool.run_in_turn(self.client, job).await?
         };
         let (online, steps) = advanced.map_err(ServiceError::from)?;
-        self.hold(online.size_bytes() as u64)?;
+        self.reserve(online.size_bytes() as u64)?;
         self.online = Some(online);
         self.n_steps += steps.len();
         Ok(steps)
     }
 
     /// Counts what the mapping takes.
-    fn hold(&mut self, n_bytes: u64) -> Result<(), SessionError> {
+    fn reserve(&mut self, n_bytes: u64) -> Result<(), SessionError> {
         // Most windows grow and shrink a little all the time.
         if n_bytes < self.held.n_bytes() / 2 {
             self.held.shrink_to(n_bytes);
@@ -335,7 +335,7 @@ impl Session {
             drop(texts_held);
             Ok(concluded)
         };
-        let (mut steps, policy, row, refinement) = etude.pool.run_patiently(self.client, job).await??;
+        let (mut steps, policy, row, refinement) = etude.pool.run_in_turn(self.client, job).await??;
         let is_refined = refinement.is_some();
         let end = SessionEnd { session_id: self.id.clone(), owner: self.owner, policy: row.at(now), refinement };
         etude.store.end_session(end).await??;
