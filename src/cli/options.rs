@@ -1,4 +1,4 @@
-//! What flags say of a request, in `map` and `stream` alike, and what is told of it if it is wrong.
+//! The flags that `map` and `stream` share, and how faults of a request are reported at the flag or file that they come from.
 
 use std::num::NonZeroU32;
 use std::str::FromStr;
@@ -68,7 +68,7 @@ pub(super) struct ReadingFlags {
 /// A request that was read from a file, with what flags say over it.
 pub(super) struct FlaggedRequest {
     members: Members<String, Value>,
-    /// What was said by flags: pointers, and the flags.
+    /// Which flag set which value: a JSON pointer and the flag as it was typed.
     flags: Vec<(String, String)>,
 }
 

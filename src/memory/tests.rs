@@ -35,11 +35,11 @@ fn what_is_held_grows_if_there_is_room_and_shrinks() {
 fn what_is_little_need_not_be_counted() {
     let memory = Memory::with_room(MIB);
     let mut held = None;
-    memory.hold(&mut held, 64 << 10).unwrap();
+    memory.reserve(&mut held, 64 << 10).unwrap();
     assert!(held.is_none());
-    memory.hold(&mut held, (64 << 10) + 1).unwrap();
-    memory.hold(&mut held, 512 << 10).unwrap();
-    assert!(memory.hold(&mut held, 2 << 20).is_err());
+    memory.reserve(&mut held, (64 << 10) + 1).unwrap();
+    memory.reserve(&mut held, 512 << 10).unwrap();
+    assert!(memory.reserve(&mut held, 2 << 20).is_err());
     assert_eq!((held.unwrap().n_bytes(), memory.free()), (MIB / 2, MIB / 2));
 }
 

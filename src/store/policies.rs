@@ -170,7 +170,7 @@ impl Store {
             if n_bytes <= MAX_INLINE_BYTES {
                 return self.read_policy(&row, links, held, memory).await.map(Some);
             }
-            memory.hold(&mut held, COPIES * n_bytes)?;
+            memory.reserve(&mut held, COPIES * n_bytes)?;
             drop(row);
             // It has no more bytes, whichever links have changed between the two reads.
             let Some(row) = self.policy_row(id, n_bytes).await? else { return Ok(None) };
@@ -295,7 +295,7 @@ fn write_answer(
         return Ok(None);
     }
     let mut held = None;
-    memory.hold(&mut held, n_bytes)?;
+    memory.reserve(&mut held, n_bytes)?;
     let answer = stored.answer(Some(n_bytes)).map_err(corrupt("steps"))?;
     debug_assert!(answer.len() + MAX_LINK_BYTES <= n_bytes, "{} of {n_bytes}", answer.len());
     Ok(Some((answer, held)))

@@ -167,7 +167,7 @@ impl Connection<'_> {
         if text.len() <= SMALL_FRAME_BYTES {
             return Ok((read_frame(&text)?, memory));
         }
-        let reading = self.etude.pool().read_patiently(self.client, text.len(), move || read_frame(&text));
+        let reading = self.etude.pool().read_in_turn(self.client, text.len(), move || read_frame(&text));
         Ok((reading.await.map_err(|error| ends(&error.into()))??, memory))
     }
 

@@ -1,6 +1,6 @@
-//! What streams take of the service: places and memory.
+//! Places and memory of streams.
 //!
-//! All streams together take half of the memory at most, and half of that while they are idle.
+//! All streams together take at most half of the memory. Idle streams take at most half of that.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -10,44 +10,44 @@ use super::queue::QUEUE_BYTES;
 use crate::memory::{Held, Memory, NoRoom};
 use crate::service::{Client, Places};
 
-/// How much is read from a socket at once. Held by every stream, most of which wait for a small frame; a larger one is read in
-/// several goes.
+/// Size of the buffer into which a socket is read. Every stream has one, and most wait for a small frame, so it is small; a larger frame is
+/// read in several parts.
 pub const READ_BUFFER_BYTES: usize = 8 << 10;
 
-/// How much of what goes to the client is gathered before it is written.
+/// Size of the buffer in which frames to the client are gathered before they are written.
 pub const WRITE_BUFFER_BYTES: usize = 8 << 10;
 
-/// Frames up to this size need no more memory than every stream has; larger ones take theirs.
+/// A frame of up to this size fits into the buffers that every stream has. A larger one takes memory of its own.
 pub const SMALL_FRAME_BYTES: usize = 16 << 10;
 
-/// What every stream takes for its buffers: what was read, and may be a part of a frame of what was put together of it; frames that wait to
-/// be handled; frames that wait to be written; and a frame that is written with what was gathered before. 80 KiB.
+/// Memory of the buffers of a stream, 80 KiB: what was read, with a frame of which a part has come (three read buffers); the queue of frames
+/// to be handled; the queue of frames to be written; the write buffer, and the frame that is being written.
 const STREAM_BYTES: u64 =
     (3 * READ_BUFFER_BYTES + QUEUE_BYTES as usize + QUEUE_BYTES as usize + WRITE_BUFFER_BYTES + SMALL_FRAME_BYTES)
         as u64;
 
-/// What a frame takes that is larger than small while it comes, for each of its bytes, as what it is collected in may be twice as large.
+/// Memory of a large frame while it is read, per byte of the frame: its buffer grows by doubling, so it may be twice as large.
 const BYTES_PER_READ_BYTE: u64 = 2;
 
-/// What a frame takes that is larger than small while it is handled, for each of its bytes: its text, and what is read from that. The
-/// smallest objects, such as `{"x":1}`, take most, as each has a node of 11 entries.
+/// Memory of a large frame while it is handled, per byte of the frame: its text, and the JSON values parsed from it. The smallest objects,
+/// such as `{"x":1}`, take most, as each is a tree node with room for 11 entries.
 const BYTES_PER_FRAME_BYTE: u64 = 96;
 
-/// Room for all streams. Clones share it.
+/// The places and the memory of all streams. Clones share them.
 #[derive(Clone, Debug)]
 pub struct Rooms(Arc<Shared>);
 
 #[derive(Debug)]
 struct Shared {
     memory: Memory,
-    /// The part of it that is for streams.
+    /// The part of the memory that streams may take.
     part: Memory,
     places: Mutex<Places>,
     limits: Limits,
 }
 
 impl Rooms {
-    /// Room for as many streams as there may be.
+    /// Places and memory for as many streams as `limits` allow.
     #[must_use]
     pub fn new(memory: &Memory, limits: Limits) -> Self {
         let part = Memory::with_room(Self::part_bytes(memory));
@@ -55,7 +55,7 @@ impl Rooms {
         Self(Arc::new(Shared { memory: memory.clone(), part, places, limits }))
     }
 
-    /// How many streams there may be, however little each of them needs.
+    /// How many idle streams fit into `memory`.
     #[must_use]
     pub fn most_streams(memory: &Memory) -> usize {
         usize::try_from(Self::part_bytes(memory) / 2 / STREAM_BYTES).unwrap_or(usize::MAX)
@@ -65,7 +65,7 @@ impl Rooms {
         memory.room() / 2
     }
 
-    /// Room for a stream of `client`: what every one takes. A client may have as many streams as it leaves to others.
+    /// Takes a place and the memory of an idle stream for `client`. A client may have no more streams than it leaves free for others.
     ///
     /// # Errors
     ///
@@ -91,10 +91,10 @@ impl Rooms {
     }
 }
 
-/// Why there is no room for one more stream now.
+/// Why no further stream is admitted now.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum NotAdmitted {
-    /// As many streams run as may, or as many of this client's.
+    /// The limit of streams is reached, in all or for this client.
     #[error("as many streams run as may")]
     NoPlace,
     /// There is no memory for it.
@@ -102,14 +102,14 @@ pub enum NotAdmitted {
     NoRoom(#[from] NoRoom),
 }
 
-/// Memory that a stream has taken, until this is dropped.
+/// Memory that a stream has taken; dropping it gives the memory back.
 #[derive(Debug)]
 pub struct Taken {
     _part: Held,
     _whole: Held,
 }
 
-/// A place for a stream, until this is dropped.
+/// The place of a stream; dropping it gives the place back.
 #[derive(Debug)]
 struct StreamPlace {
     rooms: Rooms,
@@ -122,51 +122,51 @@ impl Drop for StreamPlace {
     }
 }
 
-/// What a stream takes of the service.
+/// The place and the memory of one stream.
 #[derive(Debug)]
 pub struct Room {
-    /// For the frame that comes.
+    /// Memory for the frame that is being read.
     reading: Mutex<Vec<Taken>>,
     _small: Taken,
     place: StreamPlace,
 }
 
-/// There was no memory for a frame for as long as it may wait for that.
+/// Memory for a frame did not become free in time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("there is no memory for a frame of this size now")]
 pub struct Crowded;
 
 impl Room {
-    /// Takes what so many more bytes of a frame need that is larger than small, until [`Self::has_read`].
+    /// Takes memory for `n_bytes` more of a large frame that is being read. It is given back by [`Self::has_read`].
     ///
     /// # Errors
     ///
-    /// [`Crowded`] if that is not free for as long as a slow reader is waited for.
+    /// [`Crowded`] if the memory does not become free within the time that a slow reader is given.
     pub async fn take_to_read(&self, n_bytes: u64) -> Result<(), Crowded> {
         let taken = self.take(BYTES_PER_READ_BYTE * n_bytes).await?;
         self.reading().push(taken);
         Ok(())
     }
 
-    /// Gives back what was taken to read a frame, which is complete.
+    /// Gives back the memory that was taken to read a frame, once the frame is complete.
     pub fn has_read(&self) {
         self.reading().clear();
     }
 
-    /// Takes what a frame of `n_bytes` needs that came, until it is handled: nothing if it is small.
+    /// Takes memory to handle a frame of `n_bytes` that was read; none if the frame is small.
     ///
     /// # Errors
     ///
-    /// [`Crowded`] if that is not free for as long as a slow reader is waited for.
+    /// [`Crowded`] if the memory does not become free within the time that a slow reader is given.
     pub async fn take_to_handle(&self, n_bytes: usize) -> Result<Option<Taken>, Crowded> {
         self.take_if_large(n_bytes, BYTES_PER_FRAME_BYTE).await
     }
 
-    /// Takes what a frame of `n_bytes` needs that goes to the client, until it is written: nothing if it is small.
+    /// Takes memory to write a frame of `n_bytes` to the client; none if the frame is small.
     ///
     /// # Errors
     ///
-    /// [`Crowded`] if that is not free for as long as a slow reader is waited for.
+    /// [`Crowded`] if the memory does not become free within the time that a slow reader is given.
     pub async fn take_to_write(&self, n_bytes: usize) -> Result<Option<Taken>, Crowded> {
         self.take_if_large(n_bytes, 1).await
     }

@@ -17,13 +17,13 @@ pub struct Learner {
     pub(super) attributes: Vec<Arc<str>>,
     /// How it learns.
     pub(super) algorithm: Algorithm,
-    /// What it starts from: version 0 of its weights.
+    /// The initial distribution: version 0 of its weights.
     pub(super) initial: Distribution,
-    /// What counts as a large difference of rewards. Above 0.
+    /// Scale of rewards: differences of rewards are divided by it. Above 0.
     pub(super) reward_scale: f64,
-    /// What its draws are keyed by, together with the number of the trial.
+    /// Seed of its draws. A draw is keyed by the seed and the number of the trial.
     pub(super) seed: u64,
-    /// How long a trial may take, in seconds. At least 1.
+    /// Lease of a trial, in seconds: a trial that takes longer expires. At least 1.
     pub(super) lease_s: u64,
 }
 
@@ -36,7 +36,7 @@ pub enum Algorithm {
         alpha: f64,
         /// How far a trial moves the expected reward: 0 to 1.
         beta: f64,
-        /// What is left of the deviations after a trial: 0 to 1.
+        /// Factor by which a trial shrinks the deviations: 0 to 1.
         gamma: f64,
         /// Deviations do not fall below this. At least 0.
         sd_min: f64,
@@ -55,19 +55,19 @@ impl Learner {
         &self.attributes
     }
 
-    /// What it starts from.
+    /// The initial distribution.
     #[must_use]
     pub fn initial(&self) -> &Distribution {
         &self.initial
     }
 
-    /// How long a trial may take, in seconds.
+    /// Lease of a trial, in seconds.
     #[must_use]
     pub fn lease_s(&self) -> u64 {
         self.lease_s
     }
 
-    /// The same learner, starting from `distribution` instead: to begin with what another learner has learned.
+    /// The same learner with `distribution` as its initial one, for example that of a learner which has learned already.
     #[must_use]
     pub fn starting_from(self, distribution: Distribution) -> Self {
         Self { initial: distribution, ..self }
@@ -102,7 +102,7 @@ impl Learner {
     /// E       <- E + beta (R - E)
     /// ```
     ///
-    /// Without an `E`, the reward becomes it first, and the means stay. Where floats overflow, results stay finite: means end at
+    /// If there is no `E` yet, the reward becomes `E` first, so the means stay. Results stay finite where floats overflow: means end at
     /// [`MAX_COST`], `E` at the largest float.
     pub fn learn(&self, distribution: &mut Distribution, weights: &[f64], reward: f64) {
         let Algorithm::Srv { alpha, beta, gamma, sd_min } = self.algorithm;
@@ -110,7 +110,7 @@ impl Learner {
         let surprise = reward - expected;
         for (mean, weight) in distribution.mean.iter_mut().zip(weights) {
             let moved = *mean + alpha * surprise / self.reward_scale * (weight - *mean);
-            // An infinite surprise times no difference at all says nothing.
+            // Infinity times 0 is NaN: where the weight was the mean, the mean stays.
             *mean = if moved.is_nan() { *mean } else { moved.clamp(0.0, MAX_COST) };
         }
         for sd in &mut distribution.sd {

@@ -1,7 +1,7 @@
 //! Worlds: where policies are executed and rewards are given.
 //!
-//! A world is apart from the imitator's model of it. It executes whatever it is told, whatever the model thinks, so that
-//! the execution may differ from the prediction.
+//! A world is not the imitator's model of it. It executes any action, also one that has no transition in the model, so an execution may
+//! differ from what the policy predicts.
 
 mod wumpus;
 

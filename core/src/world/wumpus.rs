@@ -2,16 +2,16 @@
 
 use crate::model::{Act, Cave, CaveState};
 
-/// What the world pays. Sums of these are rewards.
+/// What the world pays for each event. A reward is the sum over an execution.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Rewards {
-    /// For an action, whether it has an effect or not.
+    /// For an action other than `shoot`, whether it has an effect or not.
     pub action: f64,
-    /// For `shoot`, instead.
+    /// For `shoot`, instead of that.
     pub shot: f64,
-    /// For dying, on top of the action that did it.
+    /// For death, in addition to the action that led to it.
     pub death: f64,
-    /// For each piece of gold that is carried out, on top of the `climb` that did it.
+    /// For each piece of gold that is carried out, in addition to the `climb` that does it.
     pub gold: f64,
 }
 
@@ -37,7 +37,7 @@ pub struct Execution {
     pub n_gold: u32,
     /// Whether it died.
     pub is_dead: bool,
-    /// How everything was in the end.
+    /// The state at the end.
     pub state: CaveState,
 }
 
@@ -49,13 +49,13 @@ pub struct WumpusWorld {
 }
 
 impl WumpusWorld {
-    /// A world with the rules and things of `cave`; what body that has does not matter here.
+    /// The world of `cave`, with its pits, wumpi and gold. The body of `cave` is ignored: every action can be executed.
     #[must_use]
     pub fn new(cave: Cave, rewards: Rewards) -> Self {
         Self { cave, rewards }
     }
 
-    /// The rules and things.
+    /// The cave.
     #[must_use]
     pub fn cave(&self) -> &Cave {
         &self.cave

@@ -2,13 +2,13 @@
 //!
 //! | form | begins with |
 //! |---|---|
-//! | CSV: a header, then an observation a row | anything that the others do not begin with, or the file is called `.csv` or `.tsv` |
-//! | JSON lines: an observation a line, an object or an array of values | `{` and a whole object on the first line, or `[` and a value |
+//! | CSV: a header, then an observation per row | anything else, or the file's name ends in `.csv` or `.tsv` |
+//! | JSON lines: an observation per line, as an object or as an array of values | an object that ends on the first line, or `[` and a value |
 //! | JSON: an array of observations | `[` and then `{`, `[` or `]` |
-//! | JSON: a request, with its `demonstration` and options | `{`, without a whole observation on the first line |
+//! | JSON: a request, with its `demonstration` and options | an object that goes on after the first line, or has a `demonstration` |
 //!
-//! Rows and lines are read as they come, so that a pipe can be followed while it is written. What the values must be is not checked
-//! here: an observation is handed on with the [`Spot`] where it stood, by which faults are told.
+//! Rows and lines are read as they come, so that a pipe can be followed while it is written. Values are not checked here: each
+//! observation comes with its [`Spot`], the place in the file that a fault is reported at.
 
 mod column;
 mod json;
@@ -35,7 +35,7 @@ pub(super) use self::table::Cells;
 use self::table::Table;
 use super::CliError;
 
-/// Most observations that are read ahead of a service.
+/// Most observations that are read before a service has acknowledged them.
 pub(super) const MAX_READ_AHEAD: usize = 64;
 
 /// An observation, and where it stood.
@@ -60,8 +60,7 @@ enum Form {
 }
 
 impl Observations {
-    /// The observations in the file at `path`; `-` is standard input. `columns` are taken under other names than their own, and `cells`
-    /// says what the cells of a table are.
+    /// Opens the file at `path`; `-` is standard input. `columns` rename and scale columns; `cells` says how cells of a table become values.
     pub(super) fn open(path: &Path, columns: &[Column], cells: &Cells) -> Result<Self, CliError> {
         let read = |source| CliError::Read { path: path.to_owned(), source };
         let input: Input = if path == Path::new("-") {
@@ -109,7 +108,7 @@ impl Observations {
         &self.source
     }
 
-    /// What a request says besides its demonstration; nothing where there is only a demonstration.
+    /// The members of a request besides its demonstration; none where the input is a demonstration alone.
     pub(super) fn take_request(&mut self) -> Members<String, Value> {
         std::mem::take(&mut self.request)
     }
@@ -142,7 +141,7 @@ impl Observations {
         Observation { spot: Spot::new(&self.source, at), state }
     }
 
-    /// Reads them in a thread of its own, because waiting for standard input cannot be given up.
+    /// Reads the observations in a thread of its own, because a read of standard input cannot be cancelled.
     pub(super) fn read_ahead(mut self) -> mpsc::Receiver<Result<Option<Observation>, CliError>> {
         let (sender, observations) = mpsc::channel(MAX_READ_AHEAD);
         std::thread::spawn(move || {
@@ -188,7 +187,7 @@ fn form_of(path: &Path, head: &[u8]) -> FormName {
         },
         Some(_) if is_called(&["json"]) => FormName::Document,
         Some(_) if is_called(&["ndjson", "jsonl"]) => FormName::Lines,
-        // Nothing at all is no observation of any form.
+        // An empty input has no observations, whatever its form.
         None => FormName::Lines,
         Some(_) => FormName::Table,
     }

@@ -10,16 +10,16 @@ use crate::cli::{CliError, note};
 use etude_core::attribute::{AttributeDocument, Cycle, Kind, KindName, Value as Known};
 use etude_core::model::Model;
 
-/// What the cells of a table are, by the attributes of a model.
+/// How the cells of a table become values, by attribute of a model.
 #[derive(Clone, Debug)]
 pub(in crate::cli) struct Cells(Vec<(String, Cell)>);
 
-/// What the cells of an attribute are.
+/// How the cells of an attribute become values.
 #[derive(Clone, Debug)]
 enum Cell {
     Number,
     Label,
-    /// Booleans and integers where they look like one, but for these strings, which a model has.
+    /// A cell that looks like a boolean or an integer is one, unless it is one of these strings, which are values of the model.
     Category(HashSet<Box<str>>),
 }
 
@@ -41,7 +41,7 @@ impl Cells {
         Self(attributes.map(|(n, attribute)| (attribute.name.clone(), cell(n, &attribute.kind))).collect())
     }
 
-    /// Those of the attributes that a service tells of a model. Which strings its states have is not known.
+    /// By the attributes in a service's answer. It does not say which strings the model's states have.
     pub(in crate::cli) fn told(attributes: &[AttributeDocument]) -> Self {
         let cell = |attribute: &AttributeDocument| match attribute.kind {
             KindName::Category => Cell::Category(HashSet::new()),
@@ -57,8 +57,8 @@ impl Cells {
 }
 
 impl Cell {
-    /// The value of a cell that says `text`; `null` if it says nothing. What is none of the attribute's values is handed on as a string,
-    /// which is refused by who reads the observation.
+    /// The value of the cell `text`; `null` if it is empty or NaN. A cell that is no value of the attribute becomes a string, which is
+    /// refused where the observation is read against the model.
     fn value(&self, text: &str) -> Value {
         if text.is_empty() || text.eq_ignore_ascii_case("nan") {
             return Value::Null;
@@ -72,7 +72,7 @@ impl Cell {
     }
 }
 
-/// A number as it is written in JSON, if it can be, so that none of its digits is lost here.
+/// A number with all its digits where JSON can write them; else rounded to a float.
 fn number(text: &str) -> Option<Value> {
     if let Ok(number) = text.parse::<Number>() {
         return Some(number.into());
@@ -80,8 +80,8 @@ fn number(text: &str) -> Option<Value> {
     Some(Number::from_f64(text.parse().ok()?)?.into())
 }
 
-/// What a cell is that may be anything: a boolean (Python and spreadsheets write it in their own ways), an integer (which Python writes as
-/// `1.0` where another cell of the column is empty), or a string.
+/// The value of a category's cell: a boolean (`true`, Python's `True`, a spreadsheet's `TRUE`), an integer (pandas writes `1.0` for 1 if
+/// another cell of the column is empty), or a string.
 fn plain(text: &str) -> Value {
     if text.eq_ignore_ascii_case("true") || text.eq_ignore_ascii_case("false") {
         return text.eq_ignore_ascii_case("true").into();
@@ -111,7 +111,7 @@ pub(super) struct Table {
 impl Table {
     /// Reads the header of a table.
     pub(super) fn read(mut lines: Lines, columns: &[Column], cells: &Cells) -> Result<Self, CliError> {
-        // Where numbers are written with commas, those do not stand between cells.
+        // In countries with decimal commas, spreadsheets separate cells by semicolons.
         let head = lines.first()?;
         let separator = [b',', b';', b'\t'].into_iter().find(|separator| head.contains(separator)).unwrap_or(b',');
         let mut table = Self { lines, separator, n_columns: 0, taken: Vec::new() };
