@@ -4,16 +4,13 @@
 //! derived from it), [`Options::read`] reads each of them and notes what is wrong with it, and [`RequestKind::fields`] says which request
 //! may have which. A new option needs a line in each.
 
-use std::collections::BTreeMap;
 use std::num::NonZeroU32;
 use std::time::Duration;
 
-use serde::{Deserialize, Serialize};
-
 use super::{Budget, Conditions, Demonstration, HeuristicName, Settings, longest_lookahead};
-use crate::attribute::{Kind, Scalar, Weights};
+use crate::attribute::{Kind, Weights};
 use crate::document::{Faults, Object, Path, Place, Range};
-use crate::model::{ActionIdx, Model, Origin, StateIdx};
+use crate::model::{ActionIdx, Model, Origin};
 
 /// What is requested.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -104,7 +101,7 @@ pub struct Options {
     pub weights: Vec<(usize, f64)>,
     /// Where the imitator may start: a state, or several, of which the mapping starts where that costs least. If left out, as the model
     /// says.
-    #[cfg_attr(feature = "openapi", schema(value_type = Option<StartReference>))]
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<super::StartReference>))]
     pub start: Option<Vec<Origin>>,
     /// How many observations past the current one a decision may wait for; `null`: all. With a number, the policy is what a
     /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`). It may reach so far that
@@ -352,69 +349,4 @@ fn read_heuristic(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Heuristi
         Some((_, heuristic)) => Some(heuristic),
         None => place.mismatch("one of \"default\", \"paper\", \"none\"", faults),
     }
-}
-
-/// An observed state: an object by attribute name, or an array of values in attribute order.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[serde(untagged)]
-#[cfg_attr(feature = "openapi", schema(as = Observation))]
-pub enum ObservationDocument {
-    /// By attribute name; those left out were not observed.
-    ByName(BTreeMap<String, ObservedDocument>),
-    /// In attribute order.
-    InOrder(Vec<ObservedDocument>),
-}
-
-/// An observed value; `null` was not observed.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ObservedDocument(pub Option<Scalar>);
-
-// Derived, it would be one of a reference and null, of which generators of clients make a class without members.
-#[cfg(feature = "openapi")]
-impl utoipa::PartialSchema for ObservedDocument {
-    fn schema() -> utoipa::openapi::RefOr<utoipa::openapi::Schema> {
-        use utoipa::openapi::RefOr;
-        use utoipa::openapi::schema::{ObjectBuilder, Schema, Type};
-        let mut schema = Scalar::schema();
-        if let RefOr::T(Schema::AnyOf(any)) = &mut schema {
-            any.description = Some("An observed value; `null` was not observed.".to_owned());
-            any.items.push(ObjectBuilder::new().schema_type(Type::Null).into());
-        }
-        schema
-    }
-}
-
-#[cfg(feature = "openapi")]
-impl utoipa::ToSchema for ObservedDocument {
-    fn name() -> std::borrow::Cow<'static, str> {
-        "Observed".into()
-    }
-}
-
-/// A state, or a list of states: an index, or attribute values that exactly one state has. In a world that is searched lazily, all
-/// attribute values but that of `gold`, which may be left out; there, only the start has an index, 0.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[serde(untagged)]
-pub enum StartReference {
-    /// The state's index.
-    #[cfg_attr(feature = "openapi", schema(value_type = u32))]
-    Index(StateIdx),
-    /// Values by attribute name.
-    Values(BTreeMap<String, Scalar>),
-    /// Several states, at least one.
-    Several(Vec<StateReference>),
-}
-
-/// A state: its index, or attribute values that exactly one state has.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[serde(untagged)]
-pub enum StateReference {
-    /// The state's index.
-    #[cfg_attr(feature = "openapi", schema(value_type = u32))]
-    Index(StateIdx),
-    /// Values by attribute name.
-    Values(BTreeMap<String, Scalar>),
 }
