@@ -7,7 +7,7 @@ use futures_util::{SinkExt, StreamExt};
 use serde_json::{Map, Value, json};
 use tokio_tungstenite::tungstenite::Message;
 
-use crate::harness::contract::{CONTRACT, listed};
+use crate::harness::contract::{Answered, CONTRACT, Sent, listed};
 use crate::harness::service::{Service, answer};
 use crate::harness::waiting::within;
 
@@ -181,4 +181,163 @@ async fn the_distance_is_what_the_description_of_attributes_says() {
     let (_, policy) = service.post("/v1/policies", &request).await;
     assert!(told.contains(&format!("= {}`", policy["cost"]["distance"])), "{}: {told}", policy["cost"]);
     assert_eq!(policy["steps"][0]["distance_by_attribute"], json!({"x": 2.25, "heading": 1.0, "door": 5.0}));
+}
+
+#[tokio::test]
+async fn a_fault_of_form_is_refused_and_not_valid() {
+    let service = Service::start(&[]).await;
+    let mut examples = BTreeMap::new();
+    for (method, template, operation) in listed() {
+        let id = operation["operationId"].as_str().unwrap().to_owned();
+        if let Some((_, example)) = body(&operation).filter(|(content_type, _)| *content_type == "application/json") {
+            if id.starts_with("put_") && id != "put_reward" {
+                let path = path(&template, &operation, &BTreeMap::new());
+                assert_eq!(service.put(&path, example).await.0, 201);
+            }
+            examples.insert(id, (method, template, operation.clone()));
+        }
+    }
+    let (_, made) = service.post("/v1/learners/doors/trials", body(&examples["make_trial"].2).unwrap().1).await;
+    let ids = BTreeMap::from([("trial", made["id"].as_str().unwrap().to_owned())]);
+    for (id, pointer, faulty) in [
+        ("put_model", "", json!([])),
+        ("put_model", "/hurry", json!(1)),
+        ("put_model", "/dynamics/kind", json!("tables")),
+        ("put_model", "/dynamics/walls", json!([])),
+        ("put_model", "/dynamics/states/0/0", json!([0])),
+        ("put_model", "/dynamics/transitions/0", json!([0, "forward"])),
+        ("put_model", "/dynamics/transitions/0", json!([0, "forward", 1, 1, 1, 1])),
+        ("put_model", "/dynamics/transitions/0", json!([0, "forward", -1])),
+        ("put_model", "/dynamics/transitions/0", json!([0, "forward", 1, 0])),
+        ("put_model", "/dynamics/transitions/0", json!([0, "forward", 1, 1.5])),
+        ("put_model", "/dynamics/transitions/0", json!([0, "forward", 1, 1, -2])),
+        ("put_model", "/dynamics/start", json!("first")),
+        ("put_model", "/attributes/0/kind", json!("integer")),
+        ("put_model", "/attributes/0/scale", json!(0)),
+        ("put_model", "/attributes/0/weight", json!(-1)),
+        ("put_model", "/attributes/0/unit", json!("m")),
+        ("put_model", "/actions/0/cost", json!(-0.1)),
+        ("put_model", "/dynamics", json!({"kind": "wumpus", "width": 0, "height": 4})),
+        ("put_model", "/dynamics", json!({"kind": "wumpus", "width": 4, "height": 4, "arrows": 101})),
+        ("put_model", "/dynamics", json!({"kind": "wumpus", "width": 4, "height": 4, "gold": [[1, 2, 3]]})),
+        ("put_model", "/dynamics", json!({"kind": "wumpus", "width": 4, "height": 4, "start": {"x": 0}})),
+        ("make_policy", "/model", json!(7)),
+        ("make_policy", "/demonstration", json!({})),
+        ("make_policy", "/demonstration/0", json!(3)),
+        ("make_policy", "/demonstration/0/x", json!([1])),
+        ("make_policy", "/weights/x", json!("2")),
+        ("make_policy", "/lookahead", json!(0)),
+        ("make_policy", "/lookahead", json!(1.5)),
+        ("make_policy", "/heuristic", json!("magic")),
+        ("make_policy", "/max_expansions", json!(-1)),
+        ("make_policy", "/deadline_ms", json!(86_400_001)),
+        ("make_policy", "/extra_weight", json!(1.5)),
+        ("make_policy", "/end_weight", json!(-1)),
+        ("make_policy", "/observation_weights", json!(1)),
+        ("make_policy", "/start", json!([[0]])),
+        ("make_policy", "/without", json!("forward")),
+        ("make_policy", "/action_costs", json!([1])),
+        ("make_policy", "/store", json!("no")),
+        ("make_policy", "/explore", json!(true)),
+        ("make_policies", "/items", json!([])),
+        ("make_policies", "/speed", json!(1)),
+        ("put_learner", "/attributes", json!("x")),
+        ("put_learner", "/lease_s", json!(0)),
+        ("put_learner", "/reward_scale", json!(0)),
+        ("put_learner", "/algorithm", json!({"kind": "sarsa"})),
+        ("put_learner", "/algorithm", json!({"kind": "srv", "beta": 2})),
+        ("put_learner", "/seed", json!(-1)),
+        ("make_trial", "/learner", json!("doors")),
+        ("make_trial", "/demonstration", json!(null)),
+        ("put_reward", "/reward", json!("much")),
+        ("put_reward", "", json!({})),
+        ("fail_trial", "/reason", json!(7)),
+    ] {
+        let (method, template, operation) = &examples[id];
+        let mut document = body(operation).unwrap().1.clone();
+        match pointer.rsplit_once('/') {
+            None => document = faulty.clone(),
+            Some((parent, member)) => match document.pointer_mut(parent).unwrap() {
+                Value::Array(items) => items[member.parse::<usize>().unwrap()] = faulty.clone(),
+                parent => parent[member] = faulty.clone(),
+            },
+        }
+        let path = path(template, operation, &ids);
+        let (status, answered) = answer(service.send(method.clone(), &path, &document).await).await;
+        assert_eq!(status, 422, "{id} with {faulty} at {pointer:?}: {answered}");
+        assert_ne!(
+            CONTRACT.broken_by_schema(&body_schema(id), &document),
+            None,
+            "{id} with {faulty} at {pointer:?} is valid"
+        );
+    }
+}
+
+#[tokio::test]
+async fn the_json_requests_of_the_readme_are_what_the_description_says() {
+    let readme = include_str!("../../README.md").replace("\\\n", " ");
+    let service = Service::start(&[]).await;
+    let (mut trial, mut n_sent) = (String::new(), 0);
+    let blocks = readme.split("```sh\n").skip(1).map(|block| block.split_once("```").unwrap());
+    for (commands, after) in blocks {
+        for command in commands.lines().filter(|line| line.contains("curl ")) {
+            let json = command.split("--json ").nth(1);
+            let path =
+                command.split("http://127.0.0.1:8080").nth(1).and_then(|path| path.split([' ', '|', ')']).next());
+            // What is made by another program, or compressed, or streamed, is not here to be read.
+            let (Some(json), Some(path)) = (json.filter(|json| !json.starts_with("@-")), path) else { continue };
+            let document: Value = match json.strip_prefix('@') {
+                Some(file) => {
+                    crate::harness::service::example(file.split(' ').next().unwrap().strip_prefix("examples/").unwrap())
+                }
+                None => serde_json::from_str(json.split('\'').nth(1).unwrap()).unwrap(),
+            };
+            let method = if command.contains("-X PUT") { reqwest::Method::PUT } else { reqwest::Method::POST };
+            let path = path.replace("$trial", &trial);
+            // If it is accepted, the harness holds it against its schema.
+            let (status, answered) = answer(service.send(method, &path, &document).await).await;
+            let is_faulty = after.trim_start().starts_with("```json\n{\"type\":\"/problems/");
+            assert!(if is_faulty { status == 422 } else { status < 300 }, "{command}: {status} {answered}");
+            if path.ends_with("/trials") {
+                answered["id"].as_str().unwrap().clone_into(&mut trial);
+            }
+            n_sent += 1;
+        }
+    }
+    assert!(n_sent >= 6, "{n_sent} requests");
+}
+
+#[test]
+fn what_breaks_the_contract_is_found() {
+    let sent = |body: &str| Sent {
+        method: reqwest::Method::PUT,
+        url: "http://127.0.0.1/v1/trials/7/reward".parse().unwrap(),
+        content_type: Some("application/json".to_owned()),
+        body: Some(body.into()),
+    };
+    let is_kept = |sent: Sent, status: u16, body: &Value| {
+        let text = body.to_string();
+        let content_type = Some(if status < 300 { "application/json" } else { "application/problem+json" });
+        let answered = Answered { status, content_type, body: Some(text.as_bytes()) };
+        std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| CONTRACT.check(&sent, &answered))).is_ok()
+    };
+    let trial = json!({
+        "id": "7", "learner": "gold", "number": 1, "status": "rewarded", "weights": {"x": 1}, "weights_version": 0, "reward": 1,
+        "reward_order": 1, "learned_version": null, "reason": null, "lease_expires_at": "2026-01-01T00:00:00Z", "policy_id": "8",
+    });
+    let but = |member: &str, value: Value| {
+        let mut other = trial.clone();
+        other[member] = value;
+        other
+    };
+    let problem = json!({"type": "/problems/x", "title": "X", "status": 422, "detail": "x", "request_id": "y"});
+    assert!(is_kept(sent(r#"{"reward": 1}"#), 200, &trial));
+    assert!(is_kept(sent("nonsense"), 422, &problem), "what is refused may be anything");
+    assert!(!is_kept(sent(r#"{"reward": "1"}"#), 200, &trial), "accepted, though it is not valid");
+    assert!(!is_kept(sent(r#"{"reward": 1, "hurry": 1}"#), 200, &trial));
+    assert!(!is_kept(sent(r#"{"reward": 1}"#), 201, &trial), "a status that is not told");
+    assert!(!is_kept(sent(r#"{"reward": 1}"#), 200, &problem), "another answer");
+    assert!(!is_kept(sent(r#"{"reward": 1}"#), 200, &but("mood", json!("good"))), "a member that is not described");
+    assert!(!is_kept(sent(r#"{"reward": 1}"#), 200, &but("status", json!("lost"))));
+    assert!(!is_kept(sent(r#"{"reward": 1}"#), 200, &but("lease_expires_at", json!("soon"))));
 }
