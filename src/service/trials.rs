@@ -23,6 +23,15 @@ use etude_core::learning::Learner;
 use etude_core::mapping::{RequestKind, Stamp};
 use etude_core::model::Model;
 
+/// So often a trial is drawn whose number others take each time.
+pub(super) const MAX_DRAWS: u32 = 8;
+
+/// Why a trial was drawn in vain.
+enum NotStored {
+    NumberTaken,
+    KeyTaken,
+}
+
 /// Longest reason for a failure, in characters.
 const MAX_REASON_CHARS: usize = 1000;
 
@@ -94,7 +103,8 @@ impl Etude {
         Ok(TrialAnswer { status: TrialStatus::Active, ..answer })
     }
 
-    /// Draws a trial, and stores it with the key of its request, if that has one.
+    /// Draws a trial, and stores it with the key of its request, if that has one. Where another server has taken its number meanwhile, it
+    /// is drawn anew.
     async fn make_keyed_trial(
         &self,
         name: &Name,
@@ -102,6 +112,23 @@ impl Etude {
         body: Bytes,
         caller: Caller,
     ) -> Result<Result<TrialAnswer, KeyTaken>, ServiceError> {
+        for _ in 0..MAX_DRAWS {
+            match self.try_trial(name, key, body.clone(), caller).await? {
+                Err(NotStored::NumberTaken) => {}
+                Err(NotStored::KeyTaken) => return Ok(Err(KeyTaken)),
+                Ok(made) => return Ok(Ok(made)),
+            }
+        }
+        Err(PoolError::Busy.into())
+    }
+
+    async fn try_trial(
+        &self,
+        name: &Name,
+        key: Option<&NewRequestKey>,
+        body: Bytes,
+        caller: Caller,
+    ) -> Result<Result<TrialAnswer, NotStored>, ServiceError> {
         let LearnerState { sequence, name, learner, weights } = self.learner_state(name.as_str(), None).await?;
         let numbers = self.store.trial_numbers(sequence).await?;
         let id = self.ids.next().to_string();
@@ -166,8 +193,8 @@ impl Etude {
         match self.store.open_trial(new).await? {
             Opened::Yes => {}
             Opened::NoLearner => return Err(unknown(&name, None)),
-            Opened::NumberTaken => return Err(PoolError::Busy.into()),
-            Opened::KeyTaken => return Ok(Err(KeyTaken)),
+            Opened::NumberTaken => return Ok(Err(NotStored::NumberTaken)),
+            Opened::KeyTaken => return Ok(Err(NotStored::KeyTaken)),
         }
         if is_refined {
             self.refiner.wake();
@@ -364,3 +391,6 @@ fn read_policy(policy: String, id: &str) -> Result<Box<RawValue>, ServiceError> 
     let read = RawValue::from_string(policy);
     read.map_err(|error| ServiceError::unreadable("policies", "policy", id, error))
 }
+
+#[cfg(test)]
+mod tests;

@@ -27,6 +27,7 @@ pub use session::{Observation, Received, RewardState, Session};
 use super::opening::{self, SessionOptions};
 use super::owners::Ownership;
 use super::requests::Named;
+use super::trials::MAX_DRAWS;
 use super::{Caller, Etude, Kind, PoolError, ServiceError};
 use crate::memory::{Held, Memory};
 use crate::store::{
@@ -75,34 +76,38 @@ impl Etude {
         let SessionOptions { mut weights, conditions, lookahead } = faults.check(read)?;
         let model = names.model;
 
-        let mut trial = None;
-        if let (true, Some(ready)) = (explores, &learner) {
-            let draw = self.draw(ready, mapper.model().schema(), now).await?;
-            weights = draw.weights;
-            trial = Some(draw.trial);
-        }
         let id = self.ids.next().to_string();
         let ownership = self.owners.take(&id).await?;
-        let source = Source {
+        let mut session = NewSession {
+            id: id.clone(),
+            model: model.clone(),
+            model_hash: model_hash.clone(),
+            weights: mapper.model().schema().by_attribute(weights.as_slice().iter().copied()),
+            lookahead: lookahead.map(NonZeroU32::get),
+            conditions: conditions.clone(),
             learner: learner.as_ref().map(|ready| ready.name.clone()),
             weights_version: learner.as_ref().map(|ready| ready.weights.version),
-            trial_id: trial.as_ref().map(|trial| trial.id.clone()),
+            trial: None,
+            created_at: now,
         };
-        let opened = self
-            .store
-            .open_session(NewSession {
-                id: id.clone(),
-                model: model.clone(),
-                model_hash: model_hash.clone(),
-                weights: mapper.model().schema().by_attribute(weights.as_slice().iter().copied()),
-                lookahead: lookahead.map(NonZeroU32::get),
-                conditions: conditions.clone(),
-                learner: source.learner.clone(),
-                weights_version: source.weights_version,
-                trial,
-                created_at: now,
-            })
-            .await?;
+        let mut opened = Opened::NumberTaken;
+        let mut trial_id = None;
+        // Anew where another server has taken the trial's number meanwhile.
+        for _ in 0..MAX_DRAWS {
+            if let (true, Some(ready)) = (explores, &learner) {
+                let draw = self.draw(ready, mapper.model().schema(), now).await?;
+                weights = draw.weights;
+                session.weights = mapper.model().schema().by_attribute(weights.as_slice().iter().copied());
+                trial_id = Some(draw.trial.id.clone());
+                session.trial = Some(draw.trial);
+            }
+            opened = self.store.open_session(session.clone()).await?;
+            if opened != Opened::NumberTaken {
+                break;
+            }
+        }
+        let NewSession { learner, weights_version, .. } = session;
+        let source = Source { learner, weights_version, trial_id };
         match opened {
             Opened::Yes => {}
             Opened::NoLearner => {
