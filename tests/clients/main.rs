@@ -1,7 +1,7 @@
 //! Public generators make clients of `openapi.yaml` that can do what a user does first: register a model, get a policy, draw a trial, send
 //! its reward.
 //!
-//! The generators are installed from PyPI into a folder of the build, once. Where that cannot be done, nothing is tested, which is said on
+//! The generators are installed from `PyPI` into a folder of the build, once. Where that cannot be done, nothing is tested, which is said on
 //! standard error; but with `ETUDE_TEST_CLIENTS` in the environment, as in `.ci/run`, it fails.
 
 #![expect(clippy::unwrap_used, reason = "tests may panic")]
