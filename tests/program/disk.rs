@@ -7,11 +7,12 @@ use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use crate::harness::client::Client;
 use crate::harness::process::Process;
 use crate::harness::service::{answer, example};
 use crate::harness::waiting::{LIMIT, within};
 use futures_util::{SinkExt, StreamExt};
-use reqwest::{Client, Method};
+use reqwest::Method;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 use tokio::net::TcpStream;
@@ -99,7 +100,7 @@ fn large_model() -> Value {
 
 impl Tried {
     fn new(process: &Process) -> Self {
-        let client = Client::builder().no_proxy().build().unwrap();
+        let client = Client::new();
         Self { client, address: process.address.clone(), n_rounds: 0 }
     }
 

@@ -5,10 +5,10 @@ use std::process::Command;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use crate::harness::client::Client;
 use crate::harness::process::Process;
 use crate::harness::service::example;
 use crate::harness::waiting::within;
-use reqwest::Client;
 use serde_json::{Value, json};
 use tokio::sync::{Mutex, Notify};
 
@@ -48,7 +48,7 @@ async fn every_acknowledged_reward_is_there_once_after_a_hundred_kills() {
     const N_CLIENTS: usize = 6;
     let directory = tempfile::tempdir().unwrap();
     let database = directory.path().join("etude.db");
-    let client = Client::builder().no_proxy().build().unwrap();
+    let client = Client::new();
     let demonstration = example("figure-6/demonstration.json");
     let request = Arc::new(json!({"model": "figure-6", "demonstration": demonstration}));
     let known = Arc::new(Known::default());

@@ -107,7 +107,7 @@ async fn a_service_killed_a_hundred_times_loses_and_doubles_nothing() {
     let database = directory.path().join("etude.db");
     let mut process = Process::start(&database);
     let model: Value = serde_json::from_str(include_str!("../../examples/figure-4/model.json")).unwrap();
-    let client = reqwest::Client::builder().no_proxy().build().unwrap();
+    let client = crate::harness::client::Client::new();
     let registered = client.put(format!("http://{}/v1/models/figure-4", process.address)).json(&model).send().await;
     assert!(registered.unwrap().status().is_success());
 
@@ -226,7 +226,7 @@ async fn the_command_goes_on_by_itself_when_its_service_is_killed_and_restarted(
     assert_eq!(total(done), total(expected_done));
     assert_eq!(printed, expected, "no step is missing, none comes twice");
 
-    let client = reqwest::Client::builder().no_proxy().build().unwrap();
+    let client = crate::harness::client::Client::new();
     let sessions: Value = client.get(format!("{server}/v1/sessions")).send().await.unwrap().json().await.unwrap();
     let [session] = sessions["items"].as_array().unwrap().as_slice() else { panic!("{sessions}") };
     assert_eq!((&session["status"], &session["observations"]), (&json!("done"), &json!(observations.len())));
