@@ -46,13 +46,13 @@ pub struct ServeConfig {
     /// Searches that wait for a thread; further ones are answered 503.
     #[arg(long, env = "ETUDE_SEARCH_QUEUE", default_value_t = 256, value_parser = parse_places, value_name = "N")]
     pub search_queue: usize,
-    /// Largest request body; once it is decompressed, too.
+    /// Largest request body, as it is sent and after decompression.
     #[arg(long, env = "ETUDE_MAX_BODY_BYTES", value_parser = parse_bytes::<usize>, default_value_t = 8 * 1024 * 1024, value_name = "BYTES")]
     pub max_body_bytes: usize,
     /// Largest model, as it is sent [default: as other bodies].
     #[arg(long, env = "ETUDE_MAX_MODEL_BYTES", value_parser = parse_bytes::<usize>, value_name = "BYTES")]
     pub max_model_bytes: Option<usize>,
-    /// Largest model, once it is decompressed.
+    /// Largest model after decompression.
     #[arg(long, env = "ETUDE_MAX_MODEL_TEXT_BYTES", value_parser = parse_bytes::<u64>, default_value_t = 512 * 1024 * 1024, value_name = "BYTES")]
     pub max_model_text_bytes: u64,
     /// Most states of a model; a wumpus world of more is searched lazily.
@@ -69,15 +69,15 @@ pub struct ServeConfig {
     /// Of that, for models that are kept ready to be searched [default: a quarter, 1 GiB at most].
     #[arg(long, env = "ETUDE_MODEL_CACHE_BYTES", value_parser = parse_bytes::<u64>, value_name = "BYTES")]
     pub model_cache_bytes: Option<u64>,
-    /// How long a search may take, from the arrival of its request, unless that says so itself.
+    /// How long a search may take, counted from the arrival of its request, if the request has no `deadline_ms`.
     #[arg(
         long, env = "ETUDE_DEFAULT_DEADLINE", default_value = "10s", value_parser = parse_period, value_name = "TIME"
     )]
     pub default_deadline: Duration,
-    /// How long a search may take at most, whatever its request says.
+    /// Longest time of a search; a longer `deadline_ms` is cut to it.
     #[arg(long, env = "ETUDE_MAX_DEADLINE", default_value = "10m", value_parser = parse_period, value_name = "TIME")]
     pub max_deadline: Duration,
-    /// How long compiling a model may take; beyond that, it is refused.
+    /// How long compiling a model may take; a model that takes longer is refused.
     #[arg(long, env = "ETUDE_MAX_COMPILE_TIME", default_value = "30s", value_parser = parse_period, value_name = "TIME")]
     pub max_compile_time: Duration,
     /// Connections at the same time; lowered to what the limits of files and of memory allow. Further ones are answered 503.
@@ -94,7 +94,7 @@ pub struct ServeConfig {
         long, env = "ETUDE_SESSION_IDLE_TIMEOUT", default_value = "1h", value_parser = parse_duration, value_name = "TIME"
     )]
     pub session_idle_timeout: Duration,
-    /// How long a client may leave unread what waits for it.
+    /// How long a client may leave answers and frames unread.
     #[arg(
         long, env = "ETUDE_SLOW_READER_TIMEOUT", default_value = "10s", value_parser = parse_period, value_name = "TIME"
     )]
@@ -112,7 +112,7 @@ pub struct ServeConfig {
 }
 
 impl ServeConfig {
-    /// The settings of an application that goes by `clock` and makes `ids`.
+    /// The settings of the application, with its clock and its source of ids.
     #[must_use]
     pub fn settings(&self, clock: Clock, ids: Ids) -> Settings {
         let n_cores = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
@@ -146,7 +146,7 @@ impl ServeConfig {
 }
 
 impl ServeConfig {
-    /// What connections may use.
+    /// Limits of connections.
     #[must_use]
     pub fn connection_limits(&self) -> ConnectionLimits {
         ConnectionLimits {
@@ -159,9 +159,9 @@ impl ServeConfig {
     /// The same settings, with no more connections than `max_files` open files and the memory that is kept for them allow.
     #[must_use]
     pub fn within(&self, max_files: u64) -> Self {
-        /// Files that are no connections: those of the database, of logs, of the runtime.
+        /// Open files of the database, the logs and the runtime.
         const OTHER_FILES: u64 = 64;
-        /// What an idle connection, or one that begins a request, uses at most.
+        /// Most memory of a connection that is idle or begins a request.
         const CONNECTION_BYTES: u64 = 64 * 1024;
         let max_memory = self.max_memory.unwrap_or_else(memory::default_max_bytes);
         let by_memory = max_memory.saturating_sub(Memory::new(max_memory).room()) / CONNECTION_BYTES;
@@ -169,7 +169,7 @@ impl ServeConfig {
         Self { max_connections: self.max_connections.min(allowed).max(MIN_CONNECTIONS), ..self.clone() }
     }
 
-    /// What a stream may use.
+    /// Limits of streams.
     #[must_use]
     pub fn stream_limits(&self) -> Limits {
         let memory = Memory::new(self.max_memory.unwrap_or_else(memory::default_max_bytes));

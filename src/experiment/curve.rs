@@ -5,10 +5,10 @@ use std::collections::BTreeMap;
 use super::{Laboratory, LearnerId, Scene};
 use etude_core::learning::{AlgorithmDocument, LearnerDocument, PerAttributeDocument};
 
-/// How the experiment is done.
+/// Settings of the experiment.
 #[derive(Clone, Debug, PartialEq)]
 pub struct CurvePlan {
-    /// The learner; its seed is the first one, and each further run takes the next; after the last there is, 0.
+    /// The learner of the first run. Each further run has the next seed; after the largest, seeds go on from 0.
     pub learner: LearnerDocument,
     /// How many runs there are.
     pub n_runs: usize,
@@ -48,13 +48,13 @@ impl CurvePlan {
 pub struct Run {
     /// The seed of its learner.
     pub seed: u64,
-    /// What each trial earned.
+    /// Reward of each trial.
     pub rewards: Vec<f64>,
-    /// What was learned in the end: mean weights by attribute.
+    /// Mean weights after the last trial, by attribute.
     pub means: BTreeMap<String, f64>,
 }
 
-/// What several runs came to.
+/// The rewards of several runs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Curve {
     /// The runs, all of the same length.

@@ -10,7 +10,7 @@ use etude_core::learning::{Distribution, Learner, LearnerDocument, MissingAttrib
 use etude_core::mapping::{Conditions, Demonstration, Mapper, Mapping, Problem, Settings};
 use etude_core::model::{CompileError, Definition, Limits, Model};
 
-/// Why a laboratory in this process could not do as asked.
+/// Why a laboratory in this process failed.
 #[derive(Debug, thiserror::Error)]
 pub enum LocalError {
     /// A definition, model or demonstration has faults.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::{CurvePlan, Laboratory, Scene, curve};
 
-/// What is earned where the gold lies.
+/// The rewards at one location of the gold.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct LocationRow {
     /// `L1` to `L4`.
@@ -15,7 +15,7 @@ pub struct LocationRow {
     pub learned: f64,
 }
 
-/// What is earned at all locations.
+/// The rewards at all locations.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Locations {
     /// By location.

@@ -25,9 +25,9 @@ pub use scene::Scene;
 
 use etude_core::learning::LearnerDocument;
 
-/// Where experiments run. Everything that learns and maps is behind it; worlds are not.
+/// What experiments run on: it maps, draws trials and learns. The worlds, which give rewards, are outside of it.
 pub trait Laboratory {
-    /// Why it could not do as asked.
+    /// Why it failed.
     type Error;
 
     /// Starts a learner under a name that is its own.
@@ -73,17 +73,17 @@ pub struct LearnerId(pub String);
 /// A trial that was drawn.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Attempt {
-    /// What the laboratory knows it by.
+    /// Its id in the laboratory.
     pub id: String,
-    /// What is to be executed.
+    /// The actions to execute.
     pub actions: Vec<String>,
 }
 
-/// A mapping, as far as experiments look at it.
+/// What experiments use of a mapping.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Followed {
-    /// What is to be executed.
+    /// The actions to execute.
     pub actions: Vec<String>,
-    /// What it costs.
+    /// Total cost of the mapping.
     pub cost: f64,
 }

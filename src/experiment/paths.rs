@@ -10,35 +10,35 @@ pub struct Paths {
     pub demonstrator: Vec<Cell>,
     /// Where the imitator goes, from its start on.
     pub imitator: Vec<Cell>,
-    /// What it does.
+    /// The imitator's actions.
     pub actions: Vec<String>,
-    /// What its mapping costs.
+    /// Total cost of the mapping.
     pub cost: f64,
-    /// What it earns.
+    /// Reward of the imitator.
     pub reward: f64,
-    /// What either did on the way.
+    /// Shots and grabs of both.
     pub marks: Vec<Mark>,
 }
 
-/// Something that was done on the way.
+/// A shot or a grab.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Mark {
-    /// Where.
+    /// The cell in which it was done.
     pub cell: Cell,
-    /// What.
+    /// Which of the two it was.
     pub deed: Deed,
-    /// By whom: the imitator, or the demonstrator.
+    /// Whether the imitator did it; else the demonstrator did.
     pub by_imitator: bool,
 }
 
-/// What may be done on the way.
+/// What is marked on a path.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Deed {
     /// A piece of gold was grabbed.
     Grab,
     /// A wumpus was shot.
     Shot {
-        /// Where it was.
+        /// The cell of the wumpus.
         hit: Cell,
     },
 }

@@ -6,7 +6,7 @@ use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Act, Cave, Cell, Definition, Limits};
 use etude_core::world::{Execution, Rewards, WumpusWorld};
 
-/// A world, the body that the imitator has in it, and what it was shown.
+/// A world, the imitator's model of it, and a demonstration.
 #[derive(Clone, Debug)]
 pub struct Scene {
     name: &'static str,
@@ -67,13 +67,13 @@ impl Scene {
         &self.model
     }
 
-    /// What it was shown: JSON.
+    /// The demonstration: JSON.
     #[must_use]
     pub fn demonstration(&self) -> &Value {
         &self.demonstration
     }
 
-    /// The rules and things of its world.
+    /// The cave of its world.
     #[must_use]
     pub fn cave(&self) -> &Cave {
         self.world.cave()
@@ -111,7 +111,7 @@ impl Scene {
         Some((cell_of(seen)?, hit))
     }
 
-    /// What becomes of an imitator that executes these actions. Those that are none have no place in this world.
+    /// Executes actions of these names in the world. Names that are no action of a cave are ignored.
     #[must_use]
     pub fn execute(&self, actions: &[String]) -> Execution {
         self.world.execute(actions.iter().filter_map(|name| Act::named(name)))
