@@ -23,6 +23,7 @@ CREATE TABLE models (
     n_states       INTEGER NOT NULL, -- 0: the model is searched lazily
     n_transitions  INTEGER NOT NULL,
     n_unsafe       INTEGER NOT NULL,
+    n_stochastic   INTEGER NOT NULL, -- of how many states and actions there are several outcomes
     created_at_ms  INTEGER NOT NULL
 ) STRICT;
 

@@ -18,11 +18,7 @@ pub(super) fn migrator() -> Migrator {
         Migration::new(version, description.into(), MigrationType::Simple, sql.into_sql_str(), false)
     };
     Migrator {
-        migrations: vec![
-            migration(1, "schema", include_str!("../../migrations/0001_schema.sql")),
-            migration(2, "stochastic", include_str!("../../migrations/0002_stochastic.sql")),
-        ]
-        .into(),
+        migrations: vec![migration(1, "schema", include_str!("../../migrations/0001_schema.sql"))].into(),
         ..Migrator::DEFAULT
     }
 }
@@ -127,22 +123,5 @@ mod tests {
         for error in [opened, read] {
             assert!(error.to_string().contains("development version"), "{error}");
         }
-    }
-
-    #[tokio::test]
-    async fn a_database_from_before_models_could_be_stochastic_is_brought_up_to_date() {
-        let directory = tempfile::tempdir().unwrap();
-        let path = directory.path().join("etude.db");
-        drop(Store::open(&path, &TaskTracker::new()).await.unwrap());
-        let mut older = SqliteConnectOptions::new().filename(&path).connect().await.unwrap();
-        let before = "ALTER TABLE models DROP COLUMN n_stochastic;
-            DELETE FROM _sqlx_migrations WHERE version >= 2;
-            INSERT INTO models (name, hash, definition, attributes, actions, n_states, n_transitions, n_unsafe, created_at_ms)
-            VALUES ('old', 'hash', '', '[]', '[]', 2, 1, 0, 0)";
-        sqlx::raw_sql(before).execute(&mut older).await.unwrap();
-        older.close().await.unwrap();
-        let store = Store::open(&path, &TaskTracker::new()).await.unwrap();
-        let page = store.models(None, 10).await.unwrap();
-        assert_eq!((page.items[0].name.as_str(), page.items[0].n_stochastic), ("old", 0));
     }
 }

@@ -141,7 +141,7 @@ async fn streamed(service: &Service, request: &Value, n: usize) -> Value {
     let members = open.as_object_mut().unwrap();
     members.remove("demonstration");
     members.insert("type".to_owned(), json!("open"));
-    let weights = request["observation_weights"].as_array().filter(|_| n % 3 > 0);
+    let weights = request["observation_weights"].as_array().filter(|_| !n.is_multiple_of(3));
     if weights.is_some() {
         members.remove("observation_weights");
     }

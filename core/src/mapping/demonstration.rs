@@ -8,6 +8,9 @@ pub use well_formed::WellFormed;
 use crate::attribute::{BuildError, Scalar, Schema, Value, check_count};
 use crate::document::{Faults, Place, Repeated};
 
+/// A demonstration, and by observation what it counts, as far as that is told of any.
+pub type Counted = (Demonstration, Vec<Option<f64>>);
+
 /// The observed states `o_0 .. o_n` of a demonstration, at least one. Nothing is known of the demonstrator's actions.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Demonstration {
@@ -93,7 +96,7 @@ impl Demonstration {
         schema: &Schema,
         texts: &[String],
         n_observations: usize,
-    ) -> Result<Option<(Self, Vec<Option<f64>>)>, serde_json::Error> {
+    ) -> Result<Option<Counted>, serde_json::Error> {
         let mut values = Vec::with_capacity(n_observations * schema.len());
         let mut weights = Vec::new();
         for text in texts {

@@ -149,7 +149,7 @@ impl Starts {
                 for origin in origins {
                     match origin {
                         Origin::State(state) => states.push(*state),
-                        Origin::Row(row) => rows.push(row.0.to_vec()),
+                        Origin::Row(row) => rows.push(row.0.clone()),
                     }
                 }
             }

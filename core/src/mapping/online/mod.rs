@@ -238,6 +238,7 @@ impl OnlineMapping {
     }
 
     /// How many steps would be committed if the demonstration ended now.
+    #[must_use]
     pub fn n_rest(&self) -> usize {
         self.survivor().map_or(0, |survivor| self.window.path(survivor).len())
     }

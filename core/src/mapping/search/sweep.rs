@@ -188,7 +188,7 @@ impl Sweep<'_, '_> {
                 return Ok(moves);
             }
             if first == 0 {
-                let costs = (0..self.problem.model.states().len()).map(|state| self.from_start(state));
+                let costs = (0..self.problem.model.states().len()).map(|state| self.whole_cost(state));
                 earliest = Some(KnownLayer { observation: 0, costs: costs.collect() });
             }
             first = end;
@@ -239,7 +239,7 @@ impl Sweep<'_, '_> {
     }
 
     /// What a mapping costs that starts in a state, if the first layer was done last.
-    fn from_start(&self, state: StateIdx) -> f64 {
+    fn whole_cost(&self, state: StateIdx) -> f64 {
         let (distance, here) = (self.distances[state as usize], self.here[state as usize]);
         self.problem.recurrence().go_on(MoveKind::Start, distance, here)
     }
@@ -247,7 +247,7 @@ impl Sweep<'_, '_> {
     /// The start of the cheapest mapping, the first among equals.
     fn start(&self) -> Move {
         let states = self.problem.starts.states().iter().copied();
-        let cheapest = states.min_by(|state, other| self.from_start(*state).total_cmp(&self.from_start(*other)));
+        let cheapest = states.min_by(|state, other| self.whole_cost(*state).total_cmp(&self.whole_cost(*other)));
         Move { kind: MoveKind::Start, action: None, observation: 0, state: cheapest.unwrap_or_default() }
     }
 
