@@ -7,7 +7,7 @@ use crate::commands::etude;
 /// How the README runs the program.
 const RUN: &str = "cargo run --release -- ";
 
-/// What the blocks between ``` of the README say, each with its language.
+/// What the fenced blocks of the README say, each with its language.
 fn blocks(text: &str) -> Vec<(&str, Vec<&str>)> {
     let mut blocks = Vec::new();
     let mut lines = text.lines();

@@ -131,7 +131,7 @@ async fn what_was_learned_in_one_place_starts_another() {
     assert!(done && told.contains("3 rewards give all 4 versions"), "{told}{error}");
     std::fs::write(at("odd.json"), text.replace("etude.learner.v1", "etude.learner.v9")).unwrap();
     let (done, _, error) = run(&["learner", "import", &at("odd.json"), "--database", database]);
-    assert!(!done && error.contains("/format: expected \"etude.learner.v1\""), "{error}");
+    assert!(!done && error.contains("\"format\" is not \"etude.learner.v1\""), "{error}");
     let (done, _, error) = run(&["learner", "replay", "nobody", "--database", database]);
     assert!(!done && error.contains("there is no learner \"nobody\""), "{error}");
     let (done, _, _) = run(&["learner", "replay", "gold", "--database", &at("nowhere.db")]);
