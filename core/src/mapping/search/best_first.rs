@@ -123,7 +123,9 @@ pub(in crate::mapping) fn search<S: Space>(
     let others = search.start();
     let mut end = search.probe(1, open)?;
     if end == End::Done {
-        search.start_in(others);
+        end = search.start_in(&others)?;
+    }
+    if end == End::Done {
         end = search.expand_best_first(open)?;
     }
     Ok(search.found(end))
@@ -189,13 +191,20 @@ impl<S: Space> Search<'_, '_, S> {
     }
 
     /// Takes these starts, as far as they are of interest.
-    fn start_in(&mut self, starts: Vec<(f64, StateIdx)>) {
-        for (f, state) in starts {
-            if f < self.limit {
-                self.take_start(state);
+    fn start_in(&mut self, starts: &[(f64, StateIdx)]) -> Result<End, Cancelled> {
+        for (n, (f, state)) in starts.iter().enumerate() {
+            match self.meter.spend(1) {
+                Signal::Continue if *f < self.limit => drop(self.take_start(*state)),
+                Signal::Continue => {}
+                Signal::Finish => {
+                    self.left_out_f = starts[n..].iter().map(|(f, _)| *f).fold(f64::INFINITY, f64::min);
+                    return Ok(OUT_OF_TIME);
+                }
+                Signal::Cancel => return Err(Cancelled),
             }
         }
         self.left_out_f = f64::INFINITY;
+        Ok(End::Done)
     }
 
     fn take_start(&mut self, state: StateIdx) -> Option<Reached> {
