@@ -117,6 +117,7 @@ pub(in crate::mapping) fn search<S: Space>(
         #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
         last: problem.last() as u32,
         recurrence: problem.recurrence(),
+        lingers_after_skip: problem.recurrence().may_follow(MoveKind::Skip, MoveKind::Extra),
         rounding: rounding_of_sums(problem.demonstration.len()),
         meter: Meter::new(interrupt, POLL_EVERY),
     };
@@ -155,6 +156,8 @@ struct Search<'s, 'p, S> {
     /// The last observation.
     last: u32,
     recurrence: Recurrence,
+    /// What the recurrence says of extra actions after skips.
+    lingers_after_skip: bool,
     /// Relative tolerance: mappings that are cheaper by less are not searched for.
     rounding: f64,
     meter: Meter<'s>,
@@ -388,10 +391,12 @@ impl<S: Space> Search<'_, '_, S> {
     fn expand(&mut self, id: NodeId, g: f64, step: Position, ways: Range<usize>, mut found: impl FnMut(Reached, u32)) {
         let Position { state, observation: here, kind } = step;
         let next = here + 1;
-        let may_advance = here < self.last;
-        let may_skip = may_advance && self.recurrence.may_follow(kind, MoveKind::Skip);
-        let may_linger = self.recurrence.may_follow(kind, MoveKind::Extra);
+        let may_skip = self.recurrence.may_follow(kind, MoveKind::Skip);
+        let may_linger = kind != MoveKind::Skip || self.lingers_after_skip;
         self.nodes.close(id);
+        if here == self.last {
+            return self.expand_at_last(id, g, step, ways, found);
+        }
         if may_skip {
             let is_near = Nodes::are_together(next);
             let mut block = if is_near { Nodes::block_of(id) } else { self.nodes.find(state, next) };
@@ -404,13 +409,12 @@ impl<S: Space> Search<'_, '_, S> {
             }
         }
         self.n_expanded += 1;
-        let n_by_way = u64::from(may_advance) + u64::from(may_linger);
-        self.n_generated += u64::from(may_skip) + n_by_way * ways.len() as u64;
+        self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
         for way in ways {
             let SeenWay { cost, to: state, action } = self.seen.way(way);
             let cost = g + cost;
-            let mut block = self.nodes.find(state, if may_advance { next } else { here });
-            if may_advance && self.nodes.may_take(block, next, cost) {
+            let mut block = self.nodes.find(state, next);
+            if self.nodes.may_take(block, next, cost) {
                 let kind = MoveKind::Match;
                 let arrival = Arrival { kind, observation: next, state, cost, parent: id, action };
                 if let Some(node) = self.take(&mut block, arrival) {
@@ -420,7 +424,7 @@ impl<S: Space> Search<'_, '_, S> {
             if !may_linger {
                 continue;
             }
-            if may_advance && !Nodes::are_together(next) {
+            if !Nodes::are_together(next) {
                 block = self.nodes.find(state, here);
             }
             if self.nodes.may_take(block, here, cost) {
@@ -428,6 +432,34 @@ impl<S: Space> Search<'_, '_, S> {
                 let arrival = Arrival { kind, observation: here, state, cost, parent: id, action };
                 if let Some(node) = self.take(&mut block, arrival) {
                     found(node, here);
+                }
+            }
+        }
+    }
+
+    /// As [`Self::expand`], of a node of the last observation: where ending costs something, extra actions may save some of it.
+    #[cold]
+    fn expand_at_last(
+        &mut self,
+        id: NodeId,
+        g: f64,
+        Position { observation, kind, .. }: Position,
+        ways: Range<usize>,
+        mut found: impl FnMut(Reached, u32),
+    ) {
+        self.n_expanded += 1;
+        if !self.recurrence.may_follow(kind, MoveKind::Extra) {
+            return;
+        }
+        self.n_generated += ways.len() as u64;
+        for way in ways {
+            let SeenWay { cost, to: state, action } = self.seen.way(way);
+            let cost = g + cost;
+            let mut block = self.nodes.find(state, observation);
+            if self.nodes.may_take(block, observation, cost) {
+                let arrival = Arrival { kind: MoveKind::Extra, observation, state, cost, parent: id, action };
+                if let Some(node) = self.take(&mut block, arrival) {
+                    found(node, observation);
                 }
             }
         }
@@ -441,21 +473,21 @@ impl<S: Space> Search<'_, '_, S> {
         let observation = arrival.observation;
         let Self { nodes, seen, projected, space, .. } = self;
         let node = nodes.take(block, arrival, &Estimates { seen, projected, space: &**space }, self.limit)?;
-        if observation == self.last {
-            return self.end_at(node, arrival.state);
+        if observation == self.last && !self.end_at(node.id, node.g, arrival.state) {
+            return None;
         }
         Some(node)
     }
 
-    /// Takes note of a mapping that ends here, if it is cheaper.
-    #[inline(never)]
-    fn end_at(&mut self, node: Reached, state: SeenIdx) -> Option<Reached> {
-        let cost = node.g + self.problem.end_cost(self.space.row(self.seen.state(state)));
+    /// Takes note of a mapping that ends here, if it is cheaper. Says whether the node is to be expanded.
+    #[cold]
+    fn end_at(&mut self, id: NodeId, g: f64, state: SeenIdx) -> bool {
+        let cost = g + self.problem.end_cost(self.space.row(self.seen.state(state)));
         if cost < self.limit {
             self.limit = cost * (1.0 - self.rounding);
-            self.incumbent = Some(node.id);
+            self.incumbent = Some(id);
         }
-        (self.problem.end.is_some() && node.f < self.limit).then_some(node)
+        self.problem.end.is_some()
     }
 
     fn found(self, end: End) -> Found {

@@ -95,6 +95,8 @@ pub(super) struct Nodes {
     links: Vec<[LastLink; BLOCK_LEN]>,
     index: Index,
     recurrence: Recurrence,
+    /// Whether moves of all kinds pay the same part of a distance: most often.
+    pays_alike: bool,
 }
 
 /// The key of [`NO_BLOCK`], which never has a node.
@@ -109,7 +111,7 @@ const BLOCK_BYTES: usize = size_of::<Key>()
 impl Nodes {
     /// Forgets all nodes, and keeps the memory. There will be nodes at so many observations, to which moves cost what `recurrence` says.
     pub(super) fn clear(&mut self, n_observations: usize, recurrence: Recurrence) {
-        self.recurrence = recurrence;
+        (self.recurrence, self.pays_alike) = (recurrence, recurrence.pays_alike());
         self.index.clear(&self.keys, n_observations.div_ceil(BLOCK_LEN));
         self.keys.clear();
         self.marks.clear();
@@ -167,7 +169,7 @@ impl Nodes {
     pub(super) fn get(&self, id: NodeId) -> Reached {
         let (block, in_block) = split(id);
         let (cost, estimate) = (self.costs[block].0[in_block], self.estimates[block][in_block]);
-        let g = if self.recurrence.pays_alike() { cost + estimate.distance } else { cost };
+        let g = if self.pays_alike { cost + estimate.distance } else { cost };
         Reached { id, g, f: g + estimate.cost_to_go }
     }
 
@@ -235,7 +237,7 @@ impl Nodes {
         limit: f64,
     ) -> Option<Reached> {
         let Arrival { kind, observation, state, cost, parent, action } = arrival;
-        if *block == NO_BLOCK && !self.add(block, arrival, estimates, limit) {
+        if *block == NO_BLOCK && !self.add(block, state, observation, (kind, cost), estimates, limit) {
             return None;
         }
         let (at, in_block) = (*block as usize, (observation & IN_BLOCK) as usize);
@@ -245,16 +247,18 @@ impl Nodes {
             *mark |= ESTIMATED;
             *estimate = estimates.of(state, observation);
         }
-        let g = self.recurrence.arrive(kind, cost, estimate.distance);
-        let reached = Reached { id: *block << BLOCK_BITS | observation & IN_BLOCK, g, f: g + estimate.cost_to_go };
         let known = &mut self.costs[at].0[in_block];
-        if self.recurrence.pays_alike() {
-            *known = cost;
-        } else if g < *known {
-            *known = g;
+        let (g, compared) = if self.pays_alike {
+            (cost + estimate.distance, cost)
         } else {
-            return None;
-        }
+            let g = pay(self.recurrence, kind, cost, estimate.distance);
+            if g >= *known {
+                return None;
+            }
+            (g, g)
+        };
+        *known = compared;
+        let reached = Reached { id: *block << BLOCK_BITS | observation & IN_BLOCK, g, f: g + estimate.cost_to_go };
         if reached.f >= limit && *mark & FOUND == 0 {
             return None;
         }
@@ -274,7 +278,9 @@ impl Nodes {
     fn add(
         &mut self,
         block: &mut BlockIdx,
-        Arrival { kind, observation, state, cost, .. }: Arrival,
+        state: SeenIdx,
+        observation: u32,
+        (kind, cost): (MoveKind, f64),
         estimates: &Estimates<'_, '_, impl Space>,
         limit: f64,
     ) -> bool {
@@ -295,7 +301,7 @@ impl Nodes {
             // A little more, as sums differ by rounding.
             let most = limit * (1.0 + SLACK);
             self.marks.push([ESTIMATED; BLOCK_LEN]);
-            let paid_later = if self.recurrence.pays_alike() { 1.0 } else { 0.0 };
+            let paid_later = if self.pays_alike { 1.0 } else { 0.0 };
             self.costs.push(Costs(estimates.map(|own| most - paid_later * own.distance - own.cost_to_go)));
             self.estimates.push(estimates);
         } else {
@@ -323,6 +329,12 @@ impl Nodes {
         moves.reverse();
         moves
     }
+}
+
+/// What a way costs once it has paid its part of the distance, where that depends on its last move.
+#[cold]
+fn pay(recurrence: Recurrence, kind: MoveKind, cost: f64, distance: f64) -> f64 {
+    recurrence.arrive(kind, cost, distance)
 }
 
 /// A node's block, and its place in that.
