@@ -23,8 +23,8 @@ pub fn size_bytes(document: &Value) -> usize {
     VALUE_BYTES + inside
 }
 
-/// About how much memory the values in `text` take once they are parsed, in bytes: up to eighty times as much as the text. Looks at
-/// nothing but punctuation, and takes that in strings for more of it.
+/// About how much memory the values in `text` take once they are parsed, in bytes: up to eighty times as much as the text. It counts
+/// punctuation alone, also where that stands in strings.
 #[must_use]
 pub fn parsed_bytes(text: &[u8]) -> usize {
     let bytes_of = |byte: &u8| match byte {
