@@ -95,11 +95,27 @@ pub(in crate::mapping) fn search<S: Space>(
     buffers: &mut SearchBuffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
+    if problem.recurrence().pays_alike() {
+        run::<S, true>(problem, space, projected, budget, most, buffers, interrupt)
+    } else {
+        run::<S, false>(problem, space, projected, budget, most, buffers, interrupt)
+    }
+}
+
+fn run<S: Space, const ALIKE: bool>(
+    problem: &Problem<'_>,
+    space: &mut S,
+    projected: &Projected<'_>,
+    budget: Budget,
+    most: f64,
+    buffers: &mut SearchBuffers,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Found, Cancelled> {
     let SearchBuffers { seen, nodes, open } = buffers;
     seen.prepare(space, &problem.body, projected);
     nodes.clear(problem.demonstration.len(), problem.recurrence());
     open.buckets.clear();
-    let mut search = Search {
+    let mut search = Search::<S, ALIKE> {
         problem,
         space,
         projected,
@@ -117,7 +133,6 @@ pub(in crate::mapping) fn search<S: Space>(
         #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
         last: problem.last() as u32,
         recurrence: problem.recurrence(),
-        lingers_after_skip: problem.recurrence().may_follow(MoveKind::Skip, MoveKind::Extra),
         rounding: rounding_of_sums(problem.demonstration.len()),
         meter: Meter::new(interrupt, POLL_EVERY),
     };
@@ -132,7 +147,8 @@ pub(in crate::mapping) fn search<S: Space>(
     Ok(search.found(end))
 }
 
-struct Search<'s, 'p, S> {
+/// `ALIKE`: see [`Nodes`].
+struct Search<'s, 'p, S, const ALIKE: bool> {
     problem: &'s Problem<'s>,
     space: &'s mut S,
     projected: &'s Projected<'p>,
@@ -156,14 +172,12 @@ struct Search<'s, 'p, S> {
     /// The last observation.
     last: u32,
     recurrence: Recurrence,
-    /// What the recurrence says of extra actions after skips.
-    lingers_after_skip: bool,
     /// Relative tolerance: mappings that are cheaper by less are not searched for.
     rounding: f64,
     meter: Meter<'s>,
 }
 
-impl<S: Space> Search<'_, '_, S> {
+impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
     /// Takes the most promising start, whatever it costs: it is what is left to complete if there is no budget at all. Gives the others,
     /// with their `f`.
     fn start(&mut self) -> Vec<(f64, StateIdx)> {
@@ -189,7 +203,7 @@ impl<S: Space> Search<'_, '_, S> {
         let taken = self.take_start(first);
         self.limit = self.limit.min(limit);
         self.first = taken.map_or(self.incumbent.unwrap_or(NO_NODE), |first| first.id);
-        self.least_f = self.nodes.get(self.first).f.min(self.left_out_f);
+        self.least_f = self.nodes.get::<ALIKE>(self.first).f.min(self.left_out_f);
         others
     }
 
@@ -228,7 +242,7 @@ impl<S: Space> Search<'_, '_, S> {
         let n_layers = self.problem.last() + usize::from(self.problem.end.is_some());
         let mut last_of: Vec<Option<u32>> = vec![None; n_layers];
         let mut known = Vec::new();
-        for Reached { id, f, .. } in self.nodes.open().filter(|node| node.f < self.limit) {
+        for Reached { id, f, .. } in self.nodes.open::<ALIKE>().filter(|node| node.f < self.limit) {
             match self.meter.spend(1) {
                 Signal::Continue => {}
                 Signal::Finish => return Ok(OUT_OF_TIME),
@@ -254,7 +268,7 @@ impl<S: Space> Search<'_, '_, S> {
             }
             let mut n_left = width;
             while let Some(CheapestFirst { id, .. }) = probed.pop() {
-                let Reached { g, f, .. } = self.nodes.get(id);
+                let Reached { g, f, .. } = self.nodes.get::<ALIKE>(id);
                 if self.nodes.is_closed(id) || f >= self.limit {
                     continue;
                 }
@@ -320,7 +334,7 @@ impl<S: Space> Search<'_, '_, S> {
     /// Puts all open nodes into the buckets, and gives the limit that these are for; `None` if there is no time for it.
     fn fill_buckets(&mut self, buckets: &mut Buckets) -> Result<Option<f64>, Cancelled> {
         buckets.reset(self.least_f.min(self.limit), self.limit);
-        for node in self.nodes.open().filter(|node| node.f < self.limit) {
+        for node in self.nodes.open::<ALIKE>().filter(|node| node.f < self.limit) {
             match self.meter.spend(1) {
                 Signal::Continue => buckets.push(node),
                 Signal::Finish => return Ok(None),
@@ -332,7 +346,7 @@ impl<S: Space> Search<'_, '_, S> {
 
     /// The nodes that are to be expanded.
     fn open(&self) -> impl Iterator<Item = Reached> {
-        self.nodes.open().filter(|node| node.f < self.limit)
+        self.nodes.open::<ALIKE>().filter(|node| node.f < self.limit)
     }
 
     /// Counts the expansion of a node of `state` that is about to be done, and gives where the ways out are; what ran out, if it may not
@@ -392,7 +406,7 @@ impl<S: Space> Search<'_, '_, S> {
         let Position { state, observation: here, kind } = step;
         let next = here + 1;
         let may_skip = self.recurrence.may_follow(kind, MoveKind::Skip);
-        let may_linger = kind != MoveKind::Skip || self.lingers_after_skip;
+        let may_linger = !ALIKE || kind != MoveKind::Skip;
         self.nodes.close(id);
         if here == self.last {
             return self.expand_at_last(id, g, step, ways, found);
@@ -472,7 +486,7 @@ impl<S: Space> Search<'_, '_, S> {
     fn take(&mut self, block: &mut BlockIdx, arrival: Arrival) -> Option<Reached> {
         let observation = arrival.observation;
         let Self { nodes, seen, projected, space, .. } = self;
-        let node = nodes.take(block, arrival, &Estimates { seen, projected, space: &**space }, self.limit)?;
+        let node = nodes.take::<ALIKE>(block, arrival, &Estimates { seen, projected, space: &**space }, self.limit)?;
         if observation == self.last && !self.end_at(node.id, node.g, arrival.state) {
             return None;
         }

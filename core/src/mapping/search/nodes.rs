@@ -85,7 +85,8 @@ const SKIPPED_TO: u8 = 8;
 /// Bit of a node's marks: its path ends with an extra action.
 const LINGERED_TO: u8 = 16;
 
-/// Blocks of nodes, in the order in which the first node of each was found.
+/// Blocks of nodes, in the order in which the first node of each was found. `ALIKE` says whether moves of all kinds pay the same part of a
+/// distance, for which there is a search of its own: it is what most problems need.
 #[derive(Debug, Default)]
 pub(super) struct Nodes {
     keys: Vec<Key>,
@@ -95,8 +96,6 @@ pub(super) struct Nodes {
     links: Vec<[LastLink; BLOCK_LEN]>,
     index: Index,
     recurrence: Recurrence,
-    /// Whether moves of all kinds pay the same part of a distance: most often.
-    pays_alike: bool,
 }
 
 /// The key of [`NO_BLOCK`], which never has a node.
@@ -111,7 +110,7 @@ const BLOCK_BYTES: usize = size_of::<Key>()
 impl Nodes {
     /// Forgets all nodes, and keeps the memory. There will be nodes at so many observations, to which moves cost what `recurrence` says.
     pub(super) fn clear(&mut self, n_observations: usize, recurrence: Recurrence) {
-        (self.recurrence, self.pays_alike) = (recurrence, recurrence.pays_alike());
+        self.recurrence = recurrence;
         self.index.clear(&self.keys, n_observations.div_ceil(BLOCK_LEN));
         self.keys.clear();
         self.marks.clear();
@@ -150,7 +149,7 @@ impl Nodes {
     }
 
     /// Every node that was not expanded since its way last became cheaper.
-    pub(super) fn open(&self) -> impl Iterator<Item = Reached> {
+    pub(super) fn open<const ALIKE: bool>(&self) -> impl Iterator<Item = Reached> {
         (0..).zip(&self.marks).flat_map(move |(block, marks)| {
             let marks = u64::from_le_bytes(*marks);
             // A bit of each byte.
@@ -159,17 +158,17 @@ impl Nodes {
             std::iter::from_fn(move || {
                 let in_block = (left != 0).then(|| left.trailing_zeros() / u8::BITS)?;
                 left &= left - 1;
-                Some(self.get(block << BLOCK_BITS | in_block))
+                Some(self.get::<ALIKE>(block << BLOCK_BITS | in_block))
             })
         })
     }
 
     /// A node to which a way was found.
     #[inline]
-    pub(super) fn get(&self, id: NodeId) -> Reached {
+    pub(super) fn get<const ALIKE: bool>(&self, id: NodeId) -> Reached {
         let (block, in_block) = split(id);
         let (cost, estimate) = (self.costs[block].0[in_block], self.estimates[block][in_block]);
-        let g = if self.pays_alike { cost + estimate.distance } else { cost };
+        let g = if ALIKE { cost + estimate.distance } else { cost };
         Reached { id, g, f: g + estimate.cost_to_go }
     }
 
@@ -229,7 +228,7 @@ impl Nodes {
     /// [together](Self::are_together) with it.
     #[expect(clippy::inline_always, reason = "it is what a search does most")]
     #[inline(always)]
-    pub(super) fn take(
+    pub(super) fn take<const ALIKE: bool>(
         &mut self,
         block: &mut BlockIdx,
         arrival: Arrival,
@@ -237,7 +236,7 @@ impl Nodes {
         limit: f64,
     ) -> Option<Reached> {
         let Arrival { kind, observation, state, cost, parent, action } = arrival;
-        if *block == NO_BLOCK && !self.add(block, state, observation, (kind, cost), estimates, limit) {
+        if *block == NO_BLOCK && !self.add::<ALIKE>(block, state, observation, (kind, cost), estimates, limit) {
             return None;
         }
         let (at, in_block) = (*block as usize, (observation & IN_BLOCK) as usize);
@@ -248,10 +247,10 @@ impl Nodes {
             *estimate = estimates.of(state, observation);
         }
         let known = &mut self.costs[at].0[in_block];
-        let (g, compared) = if self.pays_alike {
+        let (g, compared) = if ALIKE {
             (cost + estimate.distance, cost)
         } else {
-            let g = pay(self.recurrence, kind, cost, estimate.distance);
+            let g = self.recurrence.arrive(kind, cost, estimate.distance);
             if g >= *known {
                 return None;
             }
@@ -275,7 +274,7 @@ impl Nodes {
 
     /// Adds a block, unless the way is not of interest for which that is done. Says whether it did.
     #[inline(never)]
-    fn add(
+    fn add<const ALIKE: bool>(
         &mut self,
         block: &mut BlockIdx,
         state: SeenIdx,
@@ -301,7 +300,7 @@ impl Nodes {
             // A little more, as sums differ by rounding.
             let most = limit * (1.0 + SLACK);
             self.marks.push([ESTIMATED; BLOCK_LEN]);
-            let paid_later = if self.pays_alike { 1.0 } else { 0.0 };
+            let paid_later = if ALIKE { 1.0 } else { 0.0 };
             self.costs.push(Costs(estimates.map(|own| most - paid_later * own.distance - own.cost_to_go)));
             self.estimates.push(estimates);
         } else {
@@ -329,12 +328,6 @@ impl Nodes {
         moves.reverse();
         moves
     }
-}
-
-/// What a way costs once it has paid its part of the distance, where that depends on its last move.
-#[cold]
-fn pay(recurrence: Recurrence, kind: MoveKind, cost: f64, distance: f64) -> f64 {
-    recurrence.arrive(kind, cost, distance)
 }
 
 /// A node's block, and its place in that.
