@@ -104,8 +104,10 @@ impl Mapper {
         most_f: f64,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Found, Cancelled> {
+        let is_alike = problem.recurrence().pays_alike();
+        let search = if is_alike { best_first::search::<S, true> } else { best_first::search::<S, false> };
         self.buffers.lend(budget.max_bytes, |Buffers { searching, .. }| {
-            best_first::search(problem, space, projected, budget, most_f, searching, interrupt)
+            search(problem, space, projected, budget, most_f, searching, interrupt)
         })
     }
 }

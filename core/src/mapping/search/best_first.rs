@@ -14,6 +14,8 @@
 //!
 //! This file is longer than 400 lines because probes and the search share the expansion, its budget and what is found.
 
+mod starts;
+
 use std::collections::BinaryHeap;
 use std::ops::Range;
 
@@ -23,12 +25,11 @@ use super::seen::{Estimates, Seen, SeenIdx, SeenWay};
 use super::{End, Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
-use crate::mapping::heuristic::Heuristic as _;
 use crate::mapping::heuristic::projected::Projected;
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::recurrence::Recurrence;
 use crate::mapping::{Budget, Problem, StoppedBy};
-use crate::model::{Model, Space, StateIdx};
+use crate::model::{Model, Space};
 
 /// How many times as wide each probe is as the one before.
 const PROBE_WIDENING: u64 = 8;
@@ -81,28 +82,13 @@ impl Open {
     }
 }
 
-/// Finds the cheapest mapping, as far as `budget` allows, among those of at most `most`, of which there must be one.
+/// Finds the cheapest mapping, as far as `budget` allows, among those of at most `most`, of which there must be one. `ALIKE` says whether
+/// moves of all kinds [pay the same part](Recurrence::pays_alike) of a distance in this problem.
 ///
 /// # Errors
 ///
 /// [`Cancelled`] if `interrupt` said so.
-pub(in crate::mapping) fn search<S: Space>(
-    problem: &Problem<'_>,
-    space: &mut S,
-    projected: &Projected<'_>,
-    budget: Budget,
-    most: f64,
-    buffers: &mut SearchBuffers,
-    interrupt: &mut dyn Interrupt,
-) -> Result<Found, Cancelled> {
-    if problem.recurrence().pays_alike() {
-        run::<S, true>(problem, space, projected, budget, most, buffers, interrupt)
-    } else {
-        run::<S, false>(problem, space, projected, budget, most, buffers, interrupt)
-    }
-}
-
-fn run<S: Space, const ALIKE: bool>(
+pub(in crate::mapping) fn search<S: Space, const ALIKE: bool>(
     problem: &Problem<'_>,
     space: &mut S,
     projected: &Projected<'_>,
@@ -178,60 +164,6 @@ struct Search<'s, 'p, S, const ALIKE: bool> {
 }
 
 impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
-    /// Takes the most promising start, whatever it costs: it is what is left to complete if there is no budget at all. Gives the others,
-    /// with their `f`.
-    fn start(&mut self) -> Vec<(f64, StateIdx)> {
-        let starts = self.problem.starts.states();
-        let mut others = Vec::new();
-        let mut first = starts[0];
-        if starts.len() > 1 {
-            let f = |state: &StateIdx| {
-                let row = self.space.row(*state);
-                let distance = self.problem.distances.distance(0, row);
-                let f = self.recurrence.arrive(MoveKind::Start, 0.0, distance) + self.projected.cost_to_go(0, row);
-                (f, *state)
-            };
-            others.extend(starts.iter().map(f));
-            // The first among equals.
-            let by_f =
-                |(_, (f, _)): &(usize, (f64, StateIdx)), (_, (other, _)): &(usize, (f64, StateIdx))| f.total_cmp(other);
-            let best = others.iter().copied().enumerate().min_by(by_f).map_or(0, |(at, _)| at);
-            (_, first) = others.remove(best);
-            self.left_out_f = others.iter().map(|(f, _)| *f).fold(f64::INFINITY, f64::min);
-        }
-        let limit = std::mem::replace(&mut self.limit, f64::INFINITY);
-        let taken = self.take_start(first);
-        self.limit = self.limit.min(limit);
-        self.first = taken.map_or(self.incumbent.unwrap_or(NO_NODE), |first| first.id);
-        self.least_f = self.nodes.get::<ALIKE>(self.first).f.min(self.left_out_f);
-        others
-    }
-
-    /// Takes these starts, as far as they are of interest.
-    fn start_in(&mut self, starts: &[(f64, StateIdx)]) -> Result<End, Cancelled> {
-        for (n, (f, state)) in starts.iter().enumerate() {
-            match self.meter.spend(1) {
-                Signal::Continue if *f < self.limit => drop(self.take_start(*state)),
-                Signal::Continue => {}
-                Signal::Finish => {
-                    self.left_out_f = starts[n..].iter().map(|(f, _)| *f).fold(f64::INFINITY, f64::min);
-                    return Ok(OUT_OF_TIME);
-                }
-                Signal::Cancel => return Err(Cancelled),
-            }
-        }
-        self.left_out_f = f64::INFINITY;
-        Ok(End::Done)
-    }
-
-    fn take_start(&mut self, state: StateIdx) -> Option<Reached> {
-        let state = self.seen.number_of(state, self.space, self.projected);
-        let kind = MoveKind::Start;
-        let start = Arrival { kind, observation: 0, state, cost: 0.0, parent: NO_NODE, action: NO_ACTION };
-        let mut block = self.nodes.find(state, 0);
-        self.take(&mut block, start)
-    }
-
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
     fn probe(&mut self, width: u64, Open { buckets, probed, ahead }: &mut Open) -> Result<End, Cancelled> {
