@@ -11,10 +11,10 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::answer::{json, json_text};
 use super::body::{NoForm, read_json};
+use super::idempotency::Key;
 use super::paging::{List, Paging, after_sequence, name_in, one_of};
 use super::path::PathId;
 use super::problem::{BodyProblems, DeletionProblems, Problem};
-use super::repeated::Key;
 use super::request_id::RequestId;
 use super::requests::{BatchRequest, PolicyRequest};
 use super::{SharedContext, answer};

@@ -12,10 +12,10 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::answer::json;
 use super::body::{NoForm, read_json, read_small_json};
+use super::idempotency::Key;
 use super::paging::{List, Paging, one_of};
 use super::path::{PathId, PathName};
 use super::problem::{BodyProblems, DeletionProblems, Problem};
-use super::repeated::Key;
 use super::requests::TrialRequest;
 use super::{SharedContext, answer};
 use crate::service::TrialStatus;

@@ -15,6 +15,7 @@ mod compiler;
 mod definitions;
 mod error;
 mod hash;
+mod idempotency;
 mod learner_task;
 mod learners;
 mod models;
@@ -26,7 +27,6 @@ mod policies;
 mod pool;
 mod refined;
 mod refiner;
-mod repeats;
 mod requests;
 mod search;
 mod sessions;
@@ -43,6 +43,7 @@ pub use caller::{Caller, Client};
 pub use definitions::{DefinitionReader, ModelText, OpenText};
 pub use error::{Outage, OutageKind, ServiceError};
 pub use hash::hash_of;
+pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, Registered};
 pub use name::{InvalidName, Kind, Name};
@@ -50,7 +51,6 @@ pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
 pub(crate) use pool::Places;
 pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
-pub use repeats::{IdempotencyKey, InvalidIdempotencyKey};
 pub use sessions::{
     CommittedSteps, Ended, Observation, Received, Resumed, RewardState, Session, SessionError, SessionPolicy,
 };
@@ -69,10 +69,10 @@ pub use crate::store::{
 use cache::ModelNames;
 use compiler::Compiler;
 use etude_core::model::Limits;
+use idempotency::Turns;
 use models::Uploads;
 use owners::Owners;
 use refiner::Refiner;
-use repeats::Turns;
 
 /// How the service is set up.
 #[derive(Clone, Debug)]

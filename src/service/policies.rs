@@ -3,8 +3,8 @@
 use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
 
+use super::idempotency::{IdempotencyKey, Repeat};
 use super::learners::LearnerState;
-use super::repeats::{IdempotencyKey, Repeat};
 use super::requests::{DEMONSTRATION, Named, SentRequest, base_weights, check_request};
 use super::search::{Extent, MAX_INLINE_BYTES, Means, Searched, follow, is_quick, max_quick_observations};
 use super::{Caller, Etude, Kind, PoolError, ServiceError};

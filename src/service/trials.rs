@@ -7,8 +7,8 @@ use jiff::Timestamp;
 use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
 
+use super::idempotency::{IdempotencyKey, Repeat};
 use super::learners::{LearnerState, unknown};
-use super::repeats::{IdempotencyKey, Repeat};
 use super::requests::check_request;
 use super::search::{Searched, write};
 use super::{Caller, Etude, Kind, Name, PoolError, ServiceError, as_stored};
