@@ -47,8 +47,7 @@ impl OptionFlags {
         request.set_some("--observation-weights", "observation_weights", self.observation_weights.clone())?;
         request.set_some("--extra-weight", "extra_weight", self.extra_weight.map(|weight| json!(weight)))?;
         request.set_some("--end-weight", "end_weight", self.end_weight.map(|weight| json!(weight)))?;
-        let without = (!self.without.is_empty()).then(|| json!(self.without));
-        request.set_some("--without", "without", without)?;
+        request.set_each("--without", "without", &self.without);
         for (action, cost) in &self.action_costs {
             request.set(&format!("--action-cost {action}={cost}"), &["action_costs", action], json!(cost))?;
         }
@@ -114,6 +113,16 @@ impl FlaggedRequest {
             Some(value) => self.set(&format!("{flag} {value}"), &[name], value.clone()),
             None => Ok(()),
         }
+    }
+
+    /// Sets the option `name` to the list of what `flag` says each time that it is given, if it is.
+    pub(super) fn set_each(&mut self, flag: &str, name: &str, values: &[String]) {
+        if values.is_empty() {
+            return;
+        }
+        self.members.insert(name.to_owned(), json!(values));
+        let told = values.iter().enumerate().map(|(n, value)| (format!("/{name}/{n}"), format!("{flag} {value}")));
+        self.flags.extend(told);
     }
 
     /// The request as one document.

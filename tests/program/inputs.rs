@@ -161,6 +161,12 @@ fn what_is_wrong_is_told_of_the_flag_or_the_file_that_says_it() {
         ),
         ("map --demonstration good.csv --start {\"x\":77}", "--start {\"x\":77}: "),
         ("map --demonstration good.csv --weight x=-1", "--weight x=-1: expected a number of at least 0, found -1"),
+        ("map --demonstration good.csv --without fly", "--without fly: unknown action \"fly\"; the model has "),
+        (
+            "map --demonstration good.csv --action-cost fly=1",
+            "--action-cost fly=1: unknown action \"fly\"; the model has ",
+        ),
+        ("map --demonstration good.csv --extra-weight 2", "--extra-weight 2.0: expected a number from 0 to 1, found 2"),
         ("map --demonstration seen.csv", "row 3 of seen.csv, column \"x\": expected a number, found \"far\""),
         ("stream --demonstration request.json", "request.json: /weights/gold: unknown attribute"),
         ("map --demonstration request.json", "request.json: /weights/gold: unknown attribute"),
