@@ -91,7 +91,7 @@ CREATE TABLE sessions (
     model_hash      TEXT    NOT NULL,
     weights         TEXT    NOT NULL, -- JSON: by attribute
     lookahead       INTEGER,          -- NULL: only proven steps are committed before the end
-    conditions      TEXT    NOT NULL, -- JSON: what it may start from, what counts, what the body lacks; defaults are left out
+    conditions      TEXT    NOT NULL, -- JSON: start states, weights of observations and of the end, what the body lacks; defaults are left out
     learner         TEXT,             -- whose weights are used, if any
     weights_version INTEGER,          -- of that learner
     trial_id        TEXT,             -- the trial that is explored, if any
@@ -110,7 +110,7 @@ CREATE INDEX sessions_by_policy ON sessions (policy_id) WHERE policy_id IS NOT N
 CREATE INDEX sessions_by_trial ON sessions (trial_id) WHERE trial_id IS NOT NULL;
 
 -- Observations as they came, several a row. `states` is a JSON array of `n_states` states, the first of which is the
--- observation `seq`. A number among them is what the next one counts, if that was said.
+-- observation `seq`. A number among them is the weight of the next one, if that was given.
 CREATE TABLE observations (
     session_id  TEXT    NOT NULL,
     seq         INTEGER NOT NULL,

@@ -20,13 +20,14 @@ pub(super) struct OptionFlags {
     /// Where the imitator may start: a state's index, a JSON object of attribute values, or a JSON array of these.
     #[arg(long, value_name = "STATE", value_parser = parse_start)]
     start: Option<Value>,
-    /// What the distance to each observation counts, in order: a JSON array of numbers; 1 where it is null.
+    /// The weight of each observation, in order: a JSON array of numbers; 1 where it is null.
     #[arg(long, value_name = "WEIGHTS", value_parser = parse_json)]
     observation_weights: Option<Value>,
     /// The part of the distance, 0 to 1, that an action pays that does not meet the next observation; 1 unless said.
     #[arg(long, value_name = "PART")]
     extra_weight: Option<f64>,
-    /// What the distance between the last state and the last observation costs once more; 0 unless said.
+    /// The weight of the end: the distance between the last state and the last observation is paid once more, multiplied by it; 0
+    /// unless said.
     #[arg(long, value_name = "WEIGHT")]
     end_weight: Option<f64>,
     /// An action that the body lacks; may be given for several.

@@ -15,12 +15,12 @@ pub struct Conditions {
     /// The start states; `None`: those of the model. Not empty.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub starts: Option<Vec<Origin>>,
-    /// By observation, what a distance to it counts, `e_i`: finite, at least 0. Observations past the last one count 1.
+    /// The weights of the observations, `e_i`: finite, at least 0. Those past the last one are 1.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub observation_weights: Vec<f64>,
     /// The part of the distance that an extra action pays, `x`: 0 to 1.
     pub extra_weight: f64,
-    /// What the distance of the last state to the last observation counts once more: finite, at least 0.
+    /// The weight with which the distance between the last state and the last observation is paid once more: finite, at least 0.
     pub end_weight: f64,
     /// The actions that the body lacks.
     #[serde(skip_serializing_if = "Vec::is_empty")]
@@ -29,7 +29,7 @@ pub struct Conditions {
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub action_costs: Vec<(ActionIdx, f64)>,
     /// If there: observations are dropped that stay within this of the last one kept, by positions of attributes, and are equal to it in all
-    /// other attributes. What they count is lost.
+    /// other attributes. Their weights are lost.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub collapse: Option<Vec<(usize, f64)>>,
 }
@@ -66,13 +66,13 @@ impl Conditions {
         Self { starts: Some(vec![start]), ..Self::default() }
     }
 
-    /// What a distance to the observation at `index` counts.
+    /// The weight of the observation at `index`.
     #[must_use]
     pub fn observation_weight(&self, index: usize) -> f64 {
         self.observation_weights.get(index).copied().unwrap_or(1.0)
     }
 
-    /// These conditions, with what these observations count, as far as it is told, of `n_observations` in all.
+    /// These conditions with the weights that are `told` of `n_observations`; for the others they stay as they are.
     #[must_use]
     pub fn with_observation_weights(mut self, told: &[Option<f64>], n_observations: usize) -> Self {
         if told.iter().any(Option::is_some) {

@@ -8,8 +8,8 @@ pub use well_formed::WellFormed;
 use crate::attribute::{BuildError, Scalar, Schema, Value, check_count};
 use crate::document::{Faults, Place, Repeated};
 
-/// A demonstration, and by observation what it counts, as far as that is told of any.
-pub type Counted = (Demonstration, Vec<Option<f64>>);
+/// A demonstration, and the weights of its observations, as far as they are told.
+pub type Weighted = (Demonstration, Vec<Option<f64>>);
 
 /// The observed states `o_0 .. o_n` of a demonstration, at least one. Nothing is known of the demonstrator's actions.
 #[derive(Clone, Debug, PartialEq)]
@@ -87,7 +87,7 @@ impl Demonstration {
     }
 
     /// Reads observations that were read without faults before: arrays of them, one after the other, `n_observations` in all. A number
-    /// before one is what it counts. Gives them with what they count, as far as that is told of any. `None` if there are none.
+    /// before one is its weight. Gives them with their weights, as far as these are told. `None` if there are none.
     ///
     /// # Errors
     ///
@@ -96,7 +96,7 @@ impl Demonstration {
         schema: &Schema,
         texts: &[String],
         n_observations: usize,
-    ) -> Result<Option<Counted>, serde_json::Error> {
+    ) -> Result<Option<Weighted>, serde_json::Error> {
         let mut values = Vec::with_capacity(n_observations * schema.len());
         let mut weights = Vec::new();
         for text in texts {

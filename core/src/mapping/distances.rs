@@ -24,7 +24,7 @@ pub(crate) struct ActiveAttribute<'m> {
     position: usize,
     attribute: &'m Attribute,
     weight: f64,
-    /// By observation: the number of the value that it saw, from 1 on; 0 if it did not see the attribute, or counts nothing. Shape
+    /// By observation: the number of the value that it saw, from 1 on; 0 if it did not see the attribute, or has no weight. Shape
     /// `[n_observations]`.
     rows: Vec<u32>,
     domain: &'m [Value],
@@ -34,9 +34,9 @@ pub(crate) struct ActiveAttribute<'m> {
     untabled: Vec<(Value, f64)>,
 }
 
-/// What `term` of a distance is where the distance counts `weight`. Finite: at most [`MAX_COST`].
+/// A `term` of a distance to an observation of this weight. Finite: at most [`MAX_COST`].
 #[inline]
-fn counted(weight: f64, term: f64) -> f64 {
+fn weighted_term(weight: f64, term: f64) -> f64 {
     (weight * term).min(MAX_COST)
 }
 
@@ -68,11 +68,12 @@ impl<'m> Distances<'m> {
                 n_entries_left -= n_entries;
                 table.reserve_exact(n_entries);
                 table.resize(domain.len(), 0.0);
-                table.extend(values.iter().flat_map(|(value, counts)| {
-                    domain.iter().map(|own| counted(*counts, attribute.term(*weight, value, own)))
+                table.extend(values.iter().flat_map(|(value, observation_weight)| {
+                    domain.iter().map(|own| weighted_term(*observation_weight, attribute.term(*weight, value, own)))
                 }));
             } else {
-                untabled.extend(values.iter().map(|(value, counts)| ((*value).clone(), *counts)));
+                untabled
+                    .extend(values.iter().map(|(value, observation_weight)| ((*value).clone(), *observation_weight)));
             }
             active.push(ActiveAttribute { position, attribute, weight: *weight, rows, domain, table, untabled });
         }
@@ -142,8 +143,8 @@ impl ActiveAttribute<'_> {
             Some(term) => *term,
             None if row == 0 => 0.0,
             None => {
-                let (seen, counts) = &self.untabled[row - 1];
-                counted(*counts, self.attribute.term(self.weight, seen, &self.domain[value]))
+                let (seen, observation_weight) = &self.untabled[row - 1];
+                weighted_term(*observation_weight, self.attribute.term(self.weight, seen, &self.domain[value]))
             }
         }
     }
@@ -168,7 +169,7 @@ impl EndDistances {
         let weighted = schema.attributes().iter().zip(weights.as_slice()).zip(last).enumerate();
         let attributes = weighted.filter_map(|(position, ((attribute, weight), seen))| {
             let seen = seen.as_ref().filter(|_| *weight > 0.0)?;
-            let term = |own| counted(end_weight, attribute.term(*weight, seen, own));
+            let term = |own| weighted_term(end_weight, attribute.term(*weight, seen, own));
             Some((position, states.domain(position).iter().map(term).collect()))
         });
         Self { attributes: attributes.collect() }
@@ -222,18 +223,29 @@ struct ObservedAttribute {
     weight: f64,
     value: Value,
     /// The observation's weight, `e`.
-    counts: f64,
+    observation_weight: f64,
     /// Terms by the state's value. Shape `[domain size]`; empty if there is no table.
     table: Vec<f64>,
 }
 
 impl ObservedDistances {
-    /// With tables. The observation counts `counts`: nothing is observed if that is 0.
-    pub(crate) fn new(model: &Model, observation: &[Option<Value>], weights: &Weights, counts: f64) -> Self {
+    /// With tables. Nothing is observed if the observation's weight is 0.
+    pub(crate) fn new(
+        model: &Model,
+        observation: &[Option<Value>],
+        weights: &Weights,
+        observation_weight: f64,
+    ) -> Self {
         let weighted = weights.as_slice().iter().zip(observation).enumerate();
-        let weighted = weighted.filter(|(_, (weight, _))| counts > 0.0 && **weight > 0.0);
+        let weighted = weighted.filter(|(_, (weight, _))| observation_weight > 0.0 && **weight > 0.0);
         let attributes = weighted.filter_map(|(position, (weight, value))| {
-            Some(ObservedAttribute { position, weight: *weight, value: value.clone()?, counts, table: Vec::new() })
+            Some(ObservedAttribute {
+                position,
+                weight: *weight,
+                value: value.clone()?,
+                observation_weight,
+                table: Vec::new(),
+            })
         });
         let mut distances = Self { attributes: attributes.collect(), size_bytes: 0 };
         distances.fill_tables(model);
@@ -243,10 +255,13 @@ impl ObservedDistances {
     /// Makes the tables, unless they are there.
     pub(crate) fn fill_tables(&mut self, model: &Model) {
         for attribute in self.attributes.iter_mut().filter(|attribute| attribute.table.is_empty()) {
-            let ObservedAttribute { position, weight, value, counts, table } = attribute;
+            let ObservedAttribute { position, weight, value, observation_weight, table } = attribute;
             let domain = model.states().domain(*position);
             let attribute = &model.schema().attributes()[*position];
-            *table = domain.iter().map(|own| counted(*counts, attribute.term(*weight, value, own))).collect();
+            *table = domain
+                .iter()
+                .map(|own| weighted_term(*observation_weight, attribute.term(*weight, value, own)))
+                .collect();
         }
         self.measure();
     }
@@ -295,7 +310,10 @@ impl ObservedAttribute {
             return *term;
         }
         let own = &model.states().domain(self.position)[value as usize];
-        counted(self.counts, model.schema().attributes()[self.position].term(self.weight, &self.value, own))
+        weighted_term(
+            self.observation_weight,
+            model.schema().attributes()[self.position].term(self.weight, &self.value, own),
+        )
     }
 }
 
@@ -313,20 +331,20 @@ impl<'d> DistinctValues<'d> {
     const FEW: usize = 16;
 
     /// Forgets the values, and numbers those of the attribute at `position`. Gives the number of each observation's, or 0 if it
-    /// did not see the attribute or counts nothing.
+    /// did not see the attribute or has no weight.
     fn number(&mut self, demonstration: &'d Demonstration, conditions: &Conditions, position: usize) -> Vec<u32> {
         self.values.clear();
         self.numbers.clear();
         let seen = demonstration.iter().enumerate().map(|(i, observation)| {
-            let counts = conditions.observation_weight(i);
-            observation[position].as_ref().filter(|_| counts > 0.0).map(|value| (value, counts))
+            let observation_weight = conditions.observation_weight(i);
+            observation[position].as_ref().filter(|_| observation_weight > 0.0).map(|value| (value, observation_weight))
         });
         seen.map(|value| value.map_or(0, |value| self.number_of(value))).collect()
     }
 
     #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
     fn number_of(&mut self, value: (&'d Value, f64)) -> u32 {
-        let key = |(value, counts): (&'d Value, f64)| (value, counts.to_bits());
+        let key = |(value, observation_weight): (&'d Value, f64)| (value, observation_weight.to_bits());
         let known = if self.values.len() <= Self::FEW {
             self.values.iter().position(|known| *known == value).map(|n| n as u32 + 1)
         } else {

@@ -77,7 +77,7 @@ mod written;
 pub use budget::{Budget, StoppedBy};
 pub use conditions::Conditions;
 pub use cost::Cost;
-pub use demonstration::{Counted, Demonstration, WellFormed};
+pub use demonstration::{Demonstration, Weighted, WellFormed};
 pub use documents::{ObservationDocument, ObservedDocument, StartReference, StateReference};
 pub use end::PolicyEnd;
 pub use heuristic::HeuristicName;

@@ -108,8 +108,8 @@ pub struct Options {
     /// the observations it spans times the model's states are 134 million. Not for a world that is searched lazily.
     #[cfg_attr(feature = "openapi", schema(value_type = Option<u32>, minimum = 1, maximum = 100_000))]
     pub lookahead: Option<NonZeroU32>,
-    /// By observation, what a distance to it counts, each at least 0 (`null`: 1), as many as there are observations; all 1 if left out. A
-    /// distance adds no more than 1e150, however much it counts.
+    /// The weight of each observation, at least 0 (`null`: 1), as many as there are observations; all 1 if left out. The distances to an
+    /// observation are multiplied by its weight. No attribute adds more than 1e150 to a distance, however large the weight.
     #[cfg_attr(feature = "openapi", schema(value_type = Option<Vec<Option<f64>>>))]
     pub observation_weights: Option<Vec<f64>>,
     /// The part of the distance that an action pays that does not meet the next observation, 0 to 1. 1 if left out: such a step pays the
@@ -117,8 +117,8 @@ pub struct Options {
     /// observation pays.
     #[cfg_attr(feature = "openapi", schema(minimum = 0.0, maximum = 1.0))]
     pub extra_weight: Option<f64>,
-    /// What the distance between the last state and the last observation costs once more, at least 0; 0 if left out. For tasks whose
-    /// outcome matters more than the way to it.
+    /// The weight of the end, at least 0; 0 if left out. The distance between the last state and the last observation is paid once more,
+    /// multiplied by it. For tasks whose outcome matters more than the way to it.
     #[cfg_attr(feature = "openapi", schema(minimum = 0.0))]
     pub end_weight: Option<f64>,
     /// Names of actions that the body lacks, though its model has them.
@@ -129,7 +129,7 @@ pub struct Options {
     #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, f64>>))]
     pub action_costs: Option<Vec<(ActionIdx, f64)>>,
     /// Leaves out what repeats itself: by attribute name, within what of the last observation kept an observation is dropped, if it is equal
-    /// to it in all other attributes. The first and the last stay. What dropped ones count (`observation_weights`) is lost, `observation` in steps
+    /// to it in all other attributes. The first and the last stay. The weights of dropped ones (`observation_weights`) are lost, `observation` in steps
     /// counts the original ones, a lookahead those that are kept. Each at least 0, in the attribute's units; not for categories.
     // By the attributes' positions.
     #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, f64>>, example = json!({"x": 0.5})))]
@@ -222,7 +222,7 @@ impl Options {
         (faults.count() == n_before).then_some(options)
     }
 
-    /// Reads what observations count: an array of numbers of at least 0, `null` where it is not said.
+    /// Reads weights of observations: an array of numbers of at least 0, `null` where none is given.
     pub fn read_observation_weights(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Option<f64>>> {
         let items = place.array(faults)?;
         let n_before = faults.count();

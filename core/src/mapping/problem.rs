@@ -113,8 +113,8 @@ impl<'m> Problem<'m> {
 
     /// Whether a step pays something of whatever distance there is.
     pub(super) fn pays_at(&self, step: &Move) -> bool {
-        let counts = self.conditions.observation_weight(step.observation as usize) > 0.0;
-        counts && self.recurrence().paid(step.kind, 1.0) > 0.0
+        let is_weighed = self.conditions.observation_weight(step.observation as usize) > 0.0;
+        is_weighed && self.recurrence().paid(step.kind, 1.0) > 0.0
     }
 
     /// Whether a state with this row, of `states`, is what was observed, so far as attributes weigh something.

@@ -302,8 +302,8 @@ impl Problem<'_> {
         let mut gain =
             self.end_cost(row) - end_weight * self.least_distance(self.demonstration.observation(self.last()));
         for (index, observation) in self.demonstration.iter().enumerate() {
-            let counts = self.conditions.observation_weight(index);
-            gain += self.distances.distance(index, row) - counts * self.least_distance(observation);
+            let weight = self.conditions.observation_weight(index);
+            gain += self.distances.distance(index, row) - weight * self.least_distance(observation);
             if gain >= least {
                 return None;
             }

@@ -22,7 +22,7 @@ pub(in crate::http) enum ClientFrameDocument {
         seq: u32,
         /// Observed states: objects, or arrays in attribute order.
         states: Vec<ObservationDocument>,
-        /// What a distance to each of these counts, at least 0, as many as there are states; `null`, or left out: what `open` says.
+        /// The weight of each of these, at least 0, as many as there are states; `null`, or left out: as `open` says.
         observation_weights: Option<Vec<Option<f64>>>,
     },
     /// The demonstration has ended.

@@ -26,18 +26,18 @@ pub(super) fn read_again(
     conditions: Conditions,
 ) -> Result<ReadAgain, SessionError> {
     let model = mapper.model();
-    let (demonstration, counts) = read_stored(mapper, texts, of_session)?;
+    let (demonstration, observation_weights) = read_stored(mapper, texts, of_session)?;
     let mut watch = Watch::new(&weights);
     for (index, observation) in demonstration.iter().enumerate() {
         watch.observe(model, index, observation);
     }
     watch.news(model, 0, &STATES);
-    let told = |index: usize| counts.get(index).copied().flatten();
+    let told = |index: usize| observation_weights.get(index).copied().flatten();
     let observed = demonstration.iter().enumerate();
     let observations =
         observed.map(|(index, values)| Observation { values: values.to_vec(), weight: told(index) }).collect();
     let warnings = if is_done {
-        let conditions = conditions.with_observation_weights(&counts, demonstration.len());
+        let conditions = conditions.with_observation_weights(&observation_weights, demonstration.len());
         Problem::new(model, demonstration, weights, conditions).warnings(&STATES)
     } else {
         Vec::new()

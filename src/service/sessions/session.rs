@@ -144,7 +144,7 @@ impl Session {
     }
 
     /// Takes the states from `seq` on, of which those received before are ignored: they are durable when this returns. What
-    /// takes less time than the disk is mapped while that writes. `observation_weights` says what each of them counts, if not what the
+    /// takes less time than the disk is mapped while that writes. `observation_weights` gives the weight of each of them, if not what the
     /// session was opened with.
     ///
     /// # Errors
@@ -359,11 +359,11 @@ fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) 
 pub struct Observation {
     /// Shape `[n_attributes]`; `None` where an attribute was not observed.
     pub values: Vec<Option<etude_core::attribute::Value>>,
-    /// What distances to it count; `None`: what the session was opened with.
+    /// Its weight; `None`: what the session was opened with.
     pub weight: Option<f64>,
 }
 
-/// Observed states as they are stored: before each that counts differently, the number that it counts.
+/// Observed states as they are stored: before each that came with a weight, that number.
 fn stored_states(states: &[serde_json::Value], observations: &[Observation]) -> serde_json::Result<String> {
     if observations.iter().all(|observation| observation.weight.is_none()) {
         return serde_json::to_string(states);

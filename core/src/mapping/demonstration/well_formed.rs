@@ -40,7 +40,7 @@ impl<'s> WellFormed<'s> {
         Ok(read)
     }
 
-    /// Reads all of `text`, in which a number before an observation is what it counts. Gives what they count as far as that is told of any.
+    /// Reads all of `text`, in which a number before an observation is its weight. Gives the weights as far as they are told.
     ///
     /// # Errors
     ///
@@ -90,8 +90,8 @@ impl<'de> Visitor<'de> for Observations<'_, '_> {
             let Some(told) = items.next_element_seed(one)? else { break };
             match (told, &mut weights) {
                 (Some(_), None) => return Err(A::Error::custom("a number is no observation")),
-                (Some(counts), Some(_)) => {
-                    weight = Some(counts);
+                (Some(number), Some(_)) => {
+                    weight = Some(number);
                     continue;
                 }
                 (None, Some(weights)) if weight.is_some() => {

@@ -181,8 +181,8 @@ impl OnlineMapping {
         if self.is_whole { self.end().map(|(_, mapping)| mapping.moves).unwrap_or_default() } else { self.moves }
     }
 
-    /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits. `observation_weight` is what distances to it
-    /// count, finite and at least 0; `None`: what the conditions say.
+    /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits. `observation_weight` is
+    /// finite and at least 0; `None`: as the conditions say.
     ///
     /// # Errors
     ///
