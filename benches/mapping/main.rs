@@ -1,5 +1,5 @@
 //! The mapping against its peers on the same problems, in one run: `cargo bench --bench mapping [-- part ..]`, where a part is `peers`,
-//! `large`, `growth`, `deadline`, `limit` or `instructions`; all if none is named.
+//! `caves`, `large`, `growth`, `deadline`, `limit` or `instructions`; all if none is named.
 //!
 //! Every solver is given the problem ready: models are compiled, and terms of distances are tabulated by observation and value,
 //! for the peers too. Rounds are interleaved, so that a machine that slows down slows all of them down; in each, a solver
@@ -50,8 +50,11 @@ fn main() {
             worlds::cave(40, 8, 100, 1),
             table::table(100_000, 50, 1),
         ] {
-            compare(&world);
+            compare(&world, true);
         }
+    }
+    if is_wanted("caves") {
+        compare_caves();
     }
     if is_wanted("large") {
         large::measure();
@@ -88,8 +91,27 @@ fn problem<'m>(mapper: &'m Mapper, world: &World) -> Problem<'m> {
 
 type Solver<'a> = Box<dyn Fn() -> Solved + 'a>;
 
-fn compare(world: &World) {
+/// The peers on ten caves, drawn from seeds, and the worst of these.
+fn compare_caves() {
+    let compared: Vec<Ratios> = (1..=10).map(|seed| compare(&worlds::cave(20, 5, 50, seed), false)).collect();
+    let least = |of: fn(&Ratios) -> f64| compared.iter().map(of).fold(f64::INFINITY, f64::min);
+    println!("\nThe worst of ten caves, as multiples of etude's time:");
+    println!("pathfinding A*, paper's    {:.1}", least(|ratios| ratios.paper));
+    println!("the fastest of the others  {:.1}", least(|ratios| ratios.fastest));
+}
+
+/// Times of peers, as multiples of etude's.
+struct Ratios {
+    /// Of `pathfinding` with the paper's heuristic.
+    paper: f64,
+    /// Of the fastest that has its estimates from elsewhere.
+    fastest: f64,
+}
+
+/// `layered`: Dijkstra's algorithm on all layers as well, which takes long.
+fn compare(world: &World, layered: bool) -> Ratios {
     const N_ROUNDS: usize = 7;
+    const PAPER: &str = "pathfinding A*, paper's";
     let started = Instant::now();
     let mapper = &prepare(world);
     let prepared = started.elapsed();
@@ -113,15 +135,17 @@ fn compare(world: &World) {
         }
     };
     let bound = mapper.lower_bounds(problem);
-    let solvers: Vec<(&str, Solver<'_>)> = vec![
+    let mut solvers: Vec<(&str, Solver<'_>)> = vec![
         ("etude", Box::new(etude(HeuristicName::Default))),
         ("etude, no heuristic", Box::new(etude(HeuristicName::None))),
-        ("pathfinding A*, paper's", Box::new(|| peer.pathfinding(|node| peer.paper(node)))),
+        (PAPER, Box::new(|| peer.pathfinding(|node| peer.paper(node)))),
         ("pathfinding A*, ours", Box::new(|| peer.pathfinding(|(i, state)| peers::micro_floor(bound(i, state))))),
         ("pathfinding A*, none", Box::new(|| peer.pathfinding(|_| 0))),
         ("petgraph A*, none", Box::new(|| peer.petgraph(|_| 0))),
-        ("layered Dijkstra", Box::new(|| peer.layered())),
     ];
+    if layered {
+        solvers.push(("layered Dijkstra", Box::new(|| peer.layered())));
+    }
     let (solved, once): (Vec<Solved>, Vec<Duration>) = solvers.iter().map(|(_, solve)| timed(solve)).unzip();
     let mut times = vec![Vec::with_capacity(N_ROUNDS); solvers.len()];
     for _ in 0..N_ROUNDS {
@@ -132,7 +156,7 @@ fn compare(world: &World) {
 
     println!("{:<26} {:>8} {:>11} {:>36} {:>8}", "", "cost", "expansions", "time", "ratio");
     let first = Spread::of(&mut times[0]).median;
-    let mut fastest_peer = f64::INFINITY;
+    let mut ratios = Ratios { paper: f64::INFINITY, fastest: f64::INFINITY };
     for (((name, _), mut times), Solved { cost, n_expanded, n_steps }) in solvers.iter().zip(times).zip(&solved) {
         let spread = Spread::of(&mut times);
         let ratio = spread.median.as_secs_f64() / first.as_secs_f64();
@@ -142,11 +166,15 @@ fn compare(world: &World) {
         if let Some(n_steps) = n_steps {
             println!("{:<26} {n_steps} steps, {:.1} expansions a step", "", *n_expanded as f64 / *n_steps as f64);
         }
+        if *name == PAPER {
+            ratios.paper = ratio;
+        }
         if !name.starts_with("etude") && !name.contains("ours") {
-            fastest_peer = fastest_peer.min(ratio);
+            ratios.fastest = ratios.fastest.min(ratio);
         }
     }
-    println!("the fastest peer with estimates of its own takes {fastest_peer:.1} times as long");
+    println!("the fastest peer with estimates of its own takes {:.1} times as long", ratios.fastest);
+    ratios
 }
 
 fn timed<T>(solve: impl Fn() -> T) -> (T, Duration) {

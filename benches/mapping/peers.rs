@@ -5,7 +5,7 @@ use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashSet};
 
 use etude_core::mapping::Problem;
-use etude_core::model::Model;
+use etude_core::model::{Model, Start};
 use pathfinding::prelude::astar;
 use petgraph::visit::{EdgeRef, GraphBase, GraphRef, IntoEdgeReferences, IntoEdges, IntoNeighbors, Visitable};
 
@@ -18,13 +18,16 @@ pub(crate) struct Solved {
 /// Costs as the peers add them, in millionths: integers are totally ordered, and exact here.
 pub(crate) type MicroCost = u64;
 
-/// A node: observation and state.
+/// A node: observation and state. The first is [`ROOT`].
 pub(crate) type Node = (u32, u32);
+
+/// Stands before the first observation: from here, each start is reached by a move of its own.
+const ROOT: Node = (u32::MAX, 0);
 
 /// The problem for general searches.
 pub(crate) struct Peer<'m> {
     model: &'m Model,
-    start: u32,
+    starts: Vec<u32>,
     /// Terms of the distance by the state's value. Shape `[n_observations][n_attributes][domain size]`.
     terms: Vec<Vec<Vec<MicroCost>>>,
     action_costs: Vec<MicroCost>,
@@ -43,7 +46,12 @@ impl<'m> Peer<'m> {
             terms.collect()
         });
         let action_costs = model.actions().iter().map(|action| micro(action.cost)).collect();
-        Self { model, start: problem.closest_start(), terms: terms.collect(), action_costs, n_expanded: Cell::new(0) }
+        let starts = match model.start() {
+            Start::State(state) => vec![*state],
+            Start::Candidates(states) => states.clone(),
+            Start::Any => (0..model.states().len()).filter(|state| !model.is_unsafe(*state)).collect(),
+        };
+        Self { model, starts, terms: terms.collect(), action_costs, n_expanded: Cell::new(0) }
     }
 
     fn last(&self) -> u32 {
@@ -61,23 +69,23 @@ impl<'m> Peer<'m> {
     }
 
     /// The moves out of a node, with what they cost.
-    fn moves(&self, (i, state): Node) -> impl Iterator<Item = (Node, MicroCost)> {
-        let is_last = i == self.last();
-        let skip = (!is_last).then_some(((i + 1, state), 0));
-        let moves = self.model.graph().successors(state).iter().flat_map(move |transition| {
+    fn moves(&self, node: Node) -> impl Iterator<Item = (Node, MicroCost)> {
+        let (i, state) = node;
+        let (is_root, is_last) = (node == ROOT, i == self.last());
+        let starts: &[u32] = if is_root { &self.starts } else { &[] };
+        let starts = starts.iter().map(|start| ((0, *start), 0));
+        let skip = (!is_root && !is_last).then(|| ((i + 1, state), 0));
+        let transitions = if is_root { &[] } else { self.model.graph().successors(state) };
+        let moves = transitions.iter().flat_map(move |transition| {
             let cost = self.action_costs[usize::from(transition.action)];
-            let matched = (!is_last).then_some(((i + 1, transition.to), cost));
+            let matched = (!is_last).then(|| ((i + 1, transition.to), cost));
             [matched, Some(((i, transition.to), cost))].into_iter().flatten()
         });
-        skip.into_iter().chain(moves).map(|(node, cost)| (node, cost + self.distance(node)))
+        starts.chain(skip).chain(moves).map(|(node, cost)| (node, cost + self.distance(node)))
     }
 
     fn solved(&self, cost: MicroCost) -> Solved {
-        Solved {
-            cost: (self.distance((0, self.start)) + cost) as f64 / 1e6,
-            n_expanded: self.n_expanded.get(),
-            n_steps: None,
-        }
+        Solved { cost: cost as f64 / 1e6, n_expanded: self.n_expanded.get(), n_steps: None }
     }
 
     /// A* of the crate `pathfinding`.
@@ -88,7 +96,7 @@ impl<'m> Peer<'m> {
             self.moves(*node).collect::<Vec<_>>()
         };
         let is_end = |(i, _): &Node| *i == self.last();
-        let found = astar(&(0, self.start), successors, |node| heuristic(*node), is_end);
+        let found = astar(&ROOT, successors, |node| if *node == ROOT { 0 } else { heuristic(*node) }, is_end);
         let (_, cost) = found.expect("there is always a mapping");
         self.solved(cost)
     }
@@ -97,7 +105,8 @@ impl<'m> Peer<'m> {
     pub(crate) fn petgraph(&self, heuristic: impl Fn(Node) -> MicroCost) -> Solved {
         self.n_expanded.set(0);
         let is_end = |(i, _): Node| i == self.last();
-        let found = petgraph::algo::astar(Unfolded(self), (0, self.start), is_end, |edge| edge.cost, heuristic);
+        let estimate = |node| if node == ROOT { 0 } else { heuristic(node) };
+        let found = petgraph::algo::astar(Unfolded(self), ROOT, is_end, |edge| edge.cost, estimate);
         let (cost, _) = found.expect("there is always a mapping");
         self.solved(cost)
     }
@@ -108,7 +117,9 @@ impl<'m> Peer<'m> {
         let n_states = self.model.states().len() as usize;
         let mut n_expanded = 0;
         let mut costs: Vec<Option<MicroCost>> = vec![None; n_states];
-        costs[self.start as usize] = Some(self.distance((0, self.start)));
+        for start in &self.starts {
+            costs[*start as usize] = Some(self.distance((0, *start)));
+        }
         for i in 0..=self.last() {
             let mut open: BinaryHeap<Reverse<(MicroCost, u32)>> =
                 costs.iter().zip(0..).filter_map(|(cost, state)| Some(Reverse(((*cost)?, state)))).collect();

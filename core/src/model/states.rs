@@ -11,9 +11,9 @@ pub type StateIdx = u32;
 pub enum Start {
     /// In this state.
     State(StateIdx),
-    /// In whichever of these states is closest to the first observation; the lowest index among equals. Not empty.
+    /// In one of these states, whichever begins the cheapest mapping. Not empty.
     Candidates(Vec<StateIdx>),
-    /// In whichever state is closest to the first observation; the lowest index among equals.
+    /// In any state that may be entered, whichever begins the cheapest mapping.
     Any,
 }
 
