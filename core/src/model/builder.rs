@@ -160,8 +160,7 @@ impl ModelBuilder {
         Ok(())
     }
 
-    /// Where the imitator starts: in the one of these states that is closest to the first observation. In any state, if this is never
-    /// said.
+    /// Where the imitator may start: in any one of these states. In any state that may be entered, if this is never said.
     ///
     /// # Errors
     ///

@@ -83,7 +83,7 @@ fn a_model_is_the_same_whether_its_states_are_listed_or_found_by_the_search() {
     let (listed, lazy) = (mapper(100), mapper(0));
     assert!(!listed.model().is_lazy() && lazy.model().is_lazy());
     assert_eq!((listed.model().states().len(), lazy.model().states().len()), (N - 1, 3));
-    // It starts on the number that is closest to the first that is seen.
+    // Where it starts is part of what is found.
     for seen in [[2, 3, 4, 5, 6], [5, 6, 7, 8, 9], [9, 10, 11, 0, 2]] {
         let expected = solved(&listed, &seen);
         assert!(expected.2);

@@ -91,9 +91,8 @@ pub struct TableDocument {
     /// and what the action costs. Those of the same state, action and state to which they lead add up, and the probabilities of a state and an
     /// action sum to 1. In another order they are other content, though they mean the same.
     pub transitions: Vec<TransitionDocument>,
-    /// Where the imitator starts: a state's index, or a list of candidates, of which the one closest to the first
-    /// observation is taken; in another order they are other content, though they mean the same. Left out: every safe state is
-    /// a candidate.
+    /// Where the imitator starts: a state's index, or a list of candidates, of which the one is taken that begins the cheapest
+    /// mapping; in another order they are other content, though they mean the same. Left out: every safe state is a candidate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<StartDocument>,
     /// States that must never be entered, in any order.
@@ -177,7 +176,7 @@ pub enum StartDocument {
     /// In this state.
     #[cfg_attr(feature = "openapi", schema(value_type = u32))]
     State(StateIdx),
-    /// In the one of these that is closest to the first observation.
+    /// In the one of these that begins the cheapest mapping.
     #[cfg_attr(feature = "openapi", schema(value_type = Vec<u32>))]
     Candidates(Vec<StateIdx>),
 }
