@@ -29,7 +29,7 @@ pub struct Cost {
 
 /// Sums the cost of a mapping step by step: exactly, to within an ulp, and then to the 15 significant digits that a float
 /// holds of a decimal. Eighteen actions of 0.3 cost 5.4.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct CostSum {
     actions: CompensatedSum,
     distance: CompensatedSum,
@@ -102,7 +102,7 @@ pub(super) fn cost_of(problem: &Problem<'_>, space: &impl Space, moves: &[Move],
 }
 
 /// A sum with a running compensation for lost low-order bits (Neumaier 1974).
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct CompensatedSum {
     sum: f64,
     compensation: f64,

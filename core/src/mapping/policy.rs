@@ -254,13 +254,18 @@ impl Policy {
 }
 
 /// Writes the steps of a policy, one after the other.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct StepWriter {
     sum: CostSum,
     n_steps: u32,
 }
 
 impl StepWriter {
+    /// How many steps were written.
+    pub(super) fn n_steps(&self) -> u32 {
+        self.n_steps
+    }
+
     /// The next step, given what its action costs and the terms of the distance that it pays; `states` are those that it is numbered in.
     pub(super) fn write(
         &mut self,

@@ -20,7 +20,7 @@
 //!                A(s, a, s') +  x e_i D(o_i, s') + H(i, s') )             extra, by an action a to s'
 //! ```
 //!
-//! Searches, layers and repairs of an online mapping and completions go forwards ([`Recurrence::arrive`]), sweeps and the tables of
+//! Searches, layers of an online mapping and completions go forwards ([`Recurrence::arrive`]), sweeps and the tables of
 //! projections backwards ([`Recurrence::go_on`]). What a kind of move pays of a distance is said by [`Recurrence::paid`] alone;
 //! distances have the weight of their observation in them already ([`Distances`](super::distances::Distances)). Floats are added in the
 //! order in which they stand here, from the left forwards and from the right backwards, so that whoever uses the same direction comes to

@@ -89,12 +89,12 @@ impl<'m> Request<'m> {
         if self.lookahead.is_none() {
             return mapper.map(problem, self.settings, interrupt);
         }
-        let n_states = problem.model.graph().n_states() as u64;
         let (weights, conditions) = (problem.weights.clone(), problem.conditions.clone());
         let max_bytes = self.settings.budget.max_bytes;
         let mut online = OnlineMapping::new(mapper, weights, conditions, self.lookahead).within(max_bytes);
         for observation in problem.demonstration.iter() {
-            let is_spent = online.n_expanded().saturating_add(n_states) > self.settings.budget.max_expansions;
+            let n_expanded = online.n_expanded().saturating_add(online.next_expanded());
+            let is_spent = n_expanded > self.settings.budget.max_expansions;
             let signal = if is_spent { Signal::Finish } else { interrupt.poll() };
             let mut is_over = false;
             let mut until_over = || match interrupt.poll() {

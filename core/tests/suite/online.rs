@@ -5,27 +5,40 @@ use std::sync::Arc;
 
 use crate::oracle;
 use crate::problems::{close, example, mapper, problem};
+use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
 use etude_core::mapping::{
-    CommittedStep, Conditions, Mapper, Mapping, OnlineMapping, Options, Policy, Request, Stamp, Status, StoppedBy,
+    CommittedMove, CommittedStep, Conditions, Mapper, Mapping, OnlineMapping, Options, Policy, Request, Root, Stamp,
+    Status, StoppedBy,
 };
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
-/// Feeds the demonstration of a request, and gives what was committed and the mapping.
-fn follow(mapper: &Arc<Mapper>, request: &Value, lookahead: Option<u32>) -> (Vec<CommittedStep>, Mapping) {
-    let schema = mapper.model().schema();
+/// The weights and conditions of a request.
+fn conditions(mapper: &Mapper, request: &Value) -> (Weights, Conditions) {
     let mut faults = Faults::default();
     let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
     let options = Options::read(&object, mapper.model(), &Options::default(), &mut faults);
     let options = faults.check(options).unwrap();
-    let lookahead = lookahead.and_then(NonZeroU32::new);
-    let weights = options.weights_over(schema.weights());
-    let mut online = OnlineMapping::new(mapper, weights, options.conditions(), lookahead);
+    (options.weights_over(mapper.model().schema().weights()), options.conditions())
+}
+
+/// The observations of a request.
+fn observations(mapper: &Mapper, request: &Value) -> Vec<Vec<Option<etude_core::attribute::Value>>> {
+    let read = |observation: &Value| {
+        let place = Place::root(observation);
+        mapper.model().schema().read_observation(&place, &mut Faults::default()).unwrap()
+    };
+    request["demonstration"].as_array().unwrap().iter().map(read).collect()
+}
+
+/// Feeds the demonstration of a request, and gives what was committed and the mapping.
+fn follow(mapper: &Arc<Mapper>, request: &Value, lookahead: Option<u32>) -> (Vec<CommittedStep>, Mapping) {
+    let (weights, conditions) = conditions(mapper, request);
+    let mut online = OnlineMapping::new(mapper, weights, conditions, lookahead.and_then(NonZeroU32::new));
     let mut committed = Vec::new();
-    for observation in request["demonstration"].as_array().unwrap() {
-        let observation = schema.read_observation(&Place::root(observation), &mut Faults::default()).unwrap();
+    for observation in observations(mapper, request) {
         committed.extend(online.observe(&observation, None, &mut Uninterrupted).unwrap());
     }
     let (rest, mapping) = online.end().unwrap();
@@ -147,6 +160,96 @@ proptest! {
         prop_assert!(close(sum + mapping.cost.end, mapping.cost.total));
         prop_assert_eq!(committed.len(), mapping.moves.len());
     }
+
+    #[test]
+    fn a_step_whose_time_is_up_is_the_first_of_the_cheapest_way_to_what_has_come(
+        (model, request) in prop_oneof![problem(), line()],
+        lookahead in prop::option::weighted(0.5, 1u32..6),
+        times in prop::collection::vec(0..3_u32, 25),
+    ) {
+        let mapper = mapper(&model);
+        let (weights, conditions) = conditions(&mapper, &request);
+        let lookahead = lookahead.and_then(NonZeroU32::new);
+        let mut online = OnlineMapping::new(&mapper, weights, conditions, lookahead);
+        let starts = oracle::starts(&model, &request);
+        let to_go = |from: Option<(usize, usize)>, to: usize| match from {
+            Some(node) => oracle::cost_to_go(&model, &request, node, to, false),
+            None => oracle::cost_from(&model, &request, &starts, to, false),
+        };
+        prop_assert_eq!(online.decide(&mut Uninterrupted).unwrap(), []);
+        let mut at = None;
+        let mut is_forced_once = false;
+        for (i, (observation, n_up)) in observations(&mapper, &request).into_iter().zip(times).enumerate() {
+            let observed = online.observe(&observation, None, &mut Uninterrupted).unwrap();
+            is_forced_once |= observed.iter().any(|step| !step.is_proven);
+            at = observed.last().map(node).or(at);
+            for _ in 0..n_up {
+                let decided = online.decide(&mut Uninterrupted).unwrap();
+                let next = at.map_or(0, |(observation, _)| observation + 1);
+                prop_assert_eq!(decided.is_empty(), next > i, "something is decided wherever there is something");
+                let Some(n_forced) = decided.iter().position(|step| step.step.observation as usize == next) else { continue };
+                is_forced_once = true;
+                let (forced, shared) = decided.split_at(n_forced + 1);
+                prop_assert!(forced.iter().all(|step| !step.is_proven && step.after as usize == i + 1));
+                prop_assert!(shared.iter().all(|step| step.is_proven));
+                let paid: f64 = forced.iter().map(|step| step.step.action_cost + step.step.distance).sum();
+                let (best, taken) = (to_go(at, i), paid + to_go(forced.last().map(node), i));
+                prop_assert!(close(best, taken), "{taken} where {best} was possible");
+                at = decided.last().map(node);
+            }
+        }
+        let (_, mapping) = online.end().unwrap();
+        prop_assert_eq!(mapping.status, if is_forced_once { Status::Local } else { Status::Optimal });
+    }
+
+    #[test]
+    fn a_mapping_that_goes_on_from_its_root_gives_what_the_unbroken_one_gives(
+        (model, request) in prop_oneof![problem(), line()],
+        lookahead in prop::option::weighted(0.8, 1u32..6),
+        times in prop::collection::vec(prop::bool::weighted(0.3), 25),
+        (kept, broken) in (0_usize..25, 0_usize..25),
+    ) {
+        let mapper = mapper(&model);
+        let (weights, conditions) = conditions(&mapper, &request);
+        let lookahead = lookahead.and_then(NonZeroU32::new);
+        let observations = observations(&mapper, &request);
+        let take = |online: &mut OnlineMapping, i: usize| {
+            let mut steps = online.observe(&observations[i], None, &mut Uninterrupted).unwrap();
+            if times[i] {
+                steps.extend(online.decide(&mut Uninterrupted).unwrap());
+            }
+            steps
+        };
+        let mut unbroken = OnlineMapping::new(&mapper, weights.clone(), conditions.clone(), lookahead);
+        // The root is kept once so many observations have come, and others come after it.
+        let (kept, broken) = (kept.min(broken) % observations.len(), kept.max(broken) % observations.len());
+        (0..kept).for_each(|i| drop(take(&mut unbroken, i)));
+        let stored = serde_json::to_string(&(unbroken.root(), unbroken.moves_from(0).collect::<Vec<_>>())).unwrap();
+        let (root, moves): (Root, Vec<CommittedMove>) = serde_json::from_str(&stored).unwrap();
+        prop_assert_eq!(root, unbroken.root());
+        prop_assert_eq!(root.n_steps(), unbroken.n_steps());
+
+        let moves_before = moves.iter().copied().take(moves.len().saturating_sub(1));
+        let missing = OnlineMapping::resume(&mapper, weights.clone(), conditions.clone(), lookahead, &root, moves_before);
+        prop_assert_eq!(missing.is_some(), moves.is_empty());
+        let resumed = OnlineMapping::resume(&mapper, weights, conditions, lookahead, &root, moves);
+        let mut resumed = resumed.unwrap();
+        prop_assert_eq!(resumed.root(), root);
+        prop_assert_eq!(resumed.n_observed(), root.first_observation());
+        for observation in &observations[root.first_observation() as usize..kept] {
+            prop_assert_eq!(resumed.observe(observation, None, &mut Uninterrupted).unwrap(), []);
+        }
+        prop_assert_eq!(resumed.n_observed(), unbroken.n_observed());
+        prop_assert_eq!(resumed.root(), root);
+        for i in kept..observations.len() {
+            if i == broken {
+                prop_assert_eq!(unbroken.n_rest(), resumed.n_rest());
+            }
+            prop_assert_eq!(take(&mut unbroken, i), take(&mut resumed, i));
+        }
+        prop_assert_eq!(resumed.root(), unbroken.root());
+        prop_assert_eq!(resumed.end().unwrap(), unbroken.end().unwrap());
+    }
 }
 
 #[test]
@@ -211,7 +314,7 @@ fn where_time_or_expansions_are_up_what_a_lookahead_has_not_decided_is_followed_
     };
     for n_polls in 1..=400 {
         let mapping = after(n_polls, Signal::Finish).unwrap();
-        // A look before each observation, one in it, and those of repairs.
+        // A look before each observation, one in it, and those of what is swept again.
         let n_same = check(&mapping, StoppedBy::Deadline);
         assert!(n_same + 6 >= n_polls / 20, "{n_same} of {n_polls}");
         assert_eq!(after(n_polls, Signal::Cancel), Err(Cancelled));

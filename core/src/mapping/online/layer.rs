@@ -68,7 +68,7 @@ pub(super) struct Layer {
     pub(super) costs: Vec<f64>,
     nodes: LayerNodes,
     n_alive: usize,
-    /// How many states there may be a way to; nothing was written of others.
+    /// How many states there may be a way to, if nothing was written of others; else 0.
     n_reached: usize,
 }
 
@@ -184,7 +184,7 @@ impl Layer {
         costs[0] = 0.0;
         nodes[0].n_children = 0;
         let nodes = LayerNodes::Dense(nodes);
-        Self { observed: ObservedDistances::default(), costs, nodes, n_alive: 1, n_reached: usize::MAX }
+        Self { observed: ObservedDistances::default(), costs, nodes, n_alive: 1, n_reached: 0 }
     }
 
     /// Approximate size in memory, in bytes.

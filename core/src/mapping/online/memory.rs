@@ -3,15 +3,10 @@
 use std::num::NonZeroU32;
 
 use super::layer::{self, Layer, Node};
-use super::repair::{self, Predecessors};
 use super::{OnlineMapping, Stopped};
 use crate::mapping::Move;
 use crate::mapping::open_list::CheapestFirst;
 use crate::model::{Model, StateIdx};
-
-/// Most nodes of a window whose layers are kept whole, to be repaired, 16 bytes each; and most terms in its tables of distances,
-/// 8 bytes each. Together 48 MB.
-pub(super) const MAX_KEPT: u64 = 1 << 21;
 
 /// The longest lookahead whose window takes about `max_bytes` with `model` if all of its nodes are alive, as when nothing tells the ways
 /// apart: that has one layer more, and 8 bytes a node. With 1 GB it has at most 134 million nodes. 0 if not even the shortest one fits.
@@ -24,9 +19,8 @@ impl OnlineMapping {
     /// Approximate size in memory, in bytes, without the model. Looks at no layer.
     #[must_use]
     pub fn size_bytes(&self) -> usize {
-        let predecessors = self.predecessors.as_ref().map_or(0, Predecessors::size_bytes);
         let moves = self.moves.capacity() * size_of::<Move>();
-        size_of::<Self>() + self.window.size_bytes() + self.sweep.size_bytes() + predecessors + moves
+        size_of::<Self>() + self.window.size_bytes() + self.sweep.size_bytes() + moves
     }
 
     /// Checks that there is memory for so many bytes more.
@@ -54,17 +48,10 @@ impl OnlineMapping {
         let n_terms = n_terms(model, |_| true);
         let reach = lookahead.map_or(usize::MAX, |lookahead| lookahead.get() as usize);
         let n_layers = n_observations.min(reach.saturating_add(1));
-        let keeps = keeps(n_states, n_terms, lookahead);
-        let each = if keeps {
-            n_states * (layer::NODE_BYTES + repair::NODE_BYTES) + n_terms * size_of::<f64>()
-        } else {
-            n_states * size_of::<Node>()
-        };
-        let each = each + size_of::<Layer>() + model.schema().len() * OBSERVED_BYTES;
+        let each = n_states * size_of::<Node>() + size_of::<Layer>() + model.schema().len() * OBSERVED_BYTES;
         let once = n_states
             * (size_of::<f64>() + size_of::<StateIdx>() + OPEN * size_of::<CheapestFirst>() + 3 * layer::NODE_BYTES)
-            + n_terms * size_of::<f64>()
-            + Predecessors::bytes_for(model.graph());
+            + n_terms * size_of::<f64>();
         let moves = n_observations.saturating_mul(MOVES_PER_OBSERVATION * size_of::<Move>());
         n_layers.saturating_mul(each).saturating_add(once).saturating_add(moves + BASE_BYTES)
     }
@@ -74,12 +61,6 @@ impl OnlineMapping {
 pub(super) fn n_terms(model: &Model, weighs: impl Fn(usize) -> bool) -> usize {
     let weighing = (0..model.schema().len()).filter(|position| weighs(*position));
     weighing.map(|position| model.states().domain(position).len()).sum()
-}
-
-/// Whether the layers of a window are kept whole.
-pub(super) fn keeps(n_states: usize, n_terms: usize, lookahead: Option<NonZeroU32>) -> bool {
-    let n_layers = lookahead.map_or(u64::MAX, |lookahead| 1 + u64::from(lookahead.get()));
-    n_layers.saturating_mul(n_states.max(n_terms) as u64) <= MAX_KEPT
 }
 
 /// What an observed attribute takes, besides its terms.

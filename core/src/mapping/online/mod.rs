@@ -20,37 +20,35 @@
 //! - where there are several start states, the tree hangs on a root before all of them, from which each is reached for nothing: a start is
 //!   committed as a move from there is;
 //! - with a lookahead of H, once the observation H past the root's has come, the cheapest way to it decides: it is
-//!   committed up to its first move that advances, and the ways that do not begin so are given up. States that have lost
-//!   their way by that get the cheapest one that is left: by a repair where they are few, which looks only at nodes that
-//!   bounds do not rule out ([`repair`]), else by sweeping the (at most H) layers after the new root again.
+//!   committed up to its first move that advances, and the ways that do not begin so are given up: the (at most H) layers after the
+//!   new root are swept again. So it is where the caller says that the time for a step is up ([`OnlineMapping::decide`]), whatever has
+//!   come by then.
+//!
+//! Hence all that is still to be committed follows from the root and the observations from its own on, and a mapping can go on from there
+//! after a restart ([`OnlineMapping::resume`]): with the same steps, to the bit.
 //!
 //! **What can be left out.** Nothing is known of what is to come, so no survivor is ruled out by its cost: an observation may
 //! still come that only it is close to. What rules one out for good is that another reaches it as cheaply, and that is what
 //! extras within the newest layer do: such a state is kept, on the other's branch. A bound from the model's projections
 //! rules out no more: they bound what is to come of known observations, and a survivor's way is wanted whether it is
-//! the cheapest or not, or else nothing would be proven. But three things are never looked at:
+//! the cheapest or not, or else nothing would be proven. But two things are never looked at:
 //!
 //! - states that cannot be reached from the root any more (what was grabbed stays grabbed);
 //! - extras from a state that costs no less than it did at the observation before, if an extra pays the whole distance: the same action
-//!   would have led from there as a match, to the same state, for no more;
-//! - nodes at earlier observations that no survivor hangs on, and in a repair those whose lower bound (what they cost from an
-//!   earlier root) is no less than what a way that is left costs.
+//!   would have led from there as a match, to the same state, for no more.
 //!
-//! **Memory.** Without a lookahead, older layers keep the observation and the nodes that survivors hang on, at most 8 bytes per
-//! state; but no costs, and no distances: of the few states that steps lead to, these are computed again. With a lookahead,
-//! layers are kept whole so that they can be repaired (16 bytes per state and observation after the root's, and tables of
-//! distances), unless that would be more than [`memory::MAX_KEPT`] nodes or terms of distances; requests with a lookahead beyond
-//! [`longest_lookahead`] are refused.
+//! **Memory.** Older layers keep the observation and the nodes that survivors hang on, at most 8 bytes per state; but no costs, and no
+//! distances: of the few states that steps lead to, these are computed again. Requests with a lookahead beyond [`longest_lookahead`] are
+//! refused.
 //!
 //! **Ties.** The way found first is kept: a skip, then matches, from the lower state first, then extras, from the cheaper state
-//! first; of actions between the same two states the cheapest, the first among equals. In a repair, ways that were not
-//! lost come first. Among survivors the lower state is the cheapest. All this depends on the observations alone, so that
-//! the same ones give the same steps.
+//! first; of actions between the same two states the cheapest, the first among equals. Among survivors the lower state is the cheapest.
+//! All this depends on the root and the observations alone, so that the same ones give the same steps.
 
 mod committed;
 mod layer;
 mod memory;
-mod repair;
+mod root;
 mod window;
 
 use std::num::NonZeroU32;
@@ -66,8 +64,8 @@ use crate::model::{Model, StateIdx};
 pub use committed::{CommittedStep, Stopped};
 use layer::{Layer, Source, Sweep};
 pub(crate) use memory::longest_lookahead;
-use memory::{keeps, n_terms};
-use repair::{Predecessors, Repair, Repaired};
+use memory::n_terms;
+pub use root::{CommittedMove, Root};
 use window::{NodePlace, Window};
 
 /// A mapping in the making.
@@ -85,10 +83,6 @@ pub struct OnlineMapping {
     /// The cost of the way to the window's root, summed as the layers' costs are.
     root_cost: f64,
     sweep: Sweep,
-    /// Made when the lookahead decides for the first time.
-    predecessors: Option<Predecessors>,
-    /// Where more than one survivor in this many has lost its way, all layers are swept; none are if it is 0.
-    sweeps_from: usize,
     writer: StepWriter,
     moves: Vec<Move>,
     /// What the action of each of these costs.
@@ -100,9 +94,6 @@ pub struct OnlineMapping {
     /// Whether the survivors' ways are what they should be: not while an observation is taken, nor after one that was broken off.
     is_whole: bool,
 }
-
-/// Where more than one survivor in this many has lost its way, sweeping all layers takes less time than a repair.
-const SWEEPS_FROM: usize = 8;
 
 impl OnlineMapping {
     /// A mapping of a demonstration of which nothing has come yet. `lookahead` is how many observations past the current one a decision may
@@ -116,9 +107,8 @@ impl OnlineMapping {
         let model = mapper.shared_model();
         assert!(!model.is_lazy(), "each layer needs all states");
         let n_terms = n_terms(&model, |position| weights.as_slice()[position] > 0.0);
-        let keeps = keeps(model.graph().n_states(), n_terms, lookahead);
         let sweep = Sweep::new(&model, &conditions);
-        let window = Window::new(model.states().len(), keeps);
+        let window = Window::new(model.states().len());
         Self {
             model,
             weights,
@@ -130,8 +120,6 @@ impl OnlineMapping {
             window,
             root_cost: 0.0,
             sweep,
-            predecessors: None,
-            sweeps_from: SWEEPS_FROM,
             writer: StepWriter::default(),
             moves: Vec::new(),
             action_costs: Vec::new(),
@@ -169,6 +157,15 @@ impl OnlineMapping {
     /// How many nodes were looked at: every state once for each layer that was swept.
     pub(super) fn n_expanded(&self) -> u64 {
         self.n_swept * self.model.graph().n_states() as u64
+    }
+
+    /// How many nodes the next observation looks at, at most.
+    pub(super) fn next_expanded(&self) -> u64 {
+        let lookahead = self.lookahead.map_or(0, NonZeroU32::get);
+        // Whatever is decided leaves so many layers that are swept again.
+        let is_due = self.lookahead.is_some() && self.window.n_before.saturating_add(lookahead) <= self.n_observed + 1;
+        let n_sweeps = 1 + if is_due { u64::from(lookahead) } else { 0 };
+        n_sweeps.saturating_mul(self.model.graph().n_states() as u64)
     }
 
     /// How many transitions were looked at.
@@ -215,7 +212,9 @@ impl OnlineMapping {
         self.n_observed += 1;
         self.newest.clear();
         self.newest.extend_from_slice(observation);
-        if self.n_observed == 1 {
+        if self.is_resumed() {
+            self.begin(&[(self.window.root, self.root_cost)], Source::NONE, observed);
+        } else if self.n_observed == 1 {
             let starts = Starts::of(model, self.conditions.starts.as_deref());
             let arrived = |state: &StateIdx| {
                 let distance = observed.distance(model, *state);
@@ -230,9 +229,24 @@ impl OnlineMapping {
         }
         self.commit_shared(&mut committed);
         while self.must_decide() {
-            self.decide(&mut committed);
-            self.restore(interrupt)?;
-            self.commit_shared(&mut committed);
+            self.commit_cheapest(&mut committed, interrupt)?;
+        }
+        Ok(committed)
+    }
+
+    /// Commits the cheapest way to the newest observation, up to and including its first move that advances from the root's, for a step
+    /// whose time is up; and whatever all ways that are left share then. The start counts as a move that advances from before the first
+    /// observation. Commits nothing if no observation has come after the root's. What is decided so is forced: the status is local.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::observe`].
+    pub fn decide(&mut self, interrupt: &mut dyn Interrupt) -> Result<Vec<CommittedStep>, Stopped> {
+        let mut committed = Vec::new();
+        if self.window.layers.len() > 1 {
+            self.is_whole = false;
+            self.commit_cheapest(&mut committed, interrupt)?;
+            self.is_whole = true;
         }
         Ok(committed)
     }
@@ -290,7 +304,7 @@ impl OnlineMapping {
     fn must_decide(&self) -> bool {
         // So many layers are before the one of the newest observation.
         let newest = self.n_observed;
-        self.lookahead.is_some_and(|lookahead| self.window.n_before + lookahead.get() <= newest)
+        self.lookahead.is_some_and(|lookahead| self.window.n_before.saturating_add(lookahead.get()) <= newest)
     }
 
     /// Commits every step that all survivors share.
@@ -301,18 +315,25 @@ impl OnlineMapping {
         }
     }
 
-    /// Commits the cheapest way to the newest observation, up to its first move that advances.
-    fn decide(&mut self, committed: &mut Vec<CommittedStep>) {
+    /// Commits the cheapest way to the newest observation, up to its first move that advances, and what all ways share that are left.
+    fn commit_cheapest(
+        &mut self,
+        committed: &mut Vec<CommittedStep>,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<(), Stopped> {
         self.was_forced = true;
-        let Some(survivor) = self.window.layers.back().and_then(Layer::cheapest) else { return };
-        for place in self.window.path(survivor) {
+        let survivor = self.window.layers.back().and_then(Layer::cheapest);
+        for place in survivor.map(|survivor| self.window.path(survivor)).unwrap_or_default() {
             committed.push(self.commit_at(place, false));
             let (index, _) = place;
             if index > 0 {
                 self.window.advance(place);
-                return;
+                break;
             }
         }
+        self.restore(interrupt)?;
+        self.commit_shared(committed);
+        Ok(())
     }
 
     fn commit_at(&mut self, place: NodePlace, is_proven: bool) -> CommittedStep {
@@ -329,20 +350,9 @@ impl OnlineMapping {
         CommittedStep { step: written, is_proven, after: self.n_observed }
     }
 
-    /// Gives survivors that have lost their way the cheapest one that is left.
+    /// Finds the ways from the root anew.
     fn restore(&mut self, interrupt: &mut dyn Interrupt) -> Result<(), Stopped> {
         let model = &*Arc::clone(&self.model);
-        let n_survivors = self.window.layers.back().map_or(0, Layer::n_alive);
-        if self.window.keeps() {
-            let made = if self.predecessors.is_none() { Predecessors::bytes_for(model.graph()) } else { 0 };
-            self.check_memory(made + self.window.layers.len() * model.graph().n_states() * repair::NODE_BYTES)?;
-            let predecessors = self.predecessors.get_or_insert_with(|| Predecessors::new(model, &self.sweep.body));
-            let repair = Repair::new(&mut self.window, model, predecessors, &mut self.sweep);
-            let most = n_survivors.checked_div(self.sweeps_from).unwrap_or(usize::MAX);
-            if repair.run(most, interrupt)? == Repaired::All {
-                return Ok(());
-            }
-        }
         let root = self.window.root;
         let mut observed = self.window.clear().into_iter();
         if let Some(mut first) = observed.next() {
@@ -353,14 +363,7 @@ impl OnlineMapping {
         for mut observed in observed {
             observed.fill_tables(model);
             let layer = self.follow(observed, interrupt)?;
-            if self.window.keeps() {
-                self.window.add(layer);
-            } else {
-                self.window.push(layer);
-            }
-        }
-        if self.window.keeps() {
-            self.window.recount();
+            self.window.push(layer);
         }
         Ok(())
     }

@@ -63,7 +63,6 @@ fn an_observation_that_would_take_more_memory_than_there_is_is_not_taken_and_wha
         let observation = vec![Some(Value::Number(f64::from(1 + n % 150))); 8];
         online.observe(&observation, None, &mut Uninterrupted)
     };
-    // Window of layers that are thinned, kept whole, and thinned again.
     for lookahead in [None, Some(100), Some(10_000)] {
         let lookahead = lookahead.and_then(NonZeroU32::new);
         let new = || OnlineMapping::new(&mapper, weights.clone(), Conditions::default(), lookahead);
@@ -84,7 +83,7 @@ fn an_observation_that_would_take_more_memory_than_there_is_is_not_taken_and_wha
             });
             assert_eq!(stopped, Some(Stopped::Memory), "{max_bytes} of {most}");
             let n_observed = online.n_observed();
-            assert_eq!(n_observed > 0, max_bytes > 100_000, "{n_observed} in {max_bytes} of {most}");
+            assert_eq!(n_observed > 0, max_bytes > 10_000, "{n_observed} in {max_bytes} of {most}");
             let moves = online.into_moves();
             assert!(n_observed == 0 || !moves.is_empty());
         }
@@ -95,45 +94,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 500, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
-    fn a_repair_costs_every_survivor_what_a_sweep_does(
-        places in prop::collection::vec(0..12_u32, 2..25),
-        transitions in prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..70),
-        observed in prop::collection::vec(0..12_u32, 2..30),
-        lookahead in 1..7_u32,
-    ) {
-        let mapper = mapper(&places, &transitions);
-        let weights = mapper.model().schema().weights();
-        let new = || OnlineMapping::new(&mapper, weights.clone(), Conditions::default(), NonZeroU32::new(lookahead));
-        let mut repaired = OnlineMapping { sweeps_from: 0, ..new() };
-        let mut swept = OnlineMapping { sweeps_from: usize::MAX, ..new() };
-        // A window that is not kept is always swept.
-        let n_states = mapper.model().states().len();
-        let mut thinned = OnlineMapping { window: Window::new(n_states, false), ..new() };
-        let costs = |online: &OnlineMapping| -> Vec<f64> {
-            let newest = online.window.layers.back().unwrap();
-            let reached = (0..n_states).filter(|state| newest.node(*state).is_alive());
-            reached.map(|state| newest.costs[state as usize]).collect()
-        };
-        for x in observed {
-            let observation = [Some(Value::Number(f64::from(x)))];
-            let observe = |online: &mut OnlineMapping| online.observe(&observation, None, &mut Uninterrupted).unwrap();
-            prop_assert_eq!(observe(&mut swept), observe(&mut thinned));
-            prop_assert_eq!(costs(&swept), costs(&thinned));
-            prop_assert_eq!(swept.n_nodes(), thinned.n_nodes());
-            observe(&mut repaired);
-            for online in [&repaired, &swept, &thinned] {
-                prop_assert!(online.window.knows_its_size());
-            }
-            // Where ties were told apart in another way, they go on from different roots: see below.
-            if repaired.moves != swept.moves {
-                break;
-            }
-            prop_assert_eq!(costs(&repaired), costs(&swept));
-        }
-    }
-
-    #[test]
-    fn what_is_decided_after_repairs_is_as_cheap_as_any_search_finds(
+    fn what_is_decided_is_as_cheap_as_any_search_finds_and_so_is_every_survivors_way(
         places in prop::collection::vec(0..12_u32, 5..25),
         transitions in prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..70),
         observed in prop::collection::vec(0..12_u32, 5..25),
@@ -150,11 +111,12 @@ proptest! {
             let cost = mapper.map(&problem, settings, &mut Uninterrupted).unwrap().cost.total;
             cost - problem.distances.distance(0, mapper.model().states().row(state))
         };
-        let new = OnlineMapping::new(&mapper, weights.clone(), Conditions::default(), NonZeroU32::new(lookahead));
-        let mut online = OnlineMapping { sweeps_from: 0, ..new };
+        let lookahead = NonZeroU32::new(lookahead);
+        let mut online = OnlineMapping::new(&mapper, weights.clone(), Conditions::default(), lookahead);
         let mut at = (0, 0);
         for (i, observation) in (0..).zip(&observations) {
             let committed = online.observe(observation, None, &mut Uninterrupted).unwrap();
+            prop_assert!(online.window.knows_its_size());
             let mut paid = 0.0;
             let mut from = at;
             for (n, CommittedStep { step, is_proven, after }) in committed.iter().enumerate() {

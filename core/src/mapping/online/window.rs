@@ -22,17 +22,15 @@ pub(super) struct Window {
     pub(super) root: StateIdx,
     /// The states that a way may lead to, ascending; they only ever become fewer.
     pub(super) reached: Vec<StateIdx>,
-    /// Whether older layers keep the costs of their nodes, and the nodes that no survivor hangs on.
-    keeps: bool,
     spare: Vec<Spare>,
     /// Of all layers.
     layer_bytes: usize,
 }
 
 impl Window {
-    pub(super) fn new(n_states: StateIdx, keeps: bool) -> Self {
+    pub(super) fn new(n_states: StateIdx) -> Self {
         let reached = (0..n_states).collect();
-        Self { layers: VecDeque::new(), n_before: 0, root: 0, reached, keeps, spare: Vec::new(), layer_bytes: 0 }
+        Self { layers: VecDeque::new(), n_before: 0, root: 0, reached, spare: Vec::new(), layer_bytes: 0 }
     }
 
     /// Approximate size in memory, in bytes. Looks at no layer.
@@ -55,10 +53,6 @@ impl Window {
     #[cfg(test)]
     pub(super) fn knows_its_size(&self) -> bool {
         self.layer_bytes == self.layers.iter().map(Layer::size_bytes).sum::<usize>()
-    }
-
-    pub(super) fn keeps(&self) -> bool {
-        self.keeps
     }
 
     /// How much memory a layer takes that is made now, in bytes, besides its distances.
@@ -87,7 +81,7 @@ impl Window {
     fn recycle(&mut self, spare: Spare) {
         /// A layer comes, another goes; more are used where all are swept anew.
         const MAX_SPARE: usize = 2;
-        if self.keeps || self.spare.len() < MAX_SPARE {
+        if self.spare.len() < MAX_SPARE {
             self.spare.push(spare);
         }
     }
@@ -134,10 +128,8 @@ impl Window {
                     self.cut((newest - 1, state), newest - 1);
                 }
             }
-            if !self.keeps {
-                let spare = self.lighten(newest - 1, Layer::forget);
-                self.recycle(spare);
-            }
+            let spare = self.lighten(newest - 1, Layer::forget);
+            self.recycle(spare);
         }
         self.reached = reached;
     }
@@ -165,7 +157,7 @@ impl Window {
             let source = self.source(place);
             let (index, state) = place;
             self.layers[index].kill(state);
-            if !self.keeps && index != held {
+            if index != held {
                 // It is left to the allocator: there is one for the next layer already.
                 drop(self.lighten(index, Layer::thin));
             }
@@ -262,7 +254,7 @@ impl Window {
 }
 
 /// The cheapest action from one state to another, the first among equals, and what it costs.
-pub(super) fn cheapest_way(model: &Model, body: &Body, from: StateIdx, to: StateIdx) -> Option<(ActionIdx, f64)> {
+fn cheapest_way(model: &Model, body: &Body, from: StateIdx, to: StateIdx) -> Option<(ActionIdx, f64)> {
     let space = model.whole();
     let ways = body.ways(&space, from).filter(|(transition, _)| transition.to == to);
     let ways = ways.map(|(transition, cost)| (transition.action, cost));

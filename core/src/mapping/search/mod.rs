@@ -38,7 +38,7 @@ pub enum MoveKind {
 }
 
 /// A step of a mapping.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Move {
     /// How it advances.
     pub kind: MoveKind,
