@@ -8,6 +8,7 @@ mod healthcheck;
 mod input;
 mod learner;
 mod map;
+mod model;
 mod openapi;
 mod options;
 mod render;
@@ -50,6 +51,8 @@ enum Command {
     Stream(stream::Stream),
     /// Start a service, send it the demonstration of figure 4, and show what comes back.
     Demo,
+    /// Make models from the files of other tools.
+    Model(model::ModelCommand),
     /// Check, export and import learners.
     Learner(learner::LearnerCommand),
     /// Reproduce the paper's experiments: pictures and tables of its figures 4, 7 and 8.
@@ -80,6 +83,13 @@ enum CliError {
     /// A file is JSON, but not what was asked for.
     #[error("{what} has faults:\n{faults}")]
     Faults { what: String, faults: Faults },
+    /// A file of another tool gives no model.
+    #[error("cannot import {}: {source}", path.display())]
+    Import {
+        path: PathBuf,
+        #[source]
+        source: etude_core::model::ImportError,
+    },
     /// A flag, or something in a file, is not what it should be: what, where, and what is wrong with it.
     #[error("{0}")]
     Faulty(String),
@@ -150,6 +160,7 @@ pub fn run() -> ExitCode {
         Command::Stream(stream) => stream.run(&mut io::stdout()),
         Command::Demo => demo::run(&mut io::stdout()),
         Command::Experiment(experiment) => experiment.run(&mut io::stdout().lock()),
+        Command::Model(model) => model.run(&mut io::stdout().lock()),
         Command::Learner(learner) => learner.run(&mut io::stdout().lock()),
         Command::Openapi => openapi::run(&mut io::stdout().lock()),
         Command::Healthcheck(healthcheck) => healthcheck.run(),

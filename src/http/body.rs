@@ -10,19 +10,20 @@ use std::time::Duration;
 use axum::body::{BodyDataStream, Bytes, HttpBody};
 use axum::extract::{FromRequestParts, Request};
 use axum::http::HeaderMap;
-use axum::http::header::{CONTENT_LENGTH, CONTENT_TYPE, EXPECT, TRANSFER_ENCODING};
+use axum::http::header::{CONTENT_LENGTH, EXPECT, TRANSFER_ENCODING};
 use axum::http::request::Parts;
 use futures_util::StreamExt;
 
 use super::Context;
 use super::collected::Collected;
 use super::encoding::{BodyError, DecodedLimit, Encoding};
+use super::form::{essence, form_of, format_of};
 use super::problem::{Problem, ProblemKind};
 use crate::clock::timer_now;
 use crate::memory::Held;
-use crate::service::{Client, ModelText, OpenText, PipeWriter, ServiceError, pipe};
+use crate::service::{Client, ModelForm, ModelText, OpenText, PipeWriter, ServiceError, pipe};
 use etude_core::document::Quoted;
-use etude_core::model::Format;
+use etude_core::model::{Format, ImportFormat};
 
 /// How long a client may take to send its body, however slowly it comes.
 const BODY_TIMEOUT: Duration = Duration::from_mins(1);
@@ -106,7 +107,7 @@ pub(super) struct SentLimit {
 /// The body of a model.
 pub(super) struct SentModel {
     pub(super) text: ModelText,
-    pub(super) format: Format,
+    pub(super) form: ModelForm,
     /// What is still to come of it.
     pub(super) pump: Option<Pump>,
     /// The memory of what is at hand, if that is much.
@@ -120,10 +121,13 @@ pub(super) async fn read_model(
     decoded: DecodedLimit,
     context: &Context,
 ) -> Result<SentModel, Problem> {
-    let (format, encoding) = match (format_of(request.headers()), declared_encoding(request.headers())) {
-        (Some(format), Ok(encoding)) => (format, encoding),
+    let (form, encoding) = match (form_of(&request), declared_encoding(request.headers())) {
+        (Some(Ok(form)), Ok(encoding)) => (form, encoding),
+        (Some(Err(faults)), _) => return Err(refuse(request, context, faults.into())),
         (None, _) => {
+            let imported = ImportFormat::ALL.map(|format| format!("`{}`", format.media_type())).join(", ");
             let detail = "send JSON with the header `content-type: application/json`, or `application/x-ndjson`";
+            let detail = format!("{detail}; or a file of another tool: {imported}");
             return Err(refuse(request, context, Problem::new(ProblemKind::UnsupportedMediaType, detail)));
         }
         (_, Err(problem)) => return Err(refuse(request, context, problem)),
@@ -139,7 +143,7 @@ pub(super) async fn read_model(
             (ModelText::Arriving(open(Box::new(reader))), Some(Pump { first: bytes, rest, to_reader }))
         }
     };
-    Ok(SentModel { text, format, pump, held })
+    Ok(SentModel { text, form, pump, held })
 }
 
 /// Carries the rest of a body to its reader.
@@ -254,27 +258,6 @@ fn declared_encoding(headers: &HeaderMap) -> Result<Encoding, Problem> {
         let detail = format!("the body is encoded as {}; send it as it is, or as gzip or zstd", Quoted(&encoding));
         Problem::new(ProblemKind::UnsupportedEncoding, detail)
     })
-}
-
-/// The declared type of the body, without its parameters.
-fn essence(headers: &HeaderMap) -> &str {
-    let declared = headers.get(CONTENT_TYPE).and_then(|declared| declared.to_str().ok()).unwrap_or_default();
-    declared.split(';').next().unwrap_or_default().trim()
-}
-
-/// How the body is declared: as `application/json`, as another type that is written in JSON, or as NDJSON.
-fn format_of(headers: &HeaderMap) -> Option<Format> {
-    let essence = essence(headers);
-    // As most declare it.
-    if essence == "application/json" {
-        return Some(Format::Json);
-    }
-    let essence = essence.to_ascii_lowercase();
-    match essence.strip_prefix("application/")? {
-        "json" => Some(Format::Json),
-        "x-ndjson" | "ndjson" | "jsonl" => Some(Format::Ndjson),
-        subtype => subtype.ends_with("+json").then_some(Format::Json),
-    }
 }
 
 /// Reads until there are over `n_wanted` bytes; what is not read yet is given back.

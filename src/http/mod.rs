@@ -17,6 +17,7 @@ mod connections;
 mod description;
 mod encoding;
 mod examples;
+mod form;
 mod idempotency;
 mod learners;
 mod models;

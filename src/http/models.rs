@@ -109,6 +109,10 @@ struct WholeModelBody {
 /// with more of one or both, such as `{"states": [[2, "east", "open"]]}`, in any number and order. A line has at most 64 MiB.
 /// Faults then carry the `line`, and a `pointer` within it.
 ///
+/// A file of another tool is imported, by its content type: `application/vnd.gymnasium+json` is the table `P` of a Gymnasium environment, as
+/// `examples/gymnasium/export.py` writes it. Then the query may say `without` (actions that the body lacks, by name; `*` stands for any text), `cost` (`ACTION=COST`,
+/// in place of what the file says; or the name of the reward that is the cost) and `rename` (`OLD=NEW`), each any number of times.
+///
 /// With `If-Match`, the model takes the place of the one that has this hash, at once: requests from then on use it. Policies keep the hash of
 /// the model that they were made with, and sessions that run go on with it; it is gone for sessions that are resumed and policies that are to
 /// be refined. Learners are of attributes, and stay.
@@ -117,10 +121,14 @@ struct WholeModelBody {
     params(
         ("model" = String, Path, description = "Its name: 1 to 64 of `a-z A-Z 0-9 . _ -`, other than `.` and `..`"),
         ("content-encoding" = Option<String>, Header, description = "`gzip`, `zstd` or `identity`"),
+        ("without" = Option<Vec<String>>, Query, description = "Of what is imported: actions that the body lacks, by name; `*` stands for any text", style = Form, explode),
+        ("cost" = Option<Vec<String>>, Query, description = "Of what is imported: `ACTION=COST`, or the name of the reward that is the cost", style = Form, explode),
+        ("rename" = Option<Vec<String>>, Query, description = "Of what is imported: `OLD=NEW`", style = Form, explode),
         ("if-match" = Option<String>, Header, description = "The hash of the model that is to be replaced, in quotes as in `ETag`; `*`: whichever there is"),
     ),
     request_body(content(
         (DefinitionDocument = "application/json"),
+        (serde_json::Value = "application/vnd.gymnasium+json"),
         (String = "application/x-ndjson", example = "{\"attributes\":[{\"name\":\"x\",\"kind\":\"number\"}],\"actions\":[{\"name\":\"on\"}],\"dynamics\":{\"kind\":\"table\",\"start\":0}}\n{\"states\":[[0],[1]]}\n{\"transitions\":[[0,\"on\",1]]}\n"),
     )),
     responses(
@@ -147,8 +155,8 @@ pub(super) async fn put_model(
     };
     let decoded = DecodedLimit { n_bytes: context.max_model_text_bytes, setting: "ETUDE_MAX_MODEL_TEXT_BYTES" };
     let replaces = replaces(request.headers());
-    let SentModel { text, format, pump, held } = read_model(request, sent, decoded, &context).await?;
-    let put = context.etude.replace_model(&name, text, format, replaces, caller);
+    let SentModel { text, form, pump, held } = read_model(request, sent, decoded, &context).await?;
+    let put = context.etude.replace_model(&name, text, form, replaces, caller);
     let pumping = OptionFuture::from(pump.map(|pump| pump.run(&context)));
     let (put, _) = tokio::join!(put, pumping);
     drop(held);

@@ -190,7 +190,7 @@ impl Compiler {
             {
                 return Ok(Err(error));
             }
-            let definition = text.read(Format::Json, Limits::NONE, interrupt);
+            let definition = text.read(&Format::Json.into(), Limits::NONE, interrupt);
             Ok(match definition {
                 Ok(definition) => compiler.compile(definition, held, limits, interrupt),
                 // A definition that was accepted has no faults, unless the row is damaged.

@@ -11,7 +11,7 @@ use super::{Etude, Kind, ServiceError};
 use crate::memory::{Held, Memory, SMALL_BYTES};
 use crate::store::{ModelSummary, PIECE_BYTES, Store};
 use etude_core::interrupt::Interrupt;
-use etude_core::model::{Definition, Format, Limits, ReadError};
+use etude_core::model::{Definition, Edits, Format, ImportFile, ImportFormat, Limits, ReadError, import};
 
 /// Reads a definition piece by piece, and tells at its end whether that was the one that was registered.
 #[derive(Debug)]
@@ -70,16 +70,41 @@ pub enum ModelText {
 /// Opens a text, on the thread that will read it, as opening already reads its beginning.
 pub type OpenText = Box<dyn FnOnce() -> io::Result<Box<dyn BufRead + Send>> + Send>;
 
+/// What the text of a model is.
+#[derive(Clone, Debug)]
+pub enum ModelForm {
+    /// The model itself.
+    Own(Format),
+    /// A file of another tool, and what is to be changed on the way.
+    Imported(ImportFormat, Box<Edits>),
+}
+
+impl From<Format> for ModelForm {
+    fn from(format: Format) -> Self {
+        Self::Own(format)
+    }
+}
+
 impl ModelText {
     pub(super) fn read(
         self,
-        format: Format,
+        form: &ModelForm,
         limits: Limits,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Definition, ReadError> {
-        match self {
-            Self::Whole(text) => Definition::parse(&text, format, limits, interrupt),
-            Self::Packed(open) | Self::Arriving(open) => Definition::parse_from(open()?, format, limits, interrupt),
+        match (form, self) {
+            (ModelForm::Own(format), Self::Whole(text)) => Definition::parse(&text, *format, limits, interrupt),
+            (ModelForm::Own(format), Self::Packed(open) | Self::Arriving(open)) => {
+                Definition::parse_from(open()?, *format, limits, interrupt)
+            }
+            (ModelForm::Imported(format, edits), text) => {
+                let content: Box<dyn BufRead> = match text {
+                    Self::Whole(text) => Box::new(io::Cursor::new(text)),
+                    Self::Packed(open) | Self::Arriving(open) => open()?,
+                };
+                let file = ImportFile { name: String::new(), content };
+                Ok(import(*format, vec![file], edits, limits, interrupt)?)
+            }
         }
     }
 

@@ -40,7 +40,7 @@ use jiff::{Timestamp, Unit};
 
 pub use batch::{MAX_BATCH_ITEMS, MadePolicies};
 pub use caller::{Caller, Client};
-pub use definitions::{DefinitionReader, ModelText, OpenText};
+pub use definitions::{DefinitionReader, ModelForm, ModelText, OpenText};
 pub use error::{Outage, OutageKind, ServiceError};
 pub use hash::hash_of;
 pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey};

@@ -7,7 +7,8 @@ use tokio::sync::mpsc;
 
 use super::compiler::{Compiler, LimitedTime};
 use super::definitions::{
-    DefinitionReader, DefinitionWriter, ModelText, check_hash, corrupt_definition, definition_writer, unknown,
+    DefinitionReader, DefinitionWriter, ModelForm, ModelText, check_hash, corrupt_definition, definition_writer,
+    unknown,
 };
 use super::hash::hash_of;
 use super::pool::Places;
@@ -102,7 +103,7 @@ impl Etude {
         format: Format,
         caller: Caller,
     ) -> Result<(Registered, ModelSummary), ServiceError> {
-        self.replace_model(name, text, format, Replaces::Nothing, caller).await
+        self.replace_model(name, text, format.into(), Replaces::Nothing, caller).await
     }
 
     /// Registers the model in `text` under `name`, at once in the place of a model that it `replaces`. Sessions that run go on with the model
@@ -116,7 +117,7 @@ impl Etude {
         &self,
         name: &Name,
         text: ModelText,
-        format: Format,
+        form: ModelForm,
         replaces: Replaces,
         caller: Caller,
     ) -> Result<(Registered, ModelSummary), ServiceError> {
@@ -133,18 +134,18 @@ impl Etude {
         let text = text.counted(&self.memory);
         let (prepared, stored) = if is_arriving {
             let _place = self.uploads.admit(caller.client)?;
-            let read = self.pool.run_aside(move |interrupt| Ok(text.read(format, limits, interrupt))).await?;
+            let read = self.pool.run_aside(move |interrupt| Ok(text.read(&form, limits, interrupt))).await?;
             let job = move |interrupt: &mut dyn Interrupt| Ok(prepare(read, interrupt));
             tokio::join!(self.pool.run_in_turn(caller.client, job), self.store_pieces(pieces))
         } else if !is_new && text.is_small() {
             // The name is taken, so nothing is compiled or stored.
-            let job = |interrupt: &mut dyn Interrupt| Ok(prepare(text.read(format, limits, interrupt), interrupt));
+            let job = |interrupt: &mut dyn Interrupt| Ok(prepare(text.read(&form, limits, interrupt), interrupt));
             (self.pool.run_here(None, job), Ok(None))
         } else {
             let place = self.pool.admit(caller.client)?;
             let (max_time, clock) = (self.time_limits.compile, self.clock.clone());
             let job = move |interrupt: &mut dyn Interrupt| {
-                let read = text.read(format, limits, &mut LimitedTime::new(interrupt, max_time, clock));
+                let read = text.read(&form, limits, &mut LimitedTime::new(interrupt, max_time, clock));
                 Ok(prepare(read, interrupt))
             };
             tokio::join!(place.run(None, job), self.store_pieces(pieces))

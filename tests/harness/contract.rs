@@ -141,10 +141,13 @@ impl Contract {
             let Some(parameter) = named(place, &name) else { return Some(format!("{name} is not described")) };
             // Where a number is meant, its text is one.
             let value = value.parse().map_or_else(|_| json!(value), |number: u64| json!(number));
-            let types = &parameter["schema"]["type"];
+            let schema = &parameter["schema"];
+            // One of several.
+            let schema = if schema["type"] == "array" { &schema["items"] } else { schema };
+            let types = &schema["type"];
             let is_text = *types == "string" || types.as_array().is_some_and(|types| types.contains(&json!("string")));
             let value = if is_text && !value.is_string() { json!(value.to_string()) } else { value };
-            if let Some(broken) = self.broken_by_schema(&parameter["schema"], &value) {
+            if let Some(broken) = self.broken_by_schema(schema, &value) {
                 return Some(format!("{name}: {broken}"));
             }
         }

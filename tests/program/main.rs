@@ -8,6 +8,7 @@ mod harness;
 mod command_lines;
 mod commands;
 mod disk;
+mod imports;
 mod inputs;
 mod kill_rewards;
 mod kill_streams;

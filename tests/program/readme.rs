@@ -1,6 +1,6 @@
 //! The examples of the README that need no service run, and print what it says.
 
-use std::process::Stdio;
+use std::process::{Command, Stdio};
 
 use crate::commands::etude;
 
@@ -19,6 +19,13 @@ fn blocks(text: &str) -> Vec<(&str, Vec<&str>)> {
     blocks
 }
 
+/// The program with the arguments that a shell makes of `command`: some are in single quotes.
+fn program_of(command: &str) -> Command {
+    let parts = command.split('\'').enumerate();
+    let arguments = parts.flat_map(|(n, part)| if n % 2 == 1 { vec![part] } else { part.split_whitespace().collect() });
+    etude(&arguments.collect::<Vec<_>>())
+}
+
 #[test]
 fn examples_of_maps_streams_and_the_demo_print_what_the_readme_says() {
     let root = env!("CARGO_MANIFEST_DIR");
@@ -30,12 +37,20 @@ fn examples_of_maps_streams_and_the_demo_print_what_the_readme_says() {
         let [(_, commands), (language, printed)] = pair else { unreachable!() };
         let Some((before, command)) = commands[0].split_once(RUN) else { continue };
         let command = command.split(" #").next().unwrap().trim();
-        if !language.is_empty() || !["map", "stream", "demo"].iter().any(|name| command.starts_with(name)) {
+        if !language.is_empty()
+            || !["map", "stream", "demo", "model import"].iter().any(|name| command.starts_with(name))
+        {
             continue;
         }
         n_examples += 1;
-        let arguments: Vec<&str> = command.split(' ').collect();
-        let mut program = etude(&arguments);
+        // Of several, the last prints what is shown.
+        let (last, earlier) = commands.split_last().unwrap();
+        for command in earlier.iter().filter(|_| command.starts_with("model")) {
+            let done = program_of(command.strip_prefix(RUN).unwrap()).current_dir(directory.path()).output().unwrap();
+            assert!(done.status.success(), "{command}: {}", String::from_utf8_lossy(&done.stderr));
+        }
+        let command = if command.starts_with("model") { last.strip_prefix(RUN).unwrap() } else { command };
+        let mut program = program_of(command);
         program.current_dir(directory.path());
         // What is piped into it is what `jq -c '.[]'` makes of an array, which is read as well.
         if before.starts_with("jq -c '.[]' ") {
@@ -52,5 +67,5 @@ fn examples_of_maps_streams_and_the_demo_print_what_the_readme_says() {
             );
         }
     }
-    assert!(n_examples >= 6, "{n_examples}");
+    assert!(n_examples >= 7, "{n_examples}");
 }

@@ -22,6 +22,7 @@ mod filters;
 mod front;
 mod http;
 mod idempotency;
+mod imports;
 mod inputs;
 mod learning;
 mod limits;

@@ -22,7 +22,7 @@
 //! | `dynamics` | the seam: what every kind of dynamics is to the rest |
 //! | `table`, `wumpus` | the kinds, a folder each |
 //! | `kinds` | the list of kinds |
-//! | `definition`, `builder` | what a client registers, as JSON or by calls |
+//! | `definition`, `builder`, `import` | what a client registers, as JSON, by calls, or from the files of other tools |
 //!
 //! Nothing here knows of demonstrations.
 
@@ -34,6 +34,7 @@ mod dynamics;
 mod explored;
 mod graph;
 mod implicit;
+mod import;
 mod kinds;
 mod limits;
 mod operator;
@@ -53,6 +54,7 @@ pub use compiled::Model;
 pub use definition::{Definition, DefinitionDocument};
 pub use graph::{Graph, OwnCost, Transition};
 pub use implicit::{Implicit, Outcome};
+pub use import::{Edits, ImportError, ImportFile, ImportFormat, Spot, import};
 pub use kinds::DynamicsDocument;
 pub use limits::{CompileError, Limits};
 pub use operator::Operator;

@@ -10,6 +10,7 @@
 mod compiling;
 mod conditions;
 mod implicit;
+mod imports;
 mod lazy;
 mod mapping;
 mod online;

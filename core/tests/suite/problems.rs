@@ -12,10 +12,14 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 pub(crate) fn example(path: &str) -> Value {
+    serde_json::from_slice(&example_bytes(path)).unwrap()
+}
+
+pub(crate) fn example_bytes(path: &str) -> Vec<u8> {
     // Of the repository, whichever of its packages is tested.
     let mut roots = Path::new(env!("CARGO_MANIFEST_DIR")).ancestors();
     let path = roots.find_map(|root| Some(root.join("examples").join(path)).filter(|path| path.exists())).unwrap();
-    serde_json::from_str(&std::fs::read_to_string(path).unwrap()).unwrap()
+    std::fs::read(path).unwrap()
 }
 
 pub(crate) fn mapper(model: &Value) -> Mapper {

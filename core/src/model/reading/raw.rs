@@ -25,7 +25,7 @@ pub(in crate::model) enum Raw<T = Box<str>> {
 }
 
 impl<T: AsRef<str>> Raw<T> {
-    pub(super) fn float(number: f64) -> Self {
+    pub(in crate::model) fn float(number: f64) -> Self {
         Self::Float(number.to_bits())
     }
 
@@ -108,7 +108,7 @@ pub(in crate::model) struct Distinct {
 
 impl Distinct {
     /// The number of `found`.
-    pub(super) fn number_of(&mut self, found: Raw<&str>) -> u32 {
+    pub(in crate::model) fn number_of(&mut self, found: Raw<&str>) -> u32 {
         let Self { values, numbers, hasher, n_text_bytes } = self;
         let hash = hasher.hash_one(found);
         let is_found = |number: &u32| values[*number as usize].borrowed() == found;

@@ -43,8 +43,31 @@ impl Edges {
         self.to.push(outcome.to);
     }
 
-    pub(super) fn len(&self) -> usize {
+    pub(in crate::model) fn len(&self) -> usize {
         self.from.len()
+    }
+
+    /// Keeps the transitions of states and actions for which `number` gives the action's new number. Order is kept.
+    pub(in crate::model) fn keep(&mut self, number: impl Fn(StateIdx, ActionIdx) -> Option<ActionIdx>) {
+        let numbers: Vec<Option<ActionIdx>> =
+            self.from.iter().zip(&self.action).map(|(from, action)| number(*from, *action)).collect();
+        keep_some(&mut self.from, &numbers);
+        keep_some(&mut self.to, &numbers);
+        keep_some(&mut self.probabilities, &numbers);
+        keep_some(&mut self.own_costs, &numbers);
+        self.action = numbers.into_iter().flatten().collect();
+    }
+
+    /// Leaves out the costs of their own for which `is_said` holds, as the action's cost says the same.
+    pub(in crate::model) fn leave_out_costs(&mut self, is_said: impl Fn(ActionIdx, f64) -> bool) {
+        for (own_cost, action) in self.own_costs.iter_mut().zip(&self.action) {
+            if own_cost.get().is_some_and(|cost| is_said(*action, cost)) {
+                *own_cost = OwnCost::NONE;
+            }
+        }
+        if self.own_costs.iter().all(|own_cost| own_cost.get().is_none()) {
+            self.own_costs = Vec::new();
+        }
     }
 
     /// The state that transition `number` leaves, and its action.
@@ -168,6 +191,12 @@ impl Edges {
 
 fn is_same_pair(one: &(StateIdx, ActionIdx, u32), other: &(StateIdx, ActionIdx, u32)) -> bool {
     (one.0, one.1) == (other.0, other.1)
+}
+
+/// Keeps those items of `column`, which may be empty, for which there is something in `kept`.
+fn keep_some<T, N>(column: &mut Vec<T>, kept: &[Option<N>]) {
+    let mut kept = kept.iter();
+    column.retain(|_| kept.next().is_some_and(Option::is_some));
 }
 
 fn retain<T>(column: &mut Vec<T>, is_merged: &[bool]) {

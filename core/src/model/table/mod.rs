@@ -46,6 +46,26 @@ impl Table {
     }
 }
 
+impl Table {
+    /// How many states there are.
+    #[must_use]
+    pub fn n_states(&self) -> usize {
+        self.states.len() as usize
+    }
+
+    /// How many transitions there are, those into unsafe states and those without effect too.
+    #[must_use]
+    pub fn n_transitions(&self) -> usize {
+        self.edges.len()
+    }
+
+    /// Of how many states and actions there are several outcomes.
+    #[must_use]
+    pub fn n_stochastic(&self) -> usize {
+        self.edges.n_stochastic
+    }
+}
+
 impl Dynamics for Table {
     fn schema(&self) -> &Schema {
         &self.schema

@@ -1,0 +1,167 @@
+//! `etude model`.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
+use std::path::{Path, PathBuf};
+
+use clap::{Args, Subcommand};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use super::{CliError, note};
+use etude_core::interrupt::Uninterrupted;
+use etude_core::model::{Definition, Edits, ImportError, ImportFile, ImportFormat, Limits, Table, import};
+
+#[derive(Args, Debug)]
+pub(super) struct ModelCommand {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Make a model from the file of another tool.
+    ///
+    /// Compressed files (gzip, zstd) are read as they are.
+    Import(Import),
+}
+
+#[derive(Args, Debug)]
+struct Import {
+    /// The file; - for standard input.
+    file: PathBuf,
+    /// What it is; found by looking if left out.
+    #[arg(long = "format", value_parser = parse_format, value_name = "FORMAT")]
+    of: Option<ImportFormat>,
+    /// Actions that the body lacks: a name, in which * stands for any text; may be given for several.
+    #[arg(long, value_name = "PATTERN")]
+    without: Vec<String>,
+    /// Another name for an action or an attribute; may be given for several.
+    #[arg(long, value_name = "OLD=NEW")]
+    rename: Vec<String>,
+    /// What an action costs, in place of what the file says; in its name, * stands for any text. Or the name of the reward that is the cost. May be
+    /// given for several.
+    #[arg(long, value_name = "ACTION=COST|REWARD")]
+    cost: Vec<String>,
+    /// Where to write the model; standard output if left out.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+impl ModelCommand {
+    pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
+        match &self.command {
+            Command::Import(import) => import.run(out),
+        }
+    }
+}
+
+impl Import {
+    fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
+        let definition = self.read(&self.edits()?)?;
+        match &self.out {
+            None => {
+                definition.write(&mut *out)?;
+                writeln!(out)?;
+            }
+            Some(path) => {
+                let written = File::create(path).and_then(|file| {
+                    let mut file = BufWriter::new(file);
+                    definition.write(&mut file)?;
+                    writeln!(file)?;
+                    file.flush()
+                });
+                written.map_err(|source| CliError::Write { path: path.clone(), source })?;
+                note(&format!("{}: {}", path.display(), summary(&definition)));
+            }
+        }
+        Ok(())
+    }
+
+    fn edits(&self) -> Result<Edits, CliError> {
+        let mut edits = Edits { without: self.without.clone(), ..Edits::default() };
+        let told = |flag: &str, value: &str, detail: String| CliError::Faulty(format!("{flag} {value}: {detail}"));
+        for value in &self.rename {
+            edits.add_rename(value).map_err(|detail| told("--rename", value, detail))?;
+        }
+        for value in &self.cost {
+            edits.add_cost(value).map_err(|detail| told("--cost", value, detail))?;
+        }
+        Ok(edits)
+    }
+
+    fn read(&self, edits: &Edits) -> Result<Definition, CliError> {
+        let bar = ProgressBar::no_length().with_style(style());
+        let failed = |source: ImportError| CliError::Import { path: self.file.clone(), source };
+        let mut content = open(&self.file, &bar)?;
+        let name = self.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+        let head = content.fill_buf().map_err(|error| failed(error.into()))?;
+        let Some(format) = self.of.or_else(|| ImportFormat::of(&name, head)) else {
+            let known = ImportFormat::ALL.map(ImportFormat::name).join(", ");
+            let detail = format!("this is of no format that is known here: {known}. Say which by --format");
+            return Err(failed(ImportError::Unfit(detail)));
+        };
+        let files = vec![ImportFile { name: String::new(), content }];
+        let read = import(format, files, edits, Limits::NONE, &mut Uninterrupted);
+        bar.finish_and_clear();
+        read.map_err(failed)
+    }
+}
+
+/// Opens the file at `path`, `-` for standard input, decompressed; how far it is read is shown by `bar`.
+fn open(path: &Path, bar: &ProgressBar) -> Result<Box<dyn BufRead>, CliError> {
+    const XZ: &[u8] = b"\xfd7zXZ\0";
+    const BZIP2: &[u8] = b"BZh";
+    let read = |source| CliError::Read { path: path.to_owned(), source };
+    let input: Box<dyn Read> = if path == Path::new("-") {
+        Box::new(io::stdin())
+    } else {
+        let file = File::open(path).map_err(read)?;
+        bar.set_length(file.metadata().map_err(read)?.len());
+        Box::new(file)
+    };
+    let mut input = BufReader::with_capacity(1 << 16, bar.wrap_read(input));
+    let head = input.fill_buf().map_err(read)?;
+    if head.starts_with(&[0x1f, 0x8b]) {
+        return Ok(Box::new(BufReader::with_capacity(1 << 16, flate2::bufread::MultiGzDecoder::new(input))));
+    }
+    if head.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]) {
+        let decoder = zstd::stream::read::Decoder::with_buffer(input).map_err(read)?;
+        return Ok(Box::new(BufReader::with_capacity(1 << 16, decoder)));
+    }
+    for (magic, by) in [(XZ, "xz"), (BZIP2, "bzip2")] {
+        if head.starts_with(magic) {
+            let detail = format!("{}: compressed by {by}; decompress it first", path.display());
+            return Err(CliError::Faulty(detail));
+        }
+    }
+    Ok(Box::new(input))
+}
+
+fn style() -> ProgressStyle {
+    let template = "{bar:40} {bytes} of {total_bytes}, {bytes_per_sec}";
+    ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
+}
+
+/// What a model has.
+fn summary(definition: &Definition) -> String {
+    let attributes = definition.schema().len();
+    match definition.dynamics::<Table>() {
+        Some(table) => {
+            let (states, transitions) = (table.n_states(), table.n_transitions());
+            let stochastic = match table.n_stochastic() {
+                0 => String::new(),
+                n => format!(", {n} pairs of a state and an action with several outcomes"),
+            };
+            format!("{states} states of {attributes} attributes, {transitions} transitions{stochastic}")
+        }
+        None => format!("states of {attributes} attributes, found as they are searched"),
+    }
+}
+
+fn parse_format(name: &str) -> Result<ImportFormat, String> {
+    let known = || ImportFormat::ALL.map(ImportFormat::name).join(", ");
+    ImportFormat::ALL
+        .into_iter()
+        .find(|format| format.name() == name)
+        .ok_or_else(|| format!("expected one of {}", known()))
+}

@@ -1,0 +1,63 @@
+//! Files of other tools, imported by the program.
+
+use std::io::Write;
+use std::path::Path;
+use std::process::Stdio;
+
+use crate::commands::{etude, run, text};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+
+const TAXI: &str = "examples/gymnasium/taxi.json";
+
+/// What `etude model import` writes of what is in `input`, and says beside it.
+fn imported(input: &[u8], flags: &[&str]) -> (String, String) {
+    let arguments = [&["model", "import", "-"], flags].concat();
+    let mut child =
+        etude(&arguments).stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
+    // It may end before it has read everything.
+    let _ = child.stdin.take().unwrap().write_all(input);
+    let output = child.wait_with_output().unwrap();
+    (text(&output.stdout).to_owned(), text(&output.stderr).to_owned())
+}
+
+#[test]
+fn a_file_is_imported_from_disk_or_from_a_pipe_compressed_or_not() {
+    let directory = tempfile::tempdir().unwrap();
+    let out = directory.path().join("model.json");
+    let done = run(&["model", "import", TAXI, "--cost", "dropoff=1", "--out", out.to_str().unwrap()]);
+    assert!(done.status.success() && done.stdout.is_empty());
+    let told = format!("etude: {}: 500 states of 4 attributes, 2976 transitions\n", out.display());
+    assert_eq!(text(&done.stderr), told, "no progress is drawn where nobody sees it");
+    let written = std::fs::read_to_string(&out).unwrap();
+
+    let file = std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join(TAXI)).unwrap();
+    let mut gzip = GzEncoder::new(Vec::new(), Compression::fast());
+    gzip.write_all(&file).unwrap();
+    let gzip = gzip.finish().unwrap();
+    for input in [&file, &gzip, &zstd::bulk::compress(&file, 1).unwrap()] {
+        assert_eq!(imported(input, &["--cost", "dropoff=1"]), (written.clone(), String::new()));
+    }
+    let (_, told) = imported(&gzip[..gzip.len() / 2], &["--cost", "dropoff=1"]);
+    assert!(told.starts_with("etude: cannot import -: cannot be decompressed: "), "{told}");
+    let (_, told) = imported(b"\xfd7zXZ\0..", &[]);
+    assert_eq!(told, "etude: -: compressed by xz; decompress it first\n");
+}
+
+#[test]
+fn what_is_wrong_with_a_file_or_a_flag_is_told_in_a_line() {
+    for (input, flags, expected) in [
+        ("[[[[1, 0, 3, false]]]]", &[][..], "cannot import -: /P/0/0: a reward of 3 is no cost; "),
+        ("{\n\"P\": [[[[1, 0,", &[], "cannot import -: line 2: column 14: EOF while parsing a value"),
+        ("hello", &[], "cannot import -: this is of no format that is known here: gymnasium"),
+        ("[[[[1, 0, 0, false]]]]", &["--without", "slide *"], "cannot import -: without: no action is called like"),
+        ("[[[[1, 0, 0, false]]]]", &["--cost", "0=-1"], "--cost 0=-1: expected ACTION=COST, with a cost from 0"),
+        ("[[[[1, 0, 0, false]]]]", &["--rename", "0"], "--rename 0: expected OLD=NEW"),
+    ] {
+        let (written, told) = imported(input.as_bytes(), flags);
+        assert_eq!(written, "");
+        assert!(told.starts_with(&format!("etude: {expected}")) && told.lines().count() == 1, "{told}");
+    }
+    let missing = run(&["model", "import", "no-such-file.json"]);
+    assert_eq!(text(&missing.stderr), "etude: cannot read no-such-file.json: No such file or directory\n");
+}
