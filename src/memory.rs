@@ -13,7 +13,8 @@
 //! The budget counts only what is taken from it. Other memory shows in what is resident, which [`Memory::watch`] measures: while most of
 //! `--max-memory` is resident, nothing large is begun, whatever was counted.
 
-use std::fs;
+use std::fs::{self, File};
+use std::os::unix::fs::FileExt;
 use std::pin::pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -99,7 +100,9 @@ impl Memory {
     pub async fn watch(self) {
         let mut ticks = tokio::time::interval(MEASURE_EVERY);
         ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        while let Some(n_bytes) = resident_bytes() {
+        // It is kept open: to find it takes most of the time of reading it.
+        let Ok(statm) = File::open(STATM) else { return };
+        while let Some(n_bytes) = resident_bytes(&statm) {
             self.note_resident(n_bytes);
             ticks.tick().await;
         }
@@ -265,9 +268,14 @@ pub fn default_max_bytes() -> u64 {
     [by_resident, by_addresses].into_iter().flatten().min().unwrap_or(UNKNOWN)
 }
 
+/// Where a process finds how much memory it has.
+const STATM: &str = "/proc/self/statm";
+
 /// What this process has of the machine's memory.
-fn resident_bytes() -> Option<u64> {
-    let text = fs::read_to_string("/proc/self/statm").ok()?;
+fn resident_bytes(statm: &File) -> Option<u64> {
+    let mut text = [0; 256];
+    let n_read = statm.read_at(&mut text, 0).ok()?;
+    let text = std::str::from_utf8(&text[..n_read]).ok()?;
     let n_pages: u64 = text.split_whitespace().nth(1)?.parse().ok()?;
     Some(n_pages * rustix::param::page_size() as u64)
 }
