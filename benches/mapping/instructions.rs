@@ -42,8 +42,22 @@ fn count(world: &str, n: u64) -> Option<u64> {
     counts.lines().find_map(|line| line.strip_prefix("summary: ")?.trim().parse().ok())
 }
 
+/// `world`: an example with what it starts in, `cave` or `cave-` and a seed, `cave40` or `table`.
 pub(crate) fn solve_alone(world: &str, n: u64) {
-    let world: World = if world == FIGURE_4 { worlds::example("figure-4") } else { worlds::cave(20, 5, 50, 1) };
+    let world: World = match world {
+        FIGURE_4 => worlds::example("figure-4"),
+        "taxi" => {
+            let mut world = worlds::example("taxi");
+            world.model["dynamics"]["start"] = serde_json::json!(0);
+            world
+        }
+        "cave40" => worlds::cave(40, 8, 100, 1),
+        "table" => crate::table::table(100_000, 50, 1),
+        _ => match world.strip_prefix("cave-") {
+            Some(seed) => worlds::cave(20, 5, 50, seed.parse().expect("a seed")),
+            None => worlds::cave(20, 5, 50, 1),
+        },
+    };
     let mapper = crate::prepare(&world);
     let problem = crate::problem(&mapper, &world);
     for _ in 0..n {
