@@ -13,7 +13,7 @@
 //! Each module uses only those to its left; a test of the service holds that order.
 //!
 //! ```text
-//! interrupt, document <- attribute <- model <- mapping <- learning <- world
+//! interrupt, document <- attribute <- model <- mapping <- inspection, learning <- world
 //! ```
 //!
 //! | module | is |
@@ -23,6 +23,7 @@
 //! | [`attribute`] | attributes of states: kinds, values, weights, distance |
 //! | [`model`] | what a body can do: dynamics of any kind, compiled to one state graph, or searched lazily |
 //! | [`mapping`] | the cheapest way to follow a demonstration: problem, search, heuristics, streams, policy |
+//! | [`inspection`] | what can be said of a body before it follows anything, and what of a demonstration it can never meet |
 //! | [`learning`] | which attributes matter: a weight distribution, drawn from and learned from rewards |
 //! | [`world`] | simulators that execute a policy and give its reward |
 //!
@@ -53,6 +54,7 @@
 
 pub mod attribute;
 pub mod document;
+pub mod inspection;
 pub mod interrupt;
 pub mod learning;
 pub mod mapping;

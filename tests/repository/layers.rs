@@ -6,7 +6,7 @@ use crate::sources::{Module, modules, references};
 
 /// Modules of the core. Those of a layer may use those before it.
 const CORE: [&[&str]; 6] =
-    [&["interrupt", "document"], &["attribute"], &["model"], &["mapping"], &["learning"], &["world"]];
+    [&["interrupt", "document"], &["attribute"], &["model"], &["mapping"], &["inspection", "learning"], &["world"]];
 
 /// Modules of the service.
 const SERVICE: [&[&str]; 10] = [

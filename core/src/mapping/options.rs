@@ -25,6 +25,8 @@ pub enum RequestKind {
     Trial,
     /// A session, which observations are streamed to.
     Session,
+    /// A report, of a model and perhaps a demonstration.
+    Report,
 }
 
 impl RequestKind {
@@ -76,6 +78,7 @@ impl RequestKind {
             Self::Item => following!("demonstration", "heuristic", "max_expansions", "collapse"),
             Self::Trial => following!("model", "demonstration", "heuristic", "max_expansions", "deadline_ms"),
             Self::Session => following!("type", "model", "learner", "explore"),
+            Self::Report => &["demonstration", "weights", "start", "observation_weights", "without", "deadline_ms"],
         }
     }
 
@@ -83,7 +86,7 @@ impl RequestKind {
     #[must_use]
     pub const fn observed(self) -> Option<&'static str> {
         match self {
-            Self::Policy | Self::Item | Self::Trial => Some("demonstration"),
+            Self::Policy | Self::Item | Self::Trial | Self::Report => Some("demonstration"),
             Self::Batch => Some("items"),
             Self::Session => None,
         }
@@ -263,7 +266,7 @@ impl Options {
     }
 
     /// Notes that `object`, or else these options, which it shares, have not as many weights of observations as these.
-    pub(super) fn check_observation_weights(
+    pub(crate) fn check_observation_weights(
         &self,
         n_observations: usize,
         object: &Object<'_, '_>,

@@ -141,7 +141,7 @@ pub(crate) struct Starts {
 
 impl Starts {
     /// The start states of `model` that are listed, or all that it has.
-    pub(super) fn of(model: &Model, listed: Option<&[Origin]>) -> Self {
+    pub(crate) fn of(model: &Model, listed: Option<&[Origin]>) -> Self {
         let mut states = Vec::new();
         let mut rows: Vec<Vec<u32>> = Vec::new();
         match listed {

@@ -68,6 +68,19 @@ impl<T: Copy> Rows<T> {
         Ok(Self { offsets, items })
     }
 
+    /// Adds a row.
+    ///
+    /// # Panics
+    ///
+    /// If there come to be 2^32 items or more.
+    pub(crate) fn push(&mut self, items: impl Iterator<Item = T>) {
+        if self.offsets.is_empty() {
+            self.offsets.push(0);
+        }
+        self.items.extend(items);
+        self.offsets.push(u32::try_from(self.items.len()).expect("fewer than 2^32 items"));
+    }
+
     /// Rows of what `map` makes of the items, without those of which it makes nothing.
     pub(crate) fn filter_map<U>(&self, mut map: impl FnMut(&T) -> Option<U>) -> Rows<U> {
         let (mut offsets, mut items) = (Vec::with_capacity(self.offsets.len()), Vec::new());

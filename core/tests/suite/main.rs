@@ -11,6 +11,7 @@ mod compiling;
 mod conditions;
 mod implicit;
 mod imports;
+mod inspection;
 mod lazy;
 mod mapping;
 mod online;
