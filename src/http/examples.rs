@@ -48,6 +48,7 @@ fn body(operation_id: &str) -> Option<Json> {
                 "start": 0,
             },
         }),
+        "make_report" => json!({"demonstration": demonstration}),
         "make_policy" => json!({"model": "corridor", "demonstration": demonstration, "weights": {"x": 2}}),
         "make_policies" => json!({
             "model": "corridor",

@@ -28,6 +28,7 @@ mod path;
 mod places;
 mod policies;
 mod problem;
+mod reports;
 mod request_id;
 mod requests;
 mod stalled;
@@ -126,6 +127,7 @@ fn routes() -> OpenApiRouter<SharedContext> {
     description.tags.get_or_insert_default().push(protocol.build());
     OpenApiRouter::with_openapi(description)
         .routes(routes!(models::put_model, models::get_model, models::delete_model))
+        .routes(routes!(reports::make_report, reports::get_report))
         .routes(routes!(models::list_models))
         .routes(routes!(policies::make_policy, policies::list_policies))
         .routes(routes!(policies::make_policies))

@@ -85,6 +85,20 @@ struct OpenMembers {
     lookahead: Option<u32>,
 }
 
+/// A request for a report.
+#[derive(Serialize, ToSchema)]
+struct ReportMembers {
+    /// The observed states, in order: 1 to 100,000. Attributes may be missing or null: not observed.
+    demonstration: Vec<ObservationDocument>,
+    /// The weight of each observation, at least 0 (`null`: 1), as many as there are observations; all 1 if left out.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    observation_weights: Option<Vec<Option<f64>>>,
+    /// Most milliseconds, waiting included; what was not found by then is left out. At most a day.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(maximum = 86_400_000)]
+    deadline_ms: Option<u64>,
+}
+
 /// Describes a request: its own members, and the options that it may have.
 macro_rules! describe {
     ($(#[$doc:meta])* $request:ident, $members:ty, $kind:expr) => {
@@ -132,6 +146,11 @@ describe!(
     OpenFrame, OpenMembers, RequestKind::Session
 );
 
+describe!(
+    /// A request for a report.
+    ReportRequest, ReportMembers, RequestKind::Report
+);
+
 /// The description of a request with these members and its options.
 fn with_options(members: RefOr<Schema>, kind: RequestKind) -> RefOr<Schema> {
     let mut request = object(members);
@@ -163,6 +182,7 @@ mod tests {
             (BatchItemRequest::schema(), RequestKind::Item),
             (TrialRequest::schema(), RequestKind::Trial),
             (OpenFrame::schema(), RequestKind::Session),
+            (ReportRequest::schema(), RequestKind::Report),
         ] {
             let mut described: Vec<_> = object(request).properties.into_keys().collect();
             // What every frame has is described with them all.

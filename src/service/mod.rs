@@ -27,6 +27,7 @@ mod policies;
 mod pool;
 mod refined;
 mod refiner;
+mod reports;
 mod requests;
 mod search;
 mod sessions;

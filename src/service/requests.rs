@@ -186,7 +186,7 @@ impl Etude {
         }
         let options = Options::read_general(&object, &Options::default(), &mut faults);
         let deadline = options.and_then(|options| options.deadline());
-        let mut own_faults = self.check_deadline(deadline);
+        let mut own_faults = check_deadline(deadline, self.time_limits.max_deadline);
         let store = object.optional("store").filter(|_| kind.fields().contains(&"store"));
         let is_stored = store.and_then(|place| place.boolean(&mut own_faults)).unwrap_or(true);
         let names = model.zip(learner.map_or(Some(None), |learner| learner.map(Some)));
@@ -198,17 +198,6 @@ impl Etude {
             own_faults,
         });
         (names, faults)
-    }
-
-    /// The fault of a deadline that is further away than this service allows.
-    fn check_deadline(&self, deadline: Option<Duration>) -> Faults {
-        let max_deadline = self.time_limits.max_deadline;
-        if deadline.is_none_or(|deadline| deadline <= max_deadline) {
-            return Faults::default();
-        }
-        let most = max_deadline.as_millis();
-        let detail = format!("expected at most {most} ms, the limit of this service (ETUDE_MAX_DEADLINE)");
-        Faults::one("/deadline_ms", detail)
     }
 
     /// When the search for a request that came at `arrived` is to finish.
@@ -291,6 +280,16 @@ impl Etude {
         };
         if is_quick { self.pool.run_here(deadline, job)? } else { place.run(deadline, job).await? }
     }
+}
+
+/// The fault of a deadline that is further away than this service allows.
+pub(super) fn check_deadline(deadline: Option<Duration>, max_deadline: Duration) -> Faults {
+    if deadline.is_none_or(|deadline| deadline <= max_deadline) {
+        return Faults::default();
+    }
+    let most = max_deadline.as_millis();
+    let detail = format!("expected at most {most} ms, the limit of this service (ETUDE_MAX_DEADLINE)");
+    Faults::one("/deadline_ms", detail)
 }
 
 /// Notes what is wrong with a request to follow a demonstration. `weights` are those that it starts from, or notes why there are none.

@@ -28,6 +28,7 @@ mod learning;
 mod limits;
 mod protocol;
 mod replacement;
+mod reports;
 mod stored_policies;
 mod stream;
 mod trials;
