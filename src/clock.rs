@@ -5,16 +5,17 @@
 
 #![expect(clippy::disallowed_methods, reason = "the one place where the system's clock and random ids are asked for")]
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
+use tokio::sync::watch;
 use uuid::Uuid;
 
 /// Tells the time: of the day, and for durations. Copies of a clock tell the same.
 #[derive(Clone, Debug)]
-pub struct Clock(Option<Arc<Mutex<Stepped>>>);
+pub struct Clock(Option<Arc<watch::Sender<Stepped>>>);
 
 /// What a clock shows that is stepped by hand.
 #[derive(Clone, Copy, Debug)]
@@ -33,15 +34,16 @@ impl Clock {
     /// One that shows `now` until it is stepped.
     #[must_use]
     pub fn stepped(now: Timestamp) -> Self {
-        Self(Some(Arc::new(Mutex::new(Stepped { now, instant: Instant::now() }))))
+        Self(Some(Arc::new(watch::Sender::new(Stepped { now, instant: Instant::now() }))))
     }
 
     /// Moves the clock on. The operating system's goes by itself, and is left alone.
     pub fn step(&self, by: Duration) {
         if let Some(stepped) = &self.0 {
-            let mut stepped = stepped.lock().unwrap_or_else(PoisonError::into_inner);
-            stepped.now = stepped.now.checked_add(by).unwrap_or(Timestamp::MAX);
-            stepped.instant += by;
+            stepped.send_modify(|stepped| {
+                stepped.now = stepped.now.checked_add(by).unwrap_or(Timestamp::MAX);
+                stepped.instant += by;
+            });
         }
     }
 
@@ -63,8 +65,19 @@ impl Clock {
         self.instant().saturating_duration_since(since)
     }
 
+    /// Waits until [`Self::instant`] is `instant`.
+    pub async fn sleep_until(&self, instant: Instant) {
+        match &self.0 {
+            None => tokio::time::sleep_until(instant.into()).await,
+            Some(stepped) => {
+                // The sender is here, so that it does not end.
+                let _ = stepped.subscribe().wait_for(|stepped| stepped.instant >= instant).await;
+            }
+        }
+    }
+
     fn read(&self) -> Option<Stepped> {
-        Some(*self.0.as_ref()?.lock().unwrap_or_else(PoisonError::into_inner))
+        Some(*self.0.as_ref()?.borrow())
     }
 }
 
@@ -111,6 +124,19 @@ mod tests {
         assert_eq!((copy.now(), copy.elapsed(before)), (Timestamp::UNIX_EPOCH, Duration::ZERO));
         clock.step(Duration::from_secs(90));
         assert_eq!((copy.now().as_second(), copy.elapsed(before)), (90, Duration::from_secs(90)));
+    }
+
+    #[tokio::test]
+    async fn who_waits_for_a_time_of_a_clock_that_is_stepped_waits_for_its_steps() {
+        let clock = Clock::stepped(Timestamp::UNIX_EPOCH);
+        let due = clock.instant() + Duration::from_secs(2);
+        let mut waiting = Box::pin(clock.sleep_until(due));
+        for _ in 0..2 {
+            assert!(futures_util::poll!(&mut waiting).is_pending());
+            clock.step(Duration::from_secs(1));
+        }
+        waiting.await;
+        clock.sleep_until(due).await;
     }
 
     #[test]
