@@ -7,10 +7,11 @@ PRAGMA application_id = 1702131044;
 CREATE TABLE service (
     id                 INTEGER NOT NULL PRIMARY KEY CHECK (id = 1),
     last_alive_ms      INTEGER,          -- when it was last known to be alive, so that time in which it was not does not count
+    down_ms            INTEGER NOT NULL, -- for how long it was not, in all: its own time is that of the day less this
     models_generation  INTEGER NOT NULL  -- counts registrations and deletions of models
 ) STRICT;
 
-INSERT INTO service (id, last_alive_ms, models_generation) VALUES (1, NULL, 1);
+INSERT INTO service (id, last_alive_ms, down_ms, models_generation) VALUES (1, NULL, 0, 1);
 
 -- Models, by the name that a client gave them. `hash` is SHA-256 of the canonical text of the definition.
 CREATE TABLE models (
@@ -83,7 +84,7 @@ CREATE TABLE refinements (
     attempts    INTEGER NOT NULL DEFAULT 0   -- how often it was taken up; what has ended the process each time is given up
 ) STRICT;
 
--- Streams. Of a session, what it was opened with and the observations are kept; all else follows from them.
+-- Streams. Of a session, what it was opened with, the observations, and what was decided by time are kept; all else follows from them.
 CREATE TABLE sessions (
     sequence        INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT,
     id              TEXT    NOT NULL UNIQUE,
@@ -91,6 +92,7 @@ CREATE TABLE sessions (
     model_hash      TEXT    NOT NULL,
     weights         TEXT    NOT NULL, -- JSON: by attribute
     lookahead       INTEGER,          -- NULL: only proven steps are committed before the end
+    lookahead_ms    INTEGER,          -- how long a step may wait after its observation came; NULL: as long as the lookahead lets it
     conditions      TEXT    NOT NULL, -- JSON: start states, weights of observations and of the end, what the body lacks; defaults are left out
     learner         TEXT,             -- whose weights are used, if any
     weights_version INTEGER,          -- of that learner
@@ -104,6 +106,7 @@ CREATE TABLE sessions (
 ) STRICT;
 
 CREATE INDEX sessions_by_activity ON sessions (active_at_ms) WHERE status = 'open';
+CREATE INDEX sessions_by_time ON sessions (sequence) WHERE status = 'open' AND lookahead_ms IS NOT NULL;
 CREATE INDEX sessions_by_model ON sessions (model);
 CREATE INDEX sessions_by_status ON sessions (status);
 CREATE INDEX sessions_by_policy ON sessions (policy_id) WHERE policy_id IS NOT NULL;
@@ -116,15 +119,32 @@ CREATE TABLE observations (
     seq         INTEGER NOT NULL,
     n_states    INTEGER NOT NULL,
     states      TEXT    NOT NULL,
+    times       TEXT,             -- JSON, where steps wait for so long at most: [[seq, ms], ..], when observations came from seq on, in the service's own time
     PRIMARY KEY (session_id, seq)
 ) STRICT, WITHOUT ROWID;
 
--- Observations that are durable and not yet in their table. One row holds what a commit of the writer brought, whichever
--- sessions it is of: JSON, an array of [session_id, seq, n_states, states, at_ms], in the order in which they came. Now and
--- then, and before anybody reads observations, everything here moves to `observations` and is counted in `sessions`.
+-- Steps that sessions have committed, several a row, and in `roots` what the mapping goes on from after them. They are written along with
+-- observations that come later; at once, where time has decided. What is not written yet follows from the last row and the observations.
+CREATE TABLE steps (
+    session_id  TEXT    NOT NULL,
+    first_step  INTEGER NOT NULL,
+    steps       BLOB    NOT NULL, -- in short (postcard)
+    PRIMARY KEY (session_id, first_step)
+) STRICT, WITHOUT ROWID;
+
+CREATE TABLE roots (
+    session_id  TEXT    NOT NULL PRIMARY KEY,
+    root        BLOB    NOT NULL  -- after the last of the session's rows of steps (postcard)
+) STRICT, WITHOUT ROWID;
+
+-- Observations and steps that are durable and not yet in their tables. One row holds what a commit of the writer brought, whichever
+-- sessions it is of: JSON, an array of [session_id, seq, n_states, states, at_ms], in the order in which they came, with a sixth item where
+-- times are kept: when they came in the service's own time, in milliseconds. Now and then, and before anybody reads observations, everything
+-- here moves to `observations` and `steps`, and is counted in `sessions`.
 CREATE TABLE arrivals (
     sequence     INTEGER NOT NULL PRIMARY KEY,
-    observations TEXT    NOT NULL
+    observations TEXT    NOT NULL,
+    steps        BLOB              -- session_id, first_step, steps and root of each that came with them (postcard), if any did
 ) STRICT;
 
 -- Learners, by the name that a client gave them. `definition` is the canonical text that `hash` (SHA-256) is of. One that is

@@ -235,12 +235,16 @@ impl Held {
     pub fn grow_to(&mut self, n_bytes: u64) -> Result<(), NoRoom> {
         if n_bytes > self.n_bytes() {
             let more = self.memory.try_take_for(n_bytes, n_bytes - self.n_bytes());
-            let mut more = more.map_err(|_| self.memory.no_room(n_bytes))?;
-            if let Some(all) = more.permit.split(more.permit.num_permits()) {
-                self.permit.merge(all);
-            }
+            self.merge(more.map_err(|_| self.memory.no_room(n_bytes))?);
         }
         Ok(())
+    }
+
+    /// Holds what `more` holds too.
+    pub fn merge(&mut self, mut more: Self) {
+        if let Some(all) = more.permit.split(more.permit.num_permits()) {
+            self.permit.merge(all);
+        }
     }
 
     /// Gives back what is not needed to hold `n_bytes`.

@@ -93,6 +93,7 @@ impl Server {
         let etude = Arc::new(etude);
         tasks.spawn(Arc::clone(&etude).refine_until(stopping.clone()));
         tasks.spawn(Arc::clone(&etude).expire_until(stopping.clone()));
+        tasks.spawn(Arc::clone(&etude).attend_until(stopping.clone()));
         let streams = TaskTracker::new();
         tasks.spawn(Arc::clone(&etude).learn_periodically(config.learn_every, stopping.clone()));
         let stream_limits = config.stream_limits();

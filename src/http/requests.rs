@@ -83,6 +83,12 @@ struct OpenMembers {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 1, maximum = 100_000)]
     lookahead: Option<u32>,
+    /// For how many milliseconds a step may wait, at least 1; `null`, or left out: as long as `lookahead` lets it. A step that advances from
+    /// an observation is committed at the latest so long after the next one came, also while nobody is connected; what has come by then
+    /// decides. Time in which the service is down does not count. With a `lookahead`, the earlier of both.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 1)]
+    lookahead_ms: Option<u64>,
 }
 
 /// A request for a report.

@@ -169,6 +169,8 @@ struct SessionBody {
     weights: Option<ByAttribute<f64>>,
     /// How many observations past the current one a decision may wait for; `null`: all.
     lookahead: Option<u32>,
+    /// For how many milliseconds a step may wait; `null`: as long as `lookahead` lets it.
+    lookahead_ms: Option<u64>,
     /// The learner whose weights are used, if any.
     learner: Option<String>,
     /// The version of the learner's weights.
@@ -209,6 +211,7 @@ impl From<SessionRecord> for SessionBody {
             model_hash: row.model_hash,
             weights: Some(row.weights),
             lookahead: row.lookahead,
+            lookahead_ms: row.lookahead_ms,
             learner: row.learner,
             weights_version: row.weights_version,
             trial_id: row.trial_id,

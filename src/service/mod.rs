@@ -48,12 +48,15 @@ pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, Registered};
 pub use name::{InvalidName, Kind, Name};
+pub(crate) use opening::read_lookahead_ms;
 pub(crate) use pipe::{PipeWriter, pipe};
 pub use policies::MadePolicy;
 pub(crate) use pool::Places;
 pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
+use sessions::Left;
+pub(crate) use sessions::Waits;
 pub use sessions::{
-    CommittedSteps, Ended, Observation, Received, Resumed, RewardState, Session, SessionError, SessionPolicy,
+    CommittedSteps, Ended, Observation, Received, Resumed, RewardState, Session, SessionError, SessionPolicy, ShortStep,
 };
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -148,6 +151,8 @@ pub struct Etude {
     model_names: ModelNames,
     refiner: Refiner,
     owners: Owners,
+    /// Sessions that nobody drives and in which steps are due.
+    left: Left,
     turns: Turns,
     time_limits: TimeLimits,
     session_idle_timeout: Duration,
@@ -197,6 +202,7 @@ impl Etude {
             model_names: ModelNames::new(),
             refiner: Refiner::default(),
             owners: Owners::default(),
+            left: Left::default(),
             turns: Turns::default(),
             session_idle_timeout: settings.session_idle_timeout,
             n_search_threads: settings.pool.n_threads.max(1),

@@ -1,6 +1,6 @@
 //! Requests to open a session, as they are read: first what is named, then, with the model, the rest.
 
-use std::num::NonZeroU32;
+use std::num::{NonZeroU32, NonZeroU64};
 
 use super::learners::LearnerState;
 use super::requests::{Names, base_weights};
@@ -43,11 +43,20 @@ pub(super) fn read_general(object: &Object<'_, '_>, faults: &mut Faults) -> Opti
     Options::read_general(object, &Options { lookahead, ..Options::default() }, faults)
 }
 
+/// How long a step may wait at most, if anything is said of that.
+pub(crate) fn read_lookahead_ms(object: &Object<'_, '_>, faults: &mut Faults) -> Option<NonZeroU64> {
+    /// As large as a number of the store.
+    const MAX_MS: u64 = i64::MAX as u64;
+    object.optional("lookahead_ms").and_then(|place| place.integer(1, MAX_MS, faults)).and_then(NonZeroU64::new)
+}
+
 /// What a session is opened with.
 pub(super) struct SessionOptions {
     pub(super) weights: Weights,
     pub(super) conditions: Conditions,
     pub(super) lookahead: Option<NonZeroU32>,
+    /// In milliseconds.
+    pub(super) lookahead_ms: Option<NonZeroU64>,
 }
 
 /// Reads what needs the model, after the `general` options; the session's window may take about `max_bytes`.
@@ -60,6 +69,8 @@ pub(super) fn read(
     faults: &mut Faults,
 ) -> Option<SessionOptions> {
     let model = mapper.model();
+    // What is wrong with it was noted if it is none.
+    let lookahead_ms = read_lookahead_ms(object, faults);
     if model.is_lazy() {
         let detail = "this world is searched lazily, which needs the whole demonstration: ask for a policy instead";
         faults.note_at(&Path::Member(&Path::Root, "model"), detail);
@@ -75,5 +86,6 @@ pub(super) fn read(
         weights: options.weights_over(weights?),
         conditions: options.conditions(),
         lookahead: options.lookahead,
+        lookahead_ms,
     })
 }

@@ -1,6 +1,7 @@
 //! Which connection drives which session: one at a time, the newest.
 
 use std::collections::HashMap;
+use std::collections::hash_map::Entry;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use tokio::sync::OwnedMutexGuard;
@@ -42,6 +43,17 @@ impl Owners {
         if let Some(owner) = owners.get(id) {
             owner.taken_over.cancel();
         }
+    }
+
+    /// The right to drive a session, if nobody drives it or waits for that.
+    pub(super) fn try_take(&self, id: &str) -> Option<Ownership> {
+        let mut owners = self.owners.lock().unwrap_or_else(PoisonError::into_inner);
+        let Entry::Vacant(vacant) = owners.entry(id.to_owned()) else { return None };
+        let owner = vacant.insert(Owner { driving: Arc::default(), taken_over: CancellationToken::new() });
+        let taken_over = owner.taken_over.clone();
+        let driving = Arc::clone(&owner.driving).try_lock_owned().ok();
+        drop(owners);
+        Some(Ownership { id: id.to_owned(), taken_over, owners: Arc::clone(&self.owners), driving })
     }
 
     /// Waits until whoever drives the session has given way.
@@ -118,6 +130,21 @@ mod tests {
         drop(first);
         drop(second);
         assert_eq!(n_kept(&owners), 0);
+    }
+
+    #[tokio::test]
+    async fn a_session_that_somebody_drives_or_waits_for_is_not_to_be_had_without_asking() {
+        let owners = Owners::default();
+        let first = owners.try_take("a").unwrap();
+        assert!(owners.try_take("a").is_none());
+        let mut second = Box::pin(owners.take("a"));
+        assert!(poll!(&mut second).is_pending());
+        assert!(first.taken_over.is_cancelled(), "it gives way");
+        drop(first);
+        assert!(owners.try_take("a").is_none());
+        drop(second.await.unwrap());
+        assert_eq!(n_kept(&owners), 0);
+        assert!(owners.try_take("a").is_some());
     }
 
     #[tokio::test]

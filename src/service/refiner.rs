@@ -23,7 +23,7 @@ use super::search::{PolicyText, as_micros, report, take_for_search};
 use super::{Etude, Kind, PoolError, ServiceError};
 use crate::clock::Clock;
 use crate::memory::Memory;
-use crate::store::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError};
+use crate::store::{Attempt, MAX_ATTEMPTS, NewRefinement, RefinementEnd, StoreError, StoredObservations};
 use etude_core::attribute::Weights;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
 use etude_core::mapping::{Demonstration, Mapper, Policy, Problem, Request, Settings, Stamp, Status, WrittenPolicy};
@@ -183,7 +183,9 @@ impl Etude {
         let (texts, held) = match (&session_id, refined.demonstration) {
             (Some(session), _) => {
                 let n_observations = self.session(session).await?.n_observations;
-                self.stored_observations(session, n_observations, mapper.model()).await?
+                let stored = self.stored_observations(session, 0, n_observations, mapper.model());
+                let (StoredObservations { texts, .. }, held) = stored.await?;
+                (texts, held)
             }
             (None, Some(text)) => {
                 let mut held = None;

@@ -2,7 +2,7 @@
 //!
 //! Sessions expire once nothing has come for them for too long. Time in which nothing could come, because the service was stopped,
 //! suspended, or could not write, does not count: whoever notes that it is alive finds when that was done last, and moves the open
-//! sessions on by what was between.
+//! sessions on by what was between. The service's own time, in which steps wait for observations, is that of the day less all of it.
 
 use std::time::Duration;
 
@@ -20,19 +20,23 @@ pub(super) struct NoteAlive {
     pub(super) every: Duration,
 }
 
+/// For how long the service was not alive, in all since its database was made, in milliseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Down(pub(super) i64);
+
 impl Verb for NoteAlive {
-    type Answer = ();
+    type Answer = Down;
 
     const READS_OBSERVATIONS: bool = true;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(), StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Down, StoreError> {
         note(writing, *self).await
     }
 }
 
 /// Notes a sign of life, once everything has arrived in its table. The first one since the service was started, or since something
 /// could not be written, ends a time without service in any case.
-pub(super) async fn note(writing: &mut Writing<'_>, NoteAlive { now, every }: NoteAlive) -> Result<(), StoreError> {
+pub(super) async fn note(writing: &mut Writing<'_>, NoteAlive { now, every }: NoteAlive) -> Result<Down, StoreError> {
     let connection = &mut *writing.connection;
     writing.effects.has_noted_life = true;
     let now_ms = now.as_millisecond();
@@ -45,7 +49,8 @@ pub(super) async fn note(writing: &mut Writing<'_>, NoteAlive { now, every }: No
     let last_ms: Option<i64> = query.fetch_one(&mut *connection).await?;
     let gap_ms = last_ms.map_or(0, |last_ms| now_ms.saturating_sub(last_ms));
     let usual_ms = as_integer(u64::try_from(every.as_millis()).unwrap_or(u64::MAX)).saturating_mul(2);
-    if gap_ms > 0 && (writing.was_interrupted || gap_ms > usual_ms) {
+    let was_down = gap_ms > 0 && (writing.was_interrupted || gap_ms > usual_ms);
+    if was_down {
         let moved = sqlx::query(
             "UPDATE sessions SET active_at_ms = MIN(active_at_ms + $1, $2) WHERE status = 'open' AND active_at_ms < $2",
         );
@@ -54,9 +59,9 @@ pub(super) async fn note(writing: &mut Writing<'_>, NoteAlive { now, every }: No
             tracing::info!(gap_ms, n_sessions = n_moved, "time without service does not count for open sessions");
         }
     }
-    let noted = sqlx::query("UPDATE service SET last_alive_ms = $1");
-    noted.bind(now_ms).execute(connection).await?;
-    Ok(())
+    let noted = sqlx::query_scalar("UPDATE service SET last_alive_ms = $1, down_ms = down_ms + $2 RETURNING down_ms");
+    let noted = noted.bind(now_ms).bind(if was_down { gap_ms } else { 0 });
+    Ok(Down(noted.fetch_one(connection).await?))
 }
 
 #[cfg(test)]
@@ -66,7 +71,7 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
-    use crate::store::{ExpiredSession, NewObservations, NewSession, Opened, Owner, Store};
+    use crate::store::{ExpiredSession, NewObservations, NewSession, Opened, Owner, Store, StoredObservations};
 
     const IDLE: Duration = Duration::from_hours(1);
     const EVERY: Duration = Duration::from_mins(6);
@@ -103,6 +108,8 @@ mod tests {
             n_states: 3,
             states,
             at: at(minute),
+            service_time: None,
+            steps: None,
         };
         assert_eq!(store.append_observations(new).await.unwrap(), Ok(()));
     }
@@ -143,7 +150,7 @@ mod tests {
         }
         let gone = ExpiredSession { id: "observed".to_owned(), active_at: at(day + 30), n_observations: 3 };
         assert_eq!(expired(&store, day + 91).await, [gone]);
-        assert_eq!(store.observations("observed").await.unwrap(), Vec::<String>::new());
+        assert_eq!(store.observations("observed", 0).await.unwrap(), StoredObservations::default());
         end((store, tasks)).await;
     }
 

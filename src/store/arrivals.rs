@@ -19,7 +19,7 @@ use serde::Deserialize;
 use serde_json::value::RawValue;
 use sqlx::SqliteConnection;
 
-use super::observations::{self, Arrived, NewObservations, OpenSession, Owner, SessionRefusal};
+use super::observations::{self, Arrived, NewObservations, OpenSession, Owner, ServiceTime, SessionRefusal};
 use super::{StoreError, corrupt};
 
 /// Once `arrivals` has more bytes than this, they are settled with the next commit. A larger table would save little, and settling it would
@@ -45,6 +45,14 @@ pub(super) struct Accepted {
     pub(super) answers: Vec<Result<(), SessionRefusal>>,
     /// The row with the accepted ones; `None` if there are none.
     row: Option<String>,
+    /// Their steps, if there are any.
+    steps: Option<Vec<u8>>,
+}
+
+impl Accepted {
+    fn n_bytes(&self) -> usize {
+        self.row.as_ref().map_or(0, String::len) + self.steps.as_ref().map_or(0, Vec::len)
+    }
 }
 
 impl Arrivals {
@@ -90,22 +98,30 @@ impl Arrivals {
         }
         let mut row = String::new();
         let mut answers = Vec::with_capacity(group.len());
+        let mut steps = Vec::new();
         for new in group {
             let answer = self.accept_one(new);
             answers.push(answer);
             if answer.is_err() {
                 continue;
             }
-            let NewObservations { session_id, seq, n_states, states, at, .. } = new;
+            let NewObservations { session_id, seq, n_states, states, at, service_time, steps: committed, .. } = new;
             let id = serde_json::to_string(session_id).map_err(corrupt("sessions", "id"))?;
             let separator = if row.is_empty() { '[' } else { ',' };
-            let written = write!(row, "{separator}[{id},{seq},{n_states},{states},{}]", at.as_millisecond());
+            let written = write!(row, "{separator}[{id},{seq},{n_states},{states},{}", at.as_millisecond());
+            let written = written.and_then(|()| match service_time {
+                Some(ServiceTime(ms)) => write!(row, ",{ms}]"),
+                None => write!(row, "]"),
+            });
             written.expect("a string takes all that is written to it");
+            steps.extend(committed.as_ref().map(|committed| (session_id, committed)));
         }
         if !row.is_empty() {
             row.push(']');
         }
-        Ok(Accepted { answers, row: Some(row).filter(|row| !row.is_empty()) })
+        let steps = (!steps.is_empty()).then(|| postcard::to_allocvec(&steps));
+        let steps = steps.transpose().map_err(corrupt("arrivals", "steps"))?;
+        Ok(Accepted { answers, row: Some(row).filter(|row| !row.is_empty()), steps })
     }
 
     fn accept_one(&mut self, new: &NewObservations) -> Result<(), SessionRefusal> {
@@ -130,13 +146,15 @@ impl Arrivals {
         let Some(row) = &accepted.row else { return Ok(true) };
         // The driver changes threads for each statement, and again for BEGIN and COMMIT.
         let added = sqlx::query(
-            "INSERT INTO arrivals (observations) SELECT $1 WHERE (SELECT data_version FROM pragma_data_version) = $2",
+            "INSERT INTO arrivals (observations, steps)
+             SELECT $1, $3 WHERE (SELECT data_version FROM pragma_data_version) = $2",
         )
         .bind(row)
         .bind(self.data_version)
+        .bind(&accepted.steps)
         .execute(connection)
         .await?;
-        self.n_bytes += row.len();
+        self.n_bytes += accepted.n_bytes();
         Ok(added.rows_affected() == 1)
     }
 
@@ -147,16 +165,16 @@ impl Arrivals {
         accepted: &Accepted,
     ) -> Result<(), StoreError> {
         if let Some(row) = &accepted.row {
-            sqlx::query("INSERT INTO arrivals (observations) VALUES ($1)").bind(row).execute(connection).await?;
-            self.n_bytes += row.len();
+            let query = sqlx::query("INSERT INTO arrivals (observations, steps) VALUES ($1, $2)");
+            query.bind(row).bind(&accepted.steps).execute(connection).await?;
+            self.n_bytes += accepted.n_bytes();
         }
         Ok(())
     }
 
     /// Moves everything to where it belongs, within a transaction.
     pub(super) async fn settle(&mut self, connection: &mut SqliteConnection) -> Result<(), StoreError> {
-        let query = sqlx::query_scalar("SELECT observations FROM arrivals ORDER BY sequence");
-        let rows: Vec<String> = query.fetch_all(&mut *connection).await?;
+        let rows: Vec<ArrivalsRow> = sqlx::query_as(ROWS).fetch_all(&mut *connection).await?;
         if !rows.is_empty() {
             let settled = together(&rows)?;
             let settled: Vec<&Arrived> = settled.values().collect();
@@ -198,8 +216,7 @@ impl Arrivals {
 
 /// What has arrived and is not settled, by session.
 pub(super) async fn read(reader: &mut SqliteConnection) -> Result<BTreeMap<String, Arrived>, StoreError> {
-    let query = sqlx::query_scalar("SELECT observations FROM arrivals ORDER BY sequence");
-    together(&query.fetch_all(reader).await?)
+    together(&sqlx::query_as(ROWS).fetch_all(reader).await?)
 }
 
 /// Changes when another connection has written.
@@ -209,31 +226,41 @@ async fn data_version(connection: &mut SqliteConnection) -> Result<i64, StoreErr
 
 /// An item of a row of `arrivals`.
 #[derive(Deserialize)]
-struct Arrival<'r>(String, u32, u32, #[serde(borrow)] &'r RawValue, i64);
+struct Arrival<'r>(String, u32, u32, #[serde(borrow)] &'r RawValue, i64, #[serde(default)] Option<ServiceTime>);
+
+/// A row of `arrivals`.
+type ArrivalsRow = (String, Option<Vec<u8>>);
+
+const ROWS: &str = "SELECT observations, steps FROM arrivals ORDER BY sequence";
 
 /// Reads rows, and puts what belongs to the same session together, in order.
-fn together(rows: &[String]) -> Result<BTreeMap<String, Arrived>, StoreError> {
+fn together(rows: &[ArrivalsRow]) -> Result<BTreeMap<String, Arrived>, StoreError> {
     const TABLE: &str = "arrivals";
     let mut by_session = BTreeMap::<String, Arrived>::new();
-    for row in rows {
+    for (row, steps) in rows {
         let arrivals: Vec<Arrival<'_>> = serde_json::from_str(row).map_err(corrupt(TABLE, "observations"))?;
-        for Arrival(session_id, seq, n_states, states, at_ms) in arrivals {
+        for Arrival(session_id, seq, n_states, states, at_ms, service_time) in arrivals {
             let at = super::timestamp(TABLE, "observations", at_ms)?;
-            let states = states.get();
-            match by_session.get_mut(&session_id) {
-                Some(before) if before.seq + before.n_states != seq => refused(&session_id, seq),
-                Some(before) => {
-                    // Both are arrays that are not empty.
-                    before.states.pop();
-                    before.states.push(',');
-                    before.states.push_str(&states[1..]);
-                    before.n_states += n_states;
-                    before.at = at;
-                }
-                None => {
-                    let states = states.to_owned();
-                    by_session.insert(session_id.clone(), Arrived { session_id, seq, n_states, states, at });
-                }
+            let new = Arrived {
+                session_id,
+                seq,
+                n_states,
+                states: states.get().to_owned(),
+                at,
+                times: service_time.map(|time| (seq, time)).into_iter().collect(),
+                steps: Vec::new(),
+            };
+            match by_session.get_mut(&new.session_id) {
+                Some(before) if before.seq + before.n_states != seq => refused(&new.session_id, seq),
+                Some(before) => before.append(new),
+                None => drop(by_session.insert(new.session_id.clone(), new)),
+            }
+        }
+        let steps = steps.as_deref().map_or(Ok(Vec::new()), postcard::from_bytes);
+        for (session_id, committed) in steps.map_err(corrupt(TABLE, "steps"))? {
+            let session_id: String = session_id;
+            if let Some(new) = by_session.get_mut(&session_id) {
+                new.steps.push(committed);
             }
         }
     }
@@ -267,11 +294,13 @@ mod tests {
             n_states: u32::try_from(states.len()).unwrap(),
             states: serde_json::to_string(states).unwrap(),
             at: Timestamp::UNIX_EPOCH,
+            service_time: None,
+            steps: None,
         }
     }
 
     async fn stored(store: &Store, id: &str) -> Vec<u32> {
-        let rows = store.observations(id).await.unwrap();
+        let rows = store.observations(id, 0).await.unwrap().texts;
         rows.iter().flat_map(|row| serde_json::from_str::<Vec<u32>>(row).unwrap()).collect()
     }
 

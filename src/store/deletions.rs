@@ -4,7 +4,7 @@
 //! |---|---|---|---|
 //! | policy | its refinement, if that waits, and the key of its request | the policy that it refines, the one that refines it, its session | a trial that it is of |
 //! | trial | the key of its request | the session that explores it | its reward |
-//! | session | its observations, and the refinement of its policy that waits for them | | |
+//! | session | its observations and steps, and the refinement of its policy that waits for them | | |
 //!
 //! A trial's policy stays, and so do the policy and the trial of a session.
 
@@ -124,7 +124,13 @@ impl Verb for DeleteSession {
         let (Self(id), connection) = (self, &mut *writing.connection);
         let deleted = sqlx::query_scalar("DELETE FROM sessions WHERE id = $1 RETURNING policy_id").bind(id);
         let Some(policy_id) = deleted.fetch_optional(&mut *connection).await? else { return Ok(Deletion::Unknown) };
-        sqlx::query("DELETE FROM observations WHERE session_id = $1").bind(id).execute(&mut *connection).await?;
+        for query in [
+            "DELETE FROM observations WHERE session_id = $1",
+            "DELETE FROM steps WHERE session_id = $1",
+            "DELETE FROM roots WHERE session_id = $1",
+        ] {
+            sqlx::query(query).bind(id).execute(&mut *connection).await?;
+        }
         let policy_id: Option<String> = policy_id;
         if let Some(policy_id) = policy_id {
             let given_up = sqlx::query("DELETE FROM refinements WHERE policy_id = $1 AND session_id = $2");

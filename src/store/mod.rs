@@ -32,10 +32,11 @@ mod writer;
 use std::io;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::time::{Duration, Instant};
 
 use crate::clock::Clock;
-use alive::NoteAlive;
+use alive::{Down, NoteAlive};
 use database::{Database, Locking, Readers};
 use definitions::Sweeper;
 pub use definitions::{NewPieces, PIECE_BYTES};
@@ -47,13 +48,14 @@ pub use models::{
     ModelKey, ModelRecord, ModelRegistration, ModelSize, ModelSummary, NewDefinition, NewModel, Replaces,
     StoredDefinition,
 };
-pub use observations::{NewObservations, Owner, SessionRefusal};
+pub use observations::{NewObservations, NewSteps, Owner, ServiceTime, SessionRefusal};
 pub use page::Page;
 pub use policies::{Links, NewPolicy, NewRefinement, PolicyClass, PolicyFilter, PolicyRecord, pack_steps};
 pub use refinements::{Attempt, MAX_ATTEMPTS, RefinementEnd};
 pub use request_keys::{AnsweredRequest, KeyTaken, NewRequestKey, RequestKey};
 pub use sessions::{
-    ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, SessionFilter, SessionRecord, SessionStatus, Taken,
+    ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, SessionFilter, SessionRecord, SessionStatus,
+    StoredObservations, StoredSteps, Taken,
 };
 
 use sqlx::Sqlite;
@@ -73,6 +75,8 @@ pub struct Store {
     writer: Writer,
     sweeper: Sweeper,
     trial_numbers: TrialNumbers,
+    /// For how long the service was not alive, as was noted last.
+    down_ms: AtomicI64,
     tasks: TaskTracker,
     /// What the last check found, and when.
     checked: tokio::sync::Mutex<Option<(Instant, Result<(), Unavailable>)>>,
@@ -141,6 +145,7 @@ impl Store {
             writer,
             sweeper,
             trial_numbers: TrialNumbers::default(),
+            down_ms: AtomicI64::new(0),
             tasks: tasks.clone(),
             checked: tokio::sync::Mutex::default(),
         }
@@ -170,7 +175,18 @@ impl Store {
     ///
     /// If it cannot be written.
     pub async fn note_alive(&self, now: Timestamp, every: Duration) -> Result<(), StoreError> {
-        self.writer.write(NoteAlive { now, every }).await
+        self.note_down(self.writer.write(NoteAlive { now, every }).await?);
+        Ok(())
+    }
+
+    fn note_down(&self, Down(ms): Down) {
+        self.down_ms.store(ms, Ordering::Relaxed);
+    }
+
+    /// The service's own time at `now`: time in which it was not alive is left out, as far as that was [noted](Self::note_alive).
+    #[must_use]
+    pub fn service_time(&self, now: Timestamp) -> ServiceTime {
+        ServiceTime(now.as_millisecond() - self.down_ms.load(Ordering::Relaxed))
     }
 
     /// Whether something can be written by `clock`, as [`Self::note_alive`] is; tried at most once a second, and known within two.

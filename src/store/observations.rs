@@ -1,8 +1,11 @@
 //! Observations of sessions: who may add them, and how they come to their table.
 
 use std::collections::HashSet;
+use std::fmt::{self, Display, Formatter, Write};
+use std::time::Duration;
 
 use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use sqlx::SqliteConnection;
 
@@ -46,6 +49,53 @@ pub struct NewObservations {
     pub states: String,
     /// When they came.
     pub at: Timestamp,
+    /// The same in the service's own time, where it is to be kept for each of them.
+    pub service_time: Option<ServiceTime>,
+    /// Steps that were committed before, and are not stored yet.
+    pub steps: Option<NewSteps>,
+}
+
+impl NewObservations {
+    /// No observations, but steps of a session that has `n_observations`: they do not count as activity.
+    #[must_use]
+    pub fn none(session_id: String, owner: Owner, n_observations: u32, steps: NewSteps) -> Self {
+        let (states, at) = ("[]".to_owned(), Timestamp::UNIX_EPOCH);
+        Self { session_id, owner, seq: n_observations, n_states: 0, states, at, service_time: None, steps: Some(steps) }
+    }
+
+    /// How many bytes there are to be written, roughly.
+    pub(super) fn n_bytes(&self) -> usize {
+        self.states.len() + self.steps.as_ref().map_or(0, NewSteps::n_bytes)
+    }
+}
+
+/// A time of the service's own: milliseconds since 1970, without those in which the service was not alive.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct ServiceTime(pub(super) i64);
+
+impl ServiceTime {
+    /// How much later than `earlier` it is; nothing if it is not.
+    #[must_use]
+    pub fn since(self, earlier: Self) -> Duration {
+        Duration::from_millis(u64::try_from(self.0.saturating_sub(earlier.0)).unwrap_or(0))
+    }
+}
+
+/// Steps that a session has committed, one after the other, and what its mapping goes on from.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct NewSteps {
+    /// The number of the first of them.
+    pub first: u32,
+    /// The steps, in short.
+    pub steps: Vec<u8>,
+    /// What the mapping goes on from after them.
+    pub root: Vec<u8>,
+}
+
+impl NewSteps {
+    fn n_bytes(&self) -> usize {
+        self.steps.len() + self.root.len()
+    }
 }
 
 /// Observations of a session that have arrived.
@@ -57,7 +107,31 @@ pub(super) struct Arrived {
     /// JSON: an array of states.
     pub(super) states: String,
     pub(super) at: Timestamp,
+    /// When those came whose times are kept.
+    pub(super) times: Times,
+    pub(super) steps: Vec<NewSteps>,
 }
+
+impl Arrived {
+    /// Appends what comes next in the same session.
+    pub(super) fn append(&mut self, mut new: Self) {
+        // Both are arrays.
+        if self.n_states > 0 && new.n_states > 0 {
+            self.states.pop();
+            self.states.push(',');
+            self.states.push_str(&new.states[1..]);
+        } else if new.n_states > 0 {
+            self.states = new.states;
+        }
+        self.n_states += new.n_states;
+        self.at = self.at.max(new.at);
+        self.times.append(&mut new.times);
+        self.steps.append(&mut new.steps);
+    }
+}
+
+/// From which observation on they came when.
+pub(super) type Times = Vec<(u32, ServiceTime)>;
 
 /// What is known of an open session.
 #[derive(Clone, Copy, Debug)]
@@ -79,7 +153,7 @@ pub(super) async fn find_open(
     Ok(open.map(|(id, owner, n_observations)| (id, OpenSession { owner: Owner(owner), n_observations })).collect())
 }
 
-/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. Two
+/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. At most four
 /// statements, however many there are: each one costs the driver a change of threads.
 pub(super) async fn add(connection: &mut SqliteConnection, group: &[&Arrived]) -> Result<Vec<bool>, StoreError> {
     let rows =
@@ -98,22 +172,50 @@ pub(super) async fn add(connection: &mut SqliteConnection, group: &[&Arrived]) -
     .await?;
     let updated: HashSet<String> = updated.into_iter().collect();
     let is_updated: Vec<bool> = group.iter().map(|new| updated.contains(&new.session_id)).collect();
-    if updated.is_empty() {
-        return Ok(is_updated);
+    let added = || group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated).map(|(new, _)| new);
+    let observed = added().filter(|new| new.n_states > 0).map(|new| {
+        let times = (!new.times.is_empty()).then(|| json!(new.times).to_string());
+        json!([new.session_id, new.seq, new.n_states, new.states, times])
+    });
+    let observed: Vec<_> = observed.collect();
+    if !observed.is_empty() {
+        let query = sqlx::query(
+            "INSERT INTO observations (session_id, seq, n_states, states, times)
+             SELECT value ->> 0, value ->> 1, value ->> 2, value ->> 3, value ->> 4 FROM json_each($1)",
+        );
+        query.bind(Value::Array(observed).to_string()).execute(&mut *connection).await?;
     }
-    let rows = if updated.len() == group.len() {
-        rows
-    } else {
-        let rows = group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated);
-        let rows = rows.map(|(new, _)| json!([new.session_id, new.seq, new.n_states, new.states]));
-        Value::Array(rows.collect()).to_string()
-    };
-    sqlx::query(
-        "INSERT INTO observations (session_id, seq, n_states, states)
-         SELECT value ->> 0, value ->> 1, value ->> 2, value ->> 3 FROM json_each($1)",
-    )
-    .bind(rows)
-    .execute(connection)
-    .await?;
+    let steps = added().flat_map(|new| {
+        let rows = new.steps.iter();
+        rows.map(|NewSteps { first, steps, .. }| json!([new.session_id, first, Hexadecimal(steps).to_string()]))
+    });
+    let steps: Vec<_> = steps.collect();
+    if !steps.is_empty() {
+        let roots = added().filter_map(|new| Some((&new.session_id, new.steps.last()?)));
+        let roots = roots.map(|(id, NewSteps { root, .. })| json!([id, Hexadecimal(root).to_string()]));
+        let query = sqlx::query(
+            "INSERT OR REPLACE INTO roots (session_id, root) SELECT value ->> 0, unhex(value ->> 1) FROM json_each($1)",
+        );
+        query.bind(Value::Array(roots.collect()).to_string()).execute(&mut *connection).await?;
+        let query = sqlx::query(
+            "INSERT INTO steps (session_id, first_step, steps)
+             SELECT value ->> 0, value ->> 1, unhex(value ->> 2) FROM json_each($1)",
+        );
+        query.bind(Value::Array(steps).to_string()).execute(connection).await?;
+    }
     Ok(is_updated)
+}
+
+/// Bytes, as two digits each: JSON has none.
+struct Hexadecimal<'b>(&'b [u8]);
+
+impl Display for Hexadecimal<'_> {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        const DIGITS: &[u8; 16] = b"0123456789abcdef";
+        for byte in self.0 {
+            let digits = [byte >> 4, byte & 15].map(|digit| char::from(DIGITS[usize::from(digit)]));
+            digits.into_iter().try_for_each(|digit| f.write_char(digit))?;
+        }
+        Ok(())
+    }
 }

@@ -1,22 +1,22 @@
 //! The protocol, one connection at a time.
 
+use std::pin::pin;
 use std::time::Duration;
 
-use serde_json::Value;
 use tokio::sync::SetOnce;
-use tokio_util::bytes::Bytes;
 use tokio_util::sync::CancellationToken;
 
 use super::closing::{Closed, Over, ends, not_allowed};
 use super::frames::{ClientFrame, HelloLimits, ServerFrame, WriteError};
 use super::limits::Limits;
+use super::messages::{Incoming, Outgoing, read_frame, text_of};
 use super::problem::StreamProblem;
 use super::queue::{Gone, Receiver, Sender, Weighed};
-use super::room::{Crowded, SMALL_FRAME_BYTES, Taken};
+use super::room::{SMALL_FRAME_BYTES, Taken};
 use crate::service::{
     AcceptedReward, Caller, Client, Ended, Etude, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
-use etude_core::document::{self, ParseError, Place};
+use etude_core::document::{self, Place};
 use etude_core::mapping::CommittedStep;
 
 /// The protocol's name; also the websocket subprotocol.
@@ -28,49 +28,6 @@ const BYTES_IN_A_ROW: usize = 16 << 10;
 
 /// What a frame counts for at least, however short it is.
 const MIN_FRAME_BYTES: usize = 512;
-
-/// What came from the client.
-#[derive(Debug)]
-pub enum Incoming {
-    /// A frame.
-    Frame {
-        /// Its text.
-        text: Bytes,
-        /// What it takes of the memory of the service until it is handled, if it is not small.
-        memory: Option<Taken>,
-    },
-    /// Something that is no frame: a binary message.
-    Binary,
-    /// A frame over the limit.
-    TooLarge,
-    /// Text that is not UTF-8.
-    NotText,
-    /// Something that the transport does not allow, and what.
-    Violation(String),
-    /// A frame that there is no memory for.
-    Crowded,
-}
-
-impl Weighed for Incoming {
-    fn n_bytes(&self) -> usize {
-        if let Self::Frame { text, .. } = self { text.len() } else { 0 }
-    }
-}
-
-/// What goes to the client.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Outgoing {
-    /// A frame.
-    Frame(String),
-    /// The end of the connection.
-    Close(Closed),
-}
-
-impl Weighed for Outgoing {
-    fn n_bytes(&self) -> usize {
-        if let Self::Frame(text) = self { text.len() } else { 0 }
-    }
-}
 
 /// How long the last words may wait for a client that does not read.
 const GOODBYE_TIMEOUT: Duration = Duration::from_secs(2);
@@ -148,7 +105,18 @@ impl Connection<'_> {
                 n_bytes = 0;
                 tokio::task::yield_now().await;
             }
-            let Ok(came) = tokio::time::timeout(self.limits.idle_after, incoming.recv()).await else {
+            let came = {
+                let mut coming = pin!(tokio::time::timeout(self.limits.idle_after, incoming.recv()));
+                loop {
+                    tokio::select! {
+                        // What has come by the time that a step is due decides, not what waits to be received.
+                        biased;
+                        () = self.is_due() => self.decide().await?,
+                        came = &mut coming => break came,
+                    }
+                }
+            };
+            let Ok(came) = came else {
                 return Err(Over::because(Closed::NotAllowed, StreamProblem::new("idle", "nothing came for too long")));
             };
             let Some(came) = came else { return Ok(Closed::ByClient) };
@@ -159,6 +127,21 @@ impl Connection<'_> {
                 return Ok(closed);
             }
         }
+    }
+
+    /// Waits until a step of the session is due, if one waits for so long at most.
+    async fn is_due(&self) {
+        match self.session.as_ref().and_then(Session::due) {
+            Some(due) => self.etude.clock().sleep_until(due).await,
+            None => std::future::pending().await,
+        }
+    }
+
+    /// Commits the steps that are due.
+    async fn decide(&mut self) -> Result<(), Over> {
+        let Some(session) = &mut self.session else { return Ok(()) };
+        let steps = session.decide(self.etude).await.map_err(|error| ends(&error))?;
+        self.send_steps(&steps).await
     }
 
     /// Reads what came: a large frame off the threads that serve others. Gives its memory along.
@@ -186,10 +169,15 @@ impl Connection<'_> {
                 Ok(None)
             }
             (ClientFrame::Resume { session, step }, None) => {
-                let Resumed { session, steps, policy } =
+                let Resumed { session, kept, steps, policy } =
                     self.etude.resume_session(&session, caller).await.map_err(|error| ends(&error))?;
+                let mapper = session.mapper();
                 self.opened(session).await?;
-                self.send_steps(steps.get(step as usize..).unwrap_or_default()).await?;
+                for (number, kept) in (0..).zip(&kept).skip(step as usize) {
+                    self.send(&ServerFrame::Step((&kept.written(number, mapper.model())).into())).await?;
+                }
+                let n_kept = kept.len();
+                self.send_steps(steps.get((step as usize).saturating_sub(n_kept)..).unwrap_or_default()).await?;
                 let Some(policy) = policy else { return Ok(None) };
                 self.send(&ServerFrame::from(&policy)).await?;
                 self.done().await
@@ -339,41 +327,4 @@ async fn send(outgoing: &Sender<Outgoing>, limits: Limits, frame: &ServerFrame<'
         Ok(Err(Gone)) => Err(Over { closed: Closed::ByClient, problem: None }),
         Err(_) => Err(Over { closed: Closed::Overloaded, problem: None }),
     }
-}
-
-/// The text of what came, and its memory.
-fn text_of(came: Incoming, limits: Limits) -> Result<(Bytes, Option<Taken>), Over> {
-    let bad = |problem| Over::because(Closed::BadFrame, problem);
-    match came {
-        Incoming::Frame { text, memory } if text.len() <= limits.frame_bytes => Ok((text, memory)),
-        Incoming::Frame { .. } | Incoming::TooLarge => {
-            let detail = format!("a frame has at most {} bytes", limits.frame_bytes);
-            Err(Over::because(Closed::TooLarge, StreamProblem::new("too-large", detail)))
-        }
-        Incoming::Binary => Err(bad(StreamProblem::new("bad-frame", "expected text, found a binary message"))),
-        Incoming::NotText => {
-            let problem = StreamProblem::new("malformed-json", "the frame is not UTF-8");
-            Err(Over::because(Closed::NotText, problem))
-        }
-        Incoming::Violation(what) => {
-            let detail = format!("against the protocol of websockets: {what}");
-            Err(Over::because(Closed::Protocol, StreamProblem::new("bad-frame", detail)))
-        }
-        Incoming::Crowded => {
-            let problem = StreamProblem::new("overloaded", Crowded.to_string());
-            Err(Over::because(Closed::Overloaded, problem))
-        }
-    }
-}
-
-/// Reads the text of a frame.
-fn read_frame(text: &[u8]) -> Result<ClientFrame, Over> {
-    let bad = |problem| Over::because(Closed::BadFrame, problem);
-    let frame: Value = document::parse(text).map_err(|error| match error {
-        ParseError::Syntax { .. } => {
-            Over::because(Closed::NotText, StreamProblem::new("malformed-json", error.to_string()))
-        }
-        ParseError::Faults(faults) => bad(StreamProblem::of("bad-frame", &faults)),
-    })?;
-    ClientFrame::read(frame).map_err(|faults| bad(StreamProblem::of("bad-frame", &faults)))
 }

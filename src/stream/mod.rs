@@ -15,12 +15,14 @@ mod closing;
 mod engine;
 pub mod frames;
 mod limits;
+mod messages;
 pub mod problem;
 mod queue;
 mod room;
 
 pub use closing::Closed;
-pub use engine::{Incoming, Outgoing, PROTOCOL, run};
+pub use engine::{PROTOCOL, run};
 pub use limits::Limits;
+pub use messages::{Incoming, Outgoing};
 pub use queue::{Gone, QUEUE_BYTES, Queued, Receiver, Reserved, Sender, Weighed, queue};
 pub use room::{Crowded, NotAdmitted, READ_BUFFER_BYTES, Room, Rooms, SMALL_FRAME_BYTES, Taken, WRITE_BUFFER_BYTES};

@@ -65,6 +65,29 @@ fn map_prints_a_table_or_the_policy() {
 }
 
 #[test]
+fn stream_waits_for_some_time_only_if_it_is_told_so() {
+    let model = ["stream", "--model", "examples/figure-4/model.json", "--json"];
+    let time = ["--lookahead", "none", "--lookahead-ms", "1"];
+    let mut child = etude(&[&model[..], &time].concat()).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let _watched = Watchdog::watch(child.id());
+    let demonstration: Vec<Value> =
+        serde_json::from_str(include_str!("../../examples/figure-4/demonstration.json")).unwrap();
+    let mut input = child.stdin.take().unwrap();
+    for state in &demonstration[..3] {
+        writeln!(input, "{state}").unwrap();
+    }
+    // The input goes on.
+    let lines = BufReader::new(child.stdout.take().unwrap()).lines().map_while(Result::ok);
+    let mut steps = lines.map(|line| serde_json::from_str::<Value>(&line).unwrap());
+    let timed = steps.find(|step| step["observation"] == 2).unwrap();
+    assert_eq!((&timed["proven"], &timed["after"]), (&false.into(), &3.into()), "{timed}");
+    drop(input);
+    assert!(child.wait().unwrap().success());
+    let wrong = run(&[&model[..], &["--lookahead-ms", "0"]].concat());
+    assert!(text(&wrong.stderr).contains("--lookahead-ms"), "{}", text(&wrong.stderr));
+}
+
+#[test]
 fn map_reads_standard_input_and_bounds_its_search() {
     let arguments = ["map", "--model", "examples/figure-4/model.json", "--demonstration", "-", "--json"];
     let bounded = ["--heuristic", "none", "--max-expansions", "10"];

@@ -16,7 +16,6 @@ use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 
 const N_KILLS: usize = 100;
 
-/// Longer than anything here takes.
 /// Observations of a stream: the demonstration of figure 4, there and back.
 const N_OBSERVATIONS: usize = 48;
 
@@ -146,6 +145,99 @@ async fn a_service_killed_a_hundred_times_loses_and_doubles_nothing() {
     }
     assert!(n_streams > 5 && n_resumed_midway > N_KILLS / 3, "{n_streams} streams, {n_resumed_midway} resumed midway");
     process.kill();
+}
+
+/// Nobody can say which steps time decides, but none of those that were told may ever be told otherwise.
+#[tokio::test]
+async fn what_time_has_decided_stays_so_in_a_service_that_is_killed_again_and_again() {
+    const N_KILLS: usize = 40;
+    let there: Vec<Value> = serde_json::from_str(include_str!("../../examples/figure-4/demonstration.json")).unwrap();
+    let observations: Vec<Value> = there.iter().chain(there.iter().rev()).cycle().take(2000).cloned().collect();
+    let directory = tempfile::tempdir().unwrap();
+    let database = directory.path().join("etude.db");
+    let mut process = Process::start(&database);
+    let model: Value = serde_json::from_str(include_str!("../../examples/figure-4/model.json")).unwrap();
+    let client = crate::harness::client::Client::new();
+    let registered = client.put(format!("http://{}/v1/models/figure-4", process.address)).json(&model).send().await;
+    assert!(registered.unwrap().status().is_success());
+
+    let mut random = SplitMix(7);
+    let (mut session, mut told, mut n_received, mut n_timed) = (Value::Null, Vec::<Value>::new(), 0, 0);
+    for n_kills in 0..=N_KILLS {
+        let url = format!("ws://{}/v1/stream", process.address);
+        let (mut socket, _) = tokio_tungstenite::connect_async(url).await.unwrap();
+        let first = if session.is_null() {
+            json!({"type": "open", "model": "figure-4", "lookahead": null, "lookahead_ms": 3})
+        } else {
+            json!({"type": "resume", "session": session})
+        };
+        socket.send(Message::text(first.to_string())).await.unwrap();
+        let (mut n_steps, mut n_new, mut has_ended) = (0, 0, false);
+        let until = 1 + random.below(12);
+        while n_kills == N_KILLS || n_new < until {
+            let message = within("a message", socket.next()).await.unwrap().unwrap();
+            let mut frame: Value = serde_json::from_str(message.to_text().unwrap()).unwrap();
+            // What goes on once it is there.
+            let goes_on = match frame["type"].as_str().unwrap() {
+                "hello" => false,
+                "opened" => {
+                    assert!(frame["received"].as_u64() >= Some(n_received), "{n_received} were acknowledged: {frame}");
+                    n_received = frame["received"].as_u64().unwrap();
+                    session = frame["session"].take();
+                    true
+                }
+                "received" => {
+                    n_received = frame["seq"].as_u64().unwrap();
+                    random.below(2) == 0
+                }
+                "step" => {
+                    let is_newest = frame["observation"].as_u64() == n_received.checked_sub(1);
+                    if let Some(before) = told.get(n_steps) {
+                        assert_eq!(frame, *before);
+                    } else {
+                        n_new += 1;
+                        n_timed += usize::from(frame["proven"] == false);
+                        told.push(frame);
+                    }
+                    n_steps += 1;
+                    is_newest && n_new > 0
+                }
+                "done" => {
+                    let id = frame["policy_id"].as_str().unwrap();
+                    let policy = client.get(format!("http://{}/v1/policies/{id}", process.address)).send().await;
+                    let policy: Value = policy.unwrap().json().await.unwrap();
+                    let steps = policy["steps"].as_array().unwrap();
+                    assert_eq!(steps.len(), told.len());
+                    for (step, told) in steps.iter().zip(&told) {
+                        for field in ["step", "observation", "move", "action", "state", "distance", "cost"] {
+                            assert_eq!(step[field], told[field], "{field} of {told}");
+                        }
+                    }
+                    assert!(n_timed > 0, "{n_timed} of {} steps were decided by time", told.len());
+                    process.kill();
+                    return;
+                }
+                "error" => {
+                    assert_eq!(frame["problem"]["type"], "/problems/gap", "something came before the end");
+                    has_ended = false;
+                    true
+                }
+                _ => panic!("{frame}"),
+            };
+            if goes_on && !has_ended {
+                let seq = usize::try_from(n_received).unwrap();
+                has_ended = n_kills == N_KILLS && n_new >= until;
+                let next = if has_ended {
+                    json!({"type": "end", "seq": seq})
+                } else {
+                    json!({"type": "observe", "seq": seq, "states": observations[seq..=seq + random.below(2)]})
+                };
+                socket.send(Message::text(next.to_string())).await.unwrap();
+            }
+        }
+        process.kill();
+        process = Process::start(&database);
+    }
 }
 
 /// `etude stream` at a service.

@@ -77,7 +77,7 @@ impl RequestKind {
             }
             Self::Item => following!("demonstration", "heuristic", "max_expansions", "collapse"),
             Self::Trial => following!("model", "demonstration", "heuristic", "max_expansions", "deadline_ms"),
-            Self::Session => following!("type", "model", "learner", "explore"),
+            Self::Session => following!("type", "model", "learner", "explore", "lookahead_ms"),
             Self::Report => &["demonstration", "weights", "start", "observation_weights", "without", "deadline_ms"],
         }
     }

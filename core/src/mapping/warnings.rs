@@ -31,15 +31,15 @@ pub struct Warning {
 }
 
 /// The kinds of warnings that are told of an attribute.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 enum About {
     Strange,
     Far,
     Swallowing,
 }
 
-/// What was seen so far of what warnings are about.
-#[derive(Clone, Debug)]
+/// What was seen so far of what warnings are about. As it is stored, floats must keep their bits.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Watch {
     /// Of the attributes that weigh something, in schema order.
     watched: Vec<Watched>,
@@ -47,7 +47,7 @@ pub struct Watch {
     told: Vec<(usize, About)>,
 }
 
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Watched {
     position: usize,
     weight: f64,
@@ -64,7 +64,7 @@ struct Watched {
 }
 
 /// Values that no state has.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Strange {
     first: usize,
     value: Value,
@@ -73,7 +73,7 @@ struct Strange {
     are_several: bool,
 }
 
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 struct Same {
     first: usize,
     n: usize,

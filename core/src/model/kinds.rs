@@ -3,12 +3,11 @@
 use serde::{Deserialize, Serialize};
 
 use super::dynamics::Read;
-use super::planning::{self, PlanningDocument};
 use super::table::{self, TableDocument};
 use super::wumpus::{self, WumpusDocument};
 
 /// Each kind's name in JSON, and what reads it.
-const KINDS: [(&str, Read); 3] = [("table", table::read), ("planning", planning::read), ("wumpus", wumpus::read)];
+const KINDS: [(&str, Read); 2] = [("table", table::read), ("wumpus", wumpus::read)];
 
 /// What reads the dynamics of the kind called `name`.
 pub(super) fn reader(name: &str) -> Option<Read> {
@@ -29,9 +28,6 @@ pub enum DynamicsDocument {
     /// States and transitions are listed.
     #[cfg_attr(feature = "openapi", schema(title = "TableDynamics"))]
     Table(TableDocument),
-    /// Actions need some values and change some.
-    #[cfg_attr(feature = "openapi", schema(title = "PlanningDynamics"))]
-    Planning(PlanningDocument),
     /// They follow from the rules of the wumpus world.
     #[cfg_attr(feature = "openapi", schema(title = "WumpusDynamics"))]
     Wumpus(WumpusDocument),

@@ -5,8 +5,7 @@ use super::ActionIdx;
 /// A way in which an action changes the values of some attributes. Values are indices into the domains.
 ///
 /// The operators of a model allow all that its transitions do, and may allow more: every transition has an operator of its action that
-/// changes the same attributes from and to the same values, and that keeps nothing but what the transition keeps. Or several operators, which
-/// together change these from and to the same values, each changing further attributes as well: each attribute then pays a smaller part.
+/// changes the same attributes from and to the same values, and that keeps nothing but what the transition keeps.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Operator {
     /// The action.

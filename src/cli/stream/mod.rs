@@ -12,9 +12,10 @@ mod printer;
 mod session;
 
 use std::io::Write;
-use std::num::NonZeroU32;
+use std::num::{NonZeroU32, NonZeroU64};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use clap::Args;
 use serde::Deserialize;
@@ -28,7 +29,9 @@ use super::input::{Cells, Observation, Observations};
 use super::map::{read_json, read_model};
 use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags, faulty};
 use super::{CliError, client as http, runtime};
+use crate::clock::Clock;
 use crate::config::parse_whole;
+use crate::service::{Waits, read_lookahead_ms};
 use crate::stream::frames::ServerFrame;
 use etude_core::attribute::AttributeDocument;
 use etude_core::document::{Faults, Path, Place};
@@ -56,6 +59,10 @@ pub(super) struct Stream {
     /// How many observations past the current one a step may wait for; none: commit only what is proven [default: 8].
     #[arg(long, value_name = "N|none")]
     lookahead: Option<Lookahead>,
+    /// For how many milliseconds a step may wait for what is observed after it; as long as the lookahead lets it unless said. The earlier of
+    /// both decides.
+    #[arg(long, value_name = "MS")]
+    lookahead_ms: Option<NonZeroU64>,
     #[command(flatten)]
     options: OptionFlags,
     /// Print each step as a line of JSON, and the totals as the last one.
@@ -77,14 +84,14 @@ impl Stream {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
         let mut printer = Printer::new(out, self.json);
         let done = match &self.server {
-            None => self.run_here(&mut printer),
+            None => runtime()?.block_on(self.run_here(&mut printer)),
             Some(server) => runtime()?.block_on(self.run_at(server.as_str(), &mut printer)),
         };
         printer.progress.finish_and_clear();
         done
     }
 
-    fn run_here(&self, printer: &mut Printer<'_, impl Write>) -> Result<(), CliError> {
+    async fn run_here(&self, printer: &mut Printer<'_, impl Write>) -> Result<(), CliError> {
         let is_name = !self.model.exists() && self.model.components().count() == 1 && self.model.extension().is_none();
         if is_name {
             let detail =
@@ -104,11 +111,13 @@ impl Stream {
         let document = request.document();
         let mut faults = Faults::default();
         let object = Place::root(&document).object(RequestKind::Session.fields(), &mut faults);
+        let lookahead_ms = object.as_ref().and_then(|object| read_lookahead_ms(object, &mut faults));
         let options = object.and_then(|object| {
             Options::check_model(mapper.model(), &object, &mut faults);
             Options::read(&object, mapper.model(), &Options::default(), &mut faults)
         });
-        let told = |faults: Faults| request.told_of(&faults, observations.source(), &[]);
+        let source = Arc::clone(observations.source());
+        let told = |faults: Faults| request.told_of(&faults, &source, &[]);
         let options = faults.check(options).map_err(told)?;
 
         let weights = options.weights_over(schema.weights());
@@ -123,7 +132,27 @@ impl Stream {
             }
             Ok::<_, CliError>(())
         };
-        while let Some(Observation { spot, state }) = observations.next()? {
+        let (clock, mut waits, mut n_met) = (Clock::system(), Waits::of(lookahead_ms), 0);
+        let mut coming = observations.read_ahead();
+        loop {
+            let due = waits.as_ref().and_then(|waits| waits.next(n_met, online.n_observed()));
+            let is_due = async {
+                match due {
+                    Some(due) => clock.sleep_until(due).await,
+                    None => std::future::pending().await,
+                }
+            };
+            let next = tokio::select! {
+                biased;
+                () = is_due => {
+                    let steps = online.decide(&mut Uninterrupted)?;
+                    met(&mut waits, &mut n_met, &steps);
+                    print(printer, &steps)?;
+                    continue;
+                }
+                next = coming.recv() => next,
+            };
+            let Some(Observation { spot, state }) = next.transpose()?.flatten() else { break };
             if online.n_observed() as usize == Demonstration::MAX_OBSERVATIONS {
                 let detail = format!("one more than the {} that may be", Demonstration::MAX_OBSERVATIONS);
                 return Err(CliError::Faulty(spot.tell("", &detail)));
@@ -136,7 +165,11 @@ impl Stream {
             };
             let observed = faults.check(read).map_err(told)?;
             watch.observe(mapper.model(), online.n_observed() as usize, &observed);
+            if let Some(waits) = &mut waits {
+                waits.came(online.n_observed(), Duration::ZERO, clock.instant());
+            }
             let steps = online.observe(&observed, None, &mut Uninterrupted)?;
+            met(&mut waits, &mut n_met, &steps);
             printer.received(online.n_observed());
             print(printer, &steps)?;
         }
@@ -186,8 +219,17 @@ impl Stream {
             request.insert("lookahead", DEFAULT_LOOKAHEAD.document());
         }
         request.set_some("--lookahead", "lookahead", self.lookahead.map(Lookahead::document))?;
+        request.set_some("--lookahead-ms", "lookahead_ms", self.lookahead_ms.map(|ms| json!(ms)))?;
         self.options.add_to(&mut request)?;
         Ok(request)
+    }
+}
+
+/// Takes note of the observations that `steps` have met.
+fn met(waits: &mut Option<Waits>, n_met: &mut u32, steps: &[CommittedStep]) {
+    *n_met = steps.last().map_or(*n_met, |last| last.step.observation + 1);
+    if let Some(waits) = waits {
+        waits.met(*n_met);
     }
 }
 

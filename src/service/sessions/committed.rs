@@ -38,6 +38,17 @@ impl CommittedSteps {
         }
     }
 
+    /// Holds the memory that was taken by `other`, which has no steps, too.
+    pub(super) fn with(mut self, other: Self) -> Self {
+        match (&mut self.held, other.held) {
+            (Some(held), Some(more)) => held.merge(more),
+            (held @ None, more) => *held = more,
+            (Some(_), None) => {}
+        }
+        self.n_bytes += other.n_bytes;
+        self
+    }
+
     /// Appends steps, whose memory was taken.
     pub(super) fn extend(&mut self, steps: Vec<CommittedStep>) {
         self.steps.extend(steps);

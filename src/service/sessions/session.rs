@@ -2,6 +2,7 @@
 
 use std::num::NonZeroU32;
 use std::sync::Arc;
+use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use tokio_util::sync::CancellationToken;
@@ -9,18 +10,18 @@ use tokio_util::sync::CancellationToken;
 use super::SessionError;
 use super::committed::CommittedSteps;
 use super::ending::{Ended, conclude, take_for_end, written_bytes};
-use crate::memory::{Held, NoRoom, SMALL_BYTES};
+use super::kept::Unwritten;
+use super::left::Leaving;
+use super::waits::Waits;
+use crate::memory::Held;
 use crate::service::owners::Ownership;
 use crate::service::requests::STATES;
-use crate::service::search::take_beyond_small;
-use crate::service::{Client, Etude, PoolError, ServiceError};
-use crate::store::{AcceptedReward, NewObservations, Owner, SessionEnd, TrialRecord};
+use crate::service::{Client, Etude, ServiceError};
+use crate::store::{AcceptedReward, NewObservations, Owner, SessionEnd, StoredObservations, TrialRecord};
 use etude_core::attribute::{ByAttribute, Weights};
 use etude_core::document::{Faults, Place};
-use etude_core::interrupt::{Interrupt, Uninterrupted};
-use etude_core::mapping::{
-    Conditions, Demonstration, Mapper, OnlineMapping, Options, Policy, Stamp, Stopped, Warning, Watch,
-};
+use etude_core::interrupt::Interrupt;
+use etude_core::mapping::{Conditions, Demonstration, Mapper, OnlineMapping, Options, Policy, Stamp, Warning, Watch};
 
 /// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
 /// in the pool.
@@ -38,7 +39,14 @@ pub struct Session {
     pub(super) conditions: Conditions,
     pub(super) source: Source,
     pub(super) n_received: u32,
+    /// The same, with those that are being written.
+    pub(super) n_sent: u32,
     pub(super) n_steps: usize,
+    /// How many observations the committed steps have met.
+    pub(super) n_met: u32,
+    /// How long steps wait, where that is limited.
+    pub(super) waits: Option<Waits>,
+    pub(super) unwritten: Unwritten,
     /// `None` once the session has ended.
     pub(super) online: Option<OnlineMapping>,
     /// What was observed and can hardly be meant.
@@ -51,6 +59,8 @@ pub struct Session {
     pub(super) owner: Owner,
     /// Tells of newer owners in this process, and keeps them from coming in between.
     pub(super) ownership: Ownership,
+    /// After the ownership, so that who is told can have it.
+    pub(super) leaving: Leaving,
 }
 
 /// Where a session's weights come from.
@@ -86,6 +96,15 @@ pub enum RewardState {
     Never,
 }
 
+/// Where steps wait for so long at most, somebody must decide when nobody drives the session any more.
+impl Drop for Session {
+    fn drop(&mut self) {
+        if let Some(waits) = &self.waits {
+            self.leaving.until(waits.next(self.n_met, self.n_sent));
+        }
+    }
+}
+
 impl Session {
     /// Its id.
     #[must_use]
@@ -111,6 +130,11 @@ impl Session {
         self.mapper.model().schema().by_attribute(self.weights.as_slice().iter().copied())
     }
 
+    /// Nobody needs to decide what is due once this is dropped.
+    pub(super) fn stay(&mut self) {
+        self.waits = None;
+    }
+
     /// How many observations are durable.
     #[must_use]
     pub fn n_received(&self) -> u32 {
@@ -121,6 +145,19 @@ impl Session {
     #[must_use]
     pub fn n_steps(&self) -> usize {
         self.n_steps
+    }
+
+    /// What it is mapped by.
+    #[must_use]
+    pub fn mapper(&self) -> Arc<Mapper> {
+        Arc::clone(&self.mapper)
+    }
+
+    /// When the next step is to be [decided](Self::decide), if it waits for so long at most.
+    #[must_use]
+    pub fn due(&self) -> Option<Instant> {
+        let waits = self.waits.as_ref().filter(|_| !self.has_ended())?;
+        waits.next(self.n_met, self.n_received)
     }
 
     /// Cancelled when another connection takes the session over.
@@ -199,11 +236,21 @@ impl Session {
         let mut weights = weights.into_iter().skip(n_known);
         let observations: Vec<Observation> =
             observations.into_iter().map(|values| Observation { values, weight: weights.next().flatten() }).collect();
+        #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
+        let n_states = new.len() as u32;
+        let steps = match &self.online {
+            Some(online) if self.unwritten.are_enough(self.is_inline(1)) => {
+                Some(self.unwritten.take(online, &self.watch, self.n_received)?)
+            }
+            _ => None,
+        };
         for (index, observation) in (self.n_received as usize..).zip(&observations) {
             self.watch.observe(self.mapper.model(), index, &observation.values);
         }
-        #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
-        let n_states = new.len() as u32;
+        self.n_sent = self.n_received + n_states;
+        if let Some(waits) = &mut self.waits {
+            waits.came(self.n_received, Duration::ZERO, etude.clock.instant());
+        }
         let appending = etude.store.append_observations(NewObservations {
             session_id: self.id.clone(),
             owner: self.owner,
@@ -211,6 +258,8 @@ impl Session {
             n_states,
             states: stored_states(new, &observations).map_err(ServiceError::Write)?,
             at: now,
+            service_time: self.waits.as_ref().map(|_| etude.store.service_time(now)),
+            steps,
         });
         let mapping = async {
             if self.is_inline(observations.len()) {
@@ -222,7 +271,7 @@ impl Session {
         // In this order: the disk is at work before the mapping begins.
         let (appended, mapped) = tokio::join!(biased; appending, mapping);
         appended??;
-        self.n_received += n_states;
+        self.n_received = self.n_sent;
         mapped
     }
 
@@ -232,66 +281,9 @@ impl Session {
     }
 
     /// Whether so many observations are mapped where they arrive.
-    fn is_inline(&self, n_observations: usize) -> bool {
+    pub(super) fn is_inline(&self, n_observations: usize) -> bool {
         let graph = self.mapper.model().graph();
         is_inline(graph.n_states() + graph.n_transitions(), self.lookahead, n_observations)
-    }
-
-    /// Maps observations that were received, and gives the steps that they commit.
-    ///
-    /// # Errors
-    ///
-    /// If the service ends, or there is no memory for them; the session is then to be resumed.
-    pub async fn advance(
-        &mut self,
-        etude: &Etude,
-        observations: Vec<Observation>,
-    ) -> Result<CommittedSteps, SessionError> {
-        let online = self.online.take().ok_or(SessionError::NotOpen)?;
-        let is_inline = self.is_inline(observations.len());
-        let held_bytes = self.held.n_bytes();
-        let (mapper, memory) = (Arc::clone(&self.mapper), etude.memory.clone());
-        let job = move |interrupt: &mut dyn Interrupt| {
-            // Others find something too. What it really took is kept afterwards.
-            let wanted = if is_inline { 0 } else { u64::MAX };
-            let spare = take_beyond_small(wanted, &memory);
-            let most_bytes = held_bytes + SMALL_BYTES + spare.as_ref().map_or(0, Held::n_bytes);
-            let no_room = NoRoom { wanted: most_bytes, room: memory.room() };
-            let mut online = online.within(usize::try_from(most_bytes).unwrap_or(usize::MAX));
-            let mut steps = CommittedSteps::default();
-            for observation in &observations {
-                match online.observe(&observation.values, observation.weight, interrupt) {
-                    Ok(committed) => {
-                        if steps.take_for(committed.len(), mapper.model(), &memory).is_err() {
-                            return Ok(Err(no_room));
-                        }
-                        steps.extend(committed);
-                    }
-                    Err(Stopped::Cancelled(cancelled)) => return Err(cancelled),
-                    Err(Stopped::Memory) => return Ok(Err(no_room)),
-                }
-            }
-            Ok(Ok((online, steps)))
-        };
-        let advanced = if is_inline {
-            job(&mut Uninterrupted).map_err(|_| PoolError::Stopped)?
-        } else {
-            etude.pool.run_in_turn(self.client, job).await?
-        };
-        let (online, steps) = advanced.map_err(ServiceError::from)?;
-        self.reserve(online.size_bytes() as u64)?;
-        self.online = Some(online);
-        self.n_steps += steps.len();
-        Ok(steps)
-    }
-
-    /// Counts what the mapping takes.
-    fn reserve(&mut self, n_bytes: u64) -> Result<(), SessionError> {
-        // Most windows grow and shrink a little all the time.
-        if n_bytes < self.held.n_bytes() / 2 {
-            self.held.shrink_to(n_bytes);
-        }
-        self.held.grow_to(n_bytes).map_err(|no_room| ServiceError::from(no_room).into())
     }
 
     /// Ends the demonstration, which must have `seq` observations, and stores its policy.
@@ -309,7 +301,8 @@ impl Session {
         if seq == 0 {
             return Err(SessionError::Empty);
         }
-        let (texts, texts_held) = etude.stored_observations(&self.id, self.n_received, self.mapper.model()).await?;
+        let stored = etude.stored_observations(&self.id, 0, self.n_received, self.mapper.model());
+        let (StoredObservations { texts, .. }, texts_held) = stored.await?;
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let (mapper, wanted) = (Arc::clone(&self.mapper), (self.weights.clone(), self.conditions.clone()));
         let (id, n_committed) = (self.id.clone(), self.n_steps);
@@ -339,6 +332,7 @@ impl Session {
         let is_refined = refinement.is_some();
         let end = SessionEnd { session_id: self.id.clone(), owner: self.owner, policy: row.at(now), refinement };
         etude.store.end_session(end).await??;
+        self.stay();
         if is_refined {
             etude.refiner.wake();
         }

@@ -1,5 +1,6 @@
 //! The tables of sessions and their observations.
 
+mod reads;
 mod verbs;
 
 use std::collections::BTreeMap;
@@ -18,6 +19,7 @@ use super::trials::{NewTrial, Opened};
 use super::{Page, Store, StoreError, corrupt, timestamp};
 use etude_core::attribute::ByAttribute;
 use etude_core::mapping::Conditions;
+pub use reads::{StoredObservations, StoredSteps};
 pub(super) use verbs::SettleObservations;
 use verbs::{ExpireSessions, TakeSession, TouchSession};
 
@@ -94,6 +96,8 @@ pub struct SessionRecord {
     pub weights: ByAttribute<f64>,
     /// How many observations past the current one a decision may wait for; `None` for all.
     pub lookahead: Option<u32>,
+    /// How long a step may wait after its observation came, in milliseconds; `None`: as long as the lookahead lets it.
+    pub lookahead_ms: Option<u64>,
     /// What it may start from, what counts, and what the body lacks.
     pub conditions: Conditions,
     /// The learner whose weights are used, if any.
@@ -129,6 +133,8 @@ pub struct NewSession {
     pub weights: ByAttribute<f64>,
     /// How many observations past the current one a decision may wait for; `None` for all.
     pub lookahead: Option<u32>,
+    /// How long a step may wait after its observation came, in milliseconds; `None`: as long as the lookahead lets it.
+    pub lookahead_ms: Option<u64>,
     /// What it may start from, what counts, and what the body lacks.
     pub conditions: Conditions,
     /// The learner whose weights are used, if any.
@@ -151,6 +157,7 @@ impl NewSession {
             model_hash: "0".to_owned(),
             weights: [("x".into(), 1.0)].into_iter().collect(),
             lookahead: None,
+            lookahead_ms: None,
             conditions: Conditions::default(),
             learner: None,
             weights_version: None,
@@ -260,7 +267,9 @@ impl Store {
         every: Duration,
     ) -> Result<Vec<ExpiredSession>, StoreError> {
         let before = now.checked_sub(idle).unwrap_or(Timestamp::MIN);
-        self.writer.write(ExpireSessions { before, alive: NoteAlive { now, every } }).await
+        let (down, expired) = self.writer.write(ExpireSessions { before, alive: NoteAlive { now, every } }).await?;
+        self.note_down(down);
+        Ok(expired)
     }
 
     /// Moves the observations of all sessions from `arrivals` to their table. If nothing can be written, returns them by session instead.
@@ -315,34 +324,16 @@ impl Store {
         Ok(page)
     }
 
-    /// How many bytes the observations of a session are, as [`Self::observations`] gives them.
+    /// The ids of open sessions in which steps wait for so long at most, in the order in which they were opened.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn observations_bytes(&self, session_id: &str) -> Result<u64, StoreError> {
-        let arrived = self.settle().await?;
-        let query =
-            sqlx::query_scalar("SELECT IFNULL(SUM(octet_length(states)), 0) FROM observations WHERE session_id = $1");
-        let stored: i64 = query.bind(session_id).fetch_one(&mut *self.reader().await?).await?;
-        let new = arrived.get(session_id).map_or(0, |new| new.states.len());
-        Ok(stored.unsigned_abs() + new as u64)
-    }
-
-    /// The observations of a session, in order: JSON arrays of states.
-    ///
-    /// # Errors
-    ///
-    /// If the database failed.
-    pub async fn observations(&self, session_id: &str) -> Result<Vec<String>, StoreError> {
-        let mut arrived = self.settle().await?;
-        let query =
-            sqlx::query_as("SELECT seq + n_states, states FROM observations WHERE session_id = $1 ORDER BY seq");
-        let stored: Vec<(i64, String)> = query.bind(session_id).fetch_all(&mut *self.reader().await?).await?;
-        let n_stored = stored.last().map_or(0, |(end, _)| *end);
-        // What was settled since it was read is stored already.
-        let new = arrived.remove(session_id).filter(|new| i64::from(new.seq) == n_stored);
-        Ok(stored.into_iter().map(|(_, states)| states).chain(new.map(|new| new.states)).collect())
+    pub async fn timed_sessions(&self) -> Result<Vec<String>, StoreError> {
+        let query = sqlx::query_scalar(
+            "SELECT id FROM sessions WHERE status = 'open' AND lookahead_ms IS NOT NULL ORDER BY sequence",
+        );
+        Ok(query.fetch_all(&mut *self.reader().await?).await?)
     }
 }
 
@@ -364,6 +355,7 @@ fn read_session(row: &SqliteRow) -> Result<SessionRecord, StoreError> {
         let count: Option<i64> = row.try_get(column)?;
         count.map(u32::try_from).transpose().map_err(corrupt(TABLE, column))
     };
+    let milliseconds: Option<i64> = row.try_get("lookahead_ms")?;
     let status: &str = row.try_get("status")?;
     Ok(SessionRecord {
         sequence: row.try_get("sequence")?,
@@ -372,6 +364,7 @@ fn read_session(row: &SqliteRow) -> Result<SessionRecord, StoreError> {
         model_hash: row.try_get("model_hash")?,
         weights: serde_json::from_str(row.try_get("weights")?).map_err(corrupt(TABLE, "weights"))?,
         lookahead: count("lookahead")?,
+        lookahead_ms: milliseconds.map(u64::try_from).transpose().map_err(corrupt(TABLE, "lookahead_ms"))?,
         conditions: serde_json::from_str(row.try_get("conditions")?).map_err(corrupt(TABLE, "conditions"))?,
         learner: row.try_get("learner")?,
         weights_version: count("weights_version")?.map(u64::from),

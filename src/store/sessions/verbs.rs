@@ -5,7 +5,7 @@ use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
 use super::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, Taken, read_session};
-use crate::store::alive::{self, NoteAlive};
+use crate::store::alive::{self, Down, NoteAlive};
 use crate::store::observations::{Owner, SessionRefusal};
 use crate::store::policies::{NewPolicy, NewRefinement};
 use crate::store::trials::{self, Opened};
@@ -138,14 +138,14 @@ impl Verb for SessionEnd {
 }
 
 impl Verb for ExpireSessions {
-    type Answer = Vec<ExpiredSession>;
+    type Answer = (Down, Vec<ExpiredSession>);
 
     const READS_OBSERVATIONS: bool = true;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Vec<ExpiredSession>, StoreError> {
-        alive::note(writing, self.alive).await?;
+    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(Down, Vec<ExpiredSession>), StoreError> {
+        let down = alive::note(writing, self.alive).await?;
         writing.known.arrivals.expired();
-        expire(writing.connection, self.before).await
+        Ok((down, expire(writing.connection, self.before).await?))
     }
 }
 
@@ -161,8 +161,8 @@ async fn insert(connection: &mut SqliteConnection, session: &NewSession) -> Resu
     sqlx::query(
         "INSERT INTO sessions
              (id, model, model_hash, weights, lookahead, conditions, learner, weights_version, trial_id,
-              status, owner, n_observations, created_at_ms, active_at_ms)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', $11, 0, $10, $10)",
+              status, owner, n_observations, created_at_ms, active_at_ms, lookahead_ms)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', $11, 0, $10, $10, $12)",
     )
     .bind(&session.id)
     .bind(&session.model)
@@ -175,6 +175,7 @@ async fn insert(connection: &mut SqliteConnection, session: &NewSession) -> Resu
     .bind(session.trial.as_ref().map(|trial| &trial.id))
     .bind(created_at_ms)
     .bind(Owner::FIRST.0)
+    .bind(session.lookahead_ms.map(as_integer))
     .execute(connection)
     .await?;
     Ok(())
@@ -200,10 +201,13 @@ async fn expire(connection: &mut SqliteConnection, before: Timestamp) -> Result<
     }
     let ids: Vec<&str> = expired.iter().map(|session| session.id.as_str()).collect();
     let ids = serde_json::to_string(&ids).map_err(corrupt("sessions", "id"))?;
-    sqlx::query("DELETE FROM observations WHERE session_id IN (SELECT value FROM json_each($1))")
-        .bind(&ids)
-        .execute(&mut *connection)
-        .await?;
+    for query in [
+        "DELETE FROM observations WHERE session_id IN (SELECT value FROM json_each($1))",
+        "DELETE FROM steps WHERE session_id IN (SELECT value FROM json_each($1))",
+        "DELETE FROM roots WHERE session_id IN (SELECT value FROM json_each($1))",
+    ] {
+        sqlx::query(query).bind(&ids).execute(&mut *connection).await?;
+    }
     sqlx::query("UPDATE sessions SET status = 'expired' WHERE id IN (SELECT value FROM json_each($1))")
         .bind(&ids)
         .execute(connection)

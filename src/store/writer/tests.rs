@@ -111,7 +111,16 @@ async fn what_an_owner_still_has_in_line_is_refused_once_another_has_resumed_the
     let at = Timestamp::UNIX_EPOCH;
     let new = |owner| {
         let states = states.clone();
-        NewObservations { session_id: "s".to_owned(), owner, seq: 0, n_states: 1, states, at }
+        NewObservations {
+            session_id: "s".to_owned(),
+            owner,
+            seq: 0,
+            n_states: 1,
+            states,
+            at,
+            service_time: None,
+            steps: None,
+        }
     };
     let mut late = Box::pin(store.append_observations(new(Owner::FIRST)));
     assert!(poll!(&mut late).is_pending(), "it is behind what is large");
@@ -134,7 +143,16 @@ async fn an_owner_that_another_process_has_superseded_adds_and_ends_nothing() {
     let at = Timestamp::UNIX_EPOCH;
     let new = |owner, seq| {
         let states = "[1]".to_owned();
-        NewObservations { session_id: "s".to_owned(), owner, seq, n_states: 1, states, at }
+        NewObservations {
+            session_id: "s".to_owned(),
+            owner,
+            seq,
+            n_states: 1,
+            states,
+            at,
+            service_time: None,
+            steps: None,
+        }
     };
     assert_eq!(stores[0].append_observations(new(Owner::FIRST, 0)).await.unwrap(), Ok(()));
     let Taken::Open(taken) = stores[1].take_session("s", at).await.unwrap() else { panic!("it is open") };

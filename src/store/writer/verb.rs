@@ -60,7 +60,7 @@ pub(super) enum Job {
 impl Job {
     pub(super) fn n_bytes(&self) -> usize {
         match self {
-            Self::Observations(asked) => asked.request.states.len(),
+            Self::Observations(asked) => asked.request.n_bytes(),
             Self::Policies(asked) => asked.request.n_bytes(),
             Self::Reward(_) => 0,
             Self::Other(verb) => verb.n_bytes(),

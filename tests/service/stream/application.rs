@@ -1,6 +1,7 @@
 //! The protocol without a connection: the application alone, asked as a transport asks it.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use etude::clock::{Clock, Ids};
 use etude::service::{Caller, Etude};
@@ -22,13 +23,15 @@ const CLIENT: etude::service::Client = etude::service::Client::LOCAL;
 
 /// The application that was a service, without the service.
 async fn without_service(service: Service, abort: &CancellationToken) -> (Etude, TempDir) {
+    by_clock(service, abort, Clock::system()).await
+}
+
+/// The same, by another clock.
+async fn by_clock(service: Service, abort: &CancellationToken, clock: Clock) -> (Etude, TempDir) {
     let directory = service.stop().await;
     let database = directory.path().join("etude.db");
     let flags = flags(&["--database", database.to_str().unwrap()]);
-    (
-        Etude::open(&flags.settings(Clock::system(), Ids::random()), &TaskTracker::new(), abort.clone()).await.unwrap(),
-        directory,
-    )
+    (Etude::open(&flags.settings(clock, Ids::random()), &TaskTracker::new(), abort.clone()).await.unwrap(), directory)
 }
 
 #[tokio::test]
@@ -178,6 +181,34 @@ async fn a_session_whose_policy_is_too_large_says_so_and_can_still_be_read() {
     let mut again = Wire::connect(&etude, &stopping);
     again.send(json!({"type": "resume", "session": id, "step": 1_000_000})).await;
     assert_eq!(again.receive_until("opened").await["received"], 200);
+    etude.close().await;
+}
+
+#[tokio::test]
+async fn a_step_that_is_due_comes_while_the_client_is_silent_and_is_on_disk_before() {
+    let (service, demonstration) = figure_4().await;
+    let (clock, stopping) = (Clock::stepped(Timestamp::UNIX_EPOCH), CancellationToken::new());
+    let (etude, _directory) = by_clock(service, &stopping, clock.clone()).await;
+    let etude = Arc::new(etude);
+    let mut wire = Wire::connect(&etude, &stopping);
+    wire.send(json!({"type": "open", "model": "figure-4", "lookahead": null, "lookahead_ms": 200})).await;
+    let session = wire.receive_until("opened").await["session"].take();
+    wire.send(json!({"type": "observe", "seq": 0, "states": demonstration[..3]})).await;
+    assert_eq!(wire.receive_until("step").await["proven"], true, "the start");
+    clock.step(Duration::from_millis(200));
+    let mut steps = vec![wire.receive_until("step").await];
+    while steps.last().unwrap()["observation"] != 2 {
+        steps.push(wire.receive_until("step").await);
+    }
+    assert!(steps.iter().all(|step| step["after"] == 3), "{steps:?}");
+    // It is still read from, and goes on.
+    wire.send(json!({"type": "observe", "seq": 3, "states": demonstration[3..4]})).await;
+    assert_eq!(wire.receive_until("received").await["seq"], 4);
+    let mut again = Wire::connect(&etude, &stopping);
+    again.send(json!({"type": "resume", "session": session, "step": 1})).await;
+    for step in &steps {
+        assert_eq!(again.receive_until("step").await, *step);
+    }
     etude.close().await;
 }
 

@@ -79,6 +79,35 @@ async fn a_demonstration_is_followed_while_it_runs() {
 }
 
 #[tokio::test]
+async fn a_step_may_wait_for_some_time_only() {
+    let (service, demonstration) = figure_4().await;
+    for wrong in [json!(0), json!(-1), json!(1.5), json!("100"), json!(true)] {
+        let mut client = Client::connect(&service).await;
+        client.send(json!({"type": "open", "model": "figure-4", "lookahead_ms": wrong})).await;
+        let problem = client.receive_until_error().await["problem"].take();
+        assert_eq!(
+            (&problem["type"], &problem["errors"][0]["pointer"]),
+            (&json!("/problems/invalid"), &json!("/lookahead_ms"))
+        );
+    }
+    let mut client = Client::connect(&service).await;
+    let open = json!({"type": "open", "model": "figure-4", "lookahead": null, "lookahead_ms": 1});
+    let session = client.open(open).await;
+    client.send(json!({"type": "observe", "seq": 0, "states": demonstration[..4]})).await;
+    // Nothing is sent meanwhile.
+    while client.receive_until("step").await.last().unwrap()["observation"] != 3 {}
+    client.send(json!({"type": "end", "seq": 4})).await;
+    let done = client.receive_until("done").await.pop().unwrap();
+    assert_eq!(done["status"], "local", "time has decided");
+    let (_, session) = service.get(&format!("/v1/sessions/{session}")).await;
+    assert_eq!((&session["lookahead"], &session["lookahead_ms"]), (&json!(null), &json!(1)));
+    let mut plain = Client::connect(&service).await;
+    let session = plain.open(json!({"type": "open", "model": "figure-4", "lookahead_ms": null})).await;
+    let (_, session) = service.get(&format!("/v1/sessions/{session}")).await;
+    assert_eq!((&session["lookahead"], &session["lookahead_ms"]), (&json!(8), &json!(null)));
+}
+
+#[tokio::test]
 async fn a_local_policy_is_refined_after_the_stream() {
     let (service, demonstration) = figure_4().await;
     let mut client = Client::connect(&service).await;

@@ -1,6 +1,7 @@
 use serde_json::{Value, json};
 
 use super::*;
+use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Definition, Limits, Model};
 
 #[test]
