@@ -35,7 +35,7 @@
 //! | `search::best_first` | default heuristic, in all other problems, also where states are found as it goes; and no heuristic, where it has no estimates | it looks at a small part of the nodes |
 //! | `search::sweep` | best first has expanded 65,536 nodes, or one in 16 if that is more, or memory is used up; all states are known | it takes a sixteenth of the time for a node and two bytes of memory |
 //! | `search::astar` | the paper's heuristic | that one is not consistent, and which of its mappings is found is part of what is reproduced |
-//! | `online` | a lookahead, or the demonstration is still running | layers of all states, of which a lookahead needs the last few only |
+//! | `online` | a lookahead, or the demonstration is still running | with a lookahead, one of the above for each window; else, and where windows are small, layers of all states |
 //! | `completion` | a budget ran out before the last observation | there is always an answer |
 //!
 //! Best first begins with those tables of estimates alone that are small, and makes the others once it has expanded a sixteenth of

@@ -4,9 +4,9 @@ use std::num::NonZeroU32;
 use std::sync::Arc;
 use std::time::Duration;
 
+use super::online::Halt;
 use super::{
-    Budget, Demonstration, Mapper, Mapping, Move, MoveKind, OnlineMapping, Options, Policy, Problem, RequestKind,
-    Settings, Stopped, StoppedBy,
+    Budget, Demonstration, Mapper, Mapping, OnlineMapping, Options, Policy, Problem, RequestKind, Settings, StoppedBy,
 };
 use crate::attribute::Weights;
 use crate::document::{Faults, Object};
@@ -90,34 +90,26 @@ impl<'m> Request<'m> {
             return mapper.map(problem, self.settings, interrupt);
         }
         let (weights, conditions) = (problem.weights.clone(), problem.conditions.clone());
-        let max_bytes = self.settings.budget.max_bytes;
-        let mut online = OnlineMapping::new(mapper, weights, conditions, self.lookahead).within(max_bytes);
+        let online = OnlineMapping::new(mapper, weights, conditions, self.lookahead);
+        let mut online = online.spending(self.settings.budget);
         for observation in problem.demonstration.iter() {
-            let n_expanded = online.n_expanded().saturating_add(online.next_expanded());
-            let is_spent = n_expanded > self.settings.budget.max_expansions;
-            let signal = if is_spent { Signal::Finish } else { interrupt.poll() };
-            let mut is_over = false;
-            let mut until_over = || match interrupt.poll() {
-                Signal::Finish => {
-                    is_over = true;
-                    Signal::Cancel
+            let taken = match interrupt.poll() {
+                Signal::Continue => online.take(observation, None, interrupt),
+                Signal::Finish => Err(Halt::OutOf(StoppedBy::Deadline)),
+                Signal::Cancel => Err(Halt::Cancelled),
+            };
+            match taken {
+                Ok(_) => {}
+                Err(Halt::Cancelled) => return Err(Cancelled),
+                Err(Halt::OutOf(stopped_by)) => {
+                    let (n_expanded, n_generated) = online.n_looked_at();
+                    let (moves, states) = online.into_moves();
+                    let mapping = mapper.complete(problem, moves, states.as_ref(), stopped_by, interrupt)?;
+                    return Ok(Mapping { n_expanded, n_generated, ..mapping });
                 }
-                signal => signal,
-            };
-            let stopped_by = match signal {
-                Signal::Cancel => return Err(Cancelled),
-                Signal::Finish if is_spent => StoppedBy::MaxExpansions,
-                Signal::Finish => StoppedBy::Deadline,
-                Signal::Continue => match online.observe(observation, None, &mut until_over) {
-                    Ok(_) => continue,
-                    Err(Stopped::Cancelled(_)) if is_over => StoppedBy::Deadline,
-                    Err(Stopped::Cancelled(cancelled)) => return Err(cancelled),
-                    Err(Stopped::Memory) => StoppedBy::Memory,
-                },
-            };
-            let spent = (online.n_expanded(), online.n_generated());
-            return self.complete(mapper, online.into_moves(), stopped_by, spent, interrupt);
+            }
         }
+        online.find_rest(interrupt)?;
         let (_, mapping) = online.end().expect("a demonstration is never empty");
         Ok(mapping)
     }
@@ -131,34 +123,9 @@ impl<'m> Request<'m> {
     #[must_use]
     pub fn search_bytes(&self, mapper: &Mapper) -> usize {
         let Self { problem, settings, lookahead, .. } = self;
-        let n_observations = problem.demonstration.len();
         match lookahead {
             None => mapper.search_bytes(problem, *settings),
-            Some(_) => {
-                OnlineMapping::most_bytes(mapper.model(), *lookahead, n_observations).min(settings.budget.max_bytes)
-            }
+            Some(_) => OnlineMapping::most_bytes(mapper, problem, *lookahead).min(settings.budget.max_bytes),
         }
-    }
-
-    /// A mapping that begins with `moves`, for which so many nodes and transitions were looked at, and goes on greedily, as `stopped_by`
-    /// ran out.
-    fn complete(
-        &self,
-        mapper: &Mapper,
-        mut moves: Vec<Move>,
-        stopped_by: StoppedBy,
-        (n_expanded, n_generated): (u64, u64),
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<Mapping, Cancelled> {
-        if moves.is_empty() {
-            moves.push(Move {
-                kind: MoveKind::Start,
-                action: None,
-                observation: 0,
-                state: self.problem.closest_start(),
-            });
-        }
-        let mapping = mapper.complete(&self.problem, moves, stopped_by, interrupt)?;
-        Ok(Mapping { n_expanded, n_generated, ..mapping })
     }
 }

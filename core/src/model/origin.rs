@@ -162,6 +162,14 @@ impl Model {
         row
     }
 
+    /// Whether there is a state with this row, in a model that is searched lazily.
+    pub(crate) fn has_row(&self, row: &[u32]) -> bool {
+        let is_row = row.len() == self.schema.len()
+            && row.iter().enumerate().all(|(at, value)| (*value as usize) < self.states.domain(at).len());
+        let known: Vec<Option<u32>> = row.iter().copied().map(Some).collect();
+        is_row && self.unexplored.as_ref().is_some_and(|unexplored| unexplored.complete_row(&known).is_some())
+    }
+
     /// Where these values stand in their domains; `None` if one of them does not.
     fn row_of(&self, wanted: &[Option<Value>]) -> Option<Vec<Option<u32>>> {
         let index = |(at, wanted): (usize, &Option<Value>)| {

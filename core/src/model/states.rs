@@ -36,13 +36,13 @@ impl States {
     }
 
     /// Adds a state, by its row.
-    pub(super) fn push(&mut self, row: impl Iterator<Item = u32>) {
+    pub(crate) fn push(&mut self, row: impl Iterator<Item = u32>) {
         self.rows.extend(row);
         debug_assert!(self.rows.len().is_multiple_of(self.domains.len()), "a whole row");
     }
 
     /// The states `kept`, numbered in this order.
-    pub(super) fn keep(&self, kept: &[StateIdx]) -> Self {
+    pub(crate) fn keep(&self, kept: &[StateIdx]) -> Self {
         let rows = kept.iter().flat_map(|state| self.row(*state)).copied().collect();
         Self::new(self.domains.clone(), rows)
     }

@@ -7,6 +7,7 @@
     reason = "tests may panic, and are read top to bottom"
 )]
 
+mod cases;
 mod compiling;
 mod conditions;
 mod implicit;

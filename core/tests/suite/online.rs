@@ -1,42 +1,21 @@
 //! The mapping in the making, against its definition.
 
-use std::num::NonZeroU32;
 use std::sync::Arc;
 
+use crate::cases::{Case, begun, case, observations};
 use crate::oracle;
-use crate::problems::{close, example, mapper, problem};
-use etude_core::attribute::Weights;
+use crate::problems::{close, example, mapper};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
 use etude_core::mapping::{
-    CommittedMove, CommittedStep, Conditions, Mapper, Mapping, OnlineMapping, Options, Policy, Request, Root, Stamp,
-    Status, StoppedBy,
+    CommittedMove, CommittedStep, Conditions, Mapper, Mapping, OnlineMapping, Policy, Request, Root, Stamp, Status,
+    StoppedBy,
 };
 use proptest::prelude::*;
 use serde_json::{Value, json};
 
-/// The weights and conditions of a request.
-fn conditions(mapper: &Mapper, request: &Value) -> (Weights, Conditions) {
-    let mut faults = Faults::default();
-    let object = Place::root(request).object(Request::FIELDS, &mut faults).unwrap();
-    let options = Options::read(&object, mapper.model(), &Options::default(), &mut faults);
-    let options = faults.check(options).unwrap();
-    (options.weights_over(mapper.model().schema().weights()), options.conditions())
-}
-
-/// The observations of a request.
-fn observations(mapper: &Mapper, request: &Value) -> Vec<Vec<Option<etude_core::attribute::Value>>> {
-    let read = |observation: &Value| {
-        let place = Place::root(observation);
-        mapper.model().schema().read_observation(&place, &mut Faults::default()).unwrap()
-    };
-    request["demonstration"].as_array().unwrap().iter().map(read).collect()
-}
-
 /// Feeds the demonstration of a request, and gives what was committed and the mapping.
-fn follow(mapper: &Arc<Mapper>, request: &Value, lookahead: Option<u32>) -> (Vec<CommittedStep>, Mapping) {
-    let (weights, conditions) = conditions(mapper, request);
-    let mut online = OnlineMapping::new(mapper, weights, conditions, lookahead.and_then(NonZeroU32::new));
+fn follow(mapper: &Mapper, mut online: OnlineMapping, request: &Value) -> (Vec<CommittedStep>, Mapping) {
     let mut committed = Vec::new();
     for observation in observations(mapper, request) {
         committed.extend(online.observe(&observation, None, &mut Uninterrupted).unwrap());
@@ -44,11 +23,6 @@ fn follow(mapper: &Arc<Mapper>, request: &Value, lookahead: Option<u32>) -> (Vec
     let (rest, mapping) = online.end().unwrap();
     committed.extend(rest);
     (committed, mapping)
-}
-
-/// The node that a step ends at.
-fn node(step: &CommittedStep) -> (usize, usize) {
-    (step.step.observation as usize, step.step.state_index as usize)
 }
 
 /// The same request with a demonstration that begins with the first `n` observations and goes on otherwise.
@@ -67,45 +41,28 @@ fn another_end(request: &Value, n: usize, turn: usize) -> Value {
     request
 }
 
-/// States on a line, and longer demonstrations: often few of the states lose their ways by what is decided.
-fn line() -> impl Strategy<Value = (Value, Value)> {
-    let states = prop::collection::vec((0..12_u32, 0..3_u32), 5..25);
-    let transitions = prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..70);
-    let seen = prop::collection::vec((0..12_u32, prop::option::weighted(0.7, 0..3_u32)), 5..25);
-    let costs = prop_oneof![Just([0.0, 0.5, 2.0]), Just([0.3, 0.7, 1.1])];
-    (states, transitions, seen, costs).prop_map(|(states, mut transitions, seen, costs)| {
-        for (from, _, to) in &mut transitions {
-            (*from, *to) = (*from % states.len(), *to % states.len());
-        }
-        transitions.sort_unstable();
-        transitions.dedup_by_key(|(from, action, _)| (*from, *action));
-        let model = json!({
-            "attributes": [{"name": "x", "kind": "number"}, {"name": "c", "kind": "category", "weight": 0.3}],
-            "actions": costs.iter().enumerate().map(|(n, cost)| json!({"name": format!("a{n}"), "cost": cost})).collect::<Value>(),
-            "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0, "unsafe": []},
-        });
-        (model, json!({"model": "m", "demonstration": seen, "weights": {}}))
-    })
-}
-
 proptest! {
     #![proptest_config(ProptestConfig { cases: 1500, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn every_commit_is_what_the_definition_says(
-        (model, request) in prop_oneof![problem(), line()],
+        case in case(),
         lookahead in prop::option::weighted(0.8, 1u32..6),
+        searches in any::<bool>(),
         turn in 0usize..8,
     ) {
-        let mapper = Arc::new(mapper(&model));
-        let (committed, mapping) = follow(&mapper, &request, lookahead);
+        let mapper = case.mapper();
+        let lookahead = lookahead.or(case.lazy.is_some().then_some(3));
+        let (committed, mapping) = follow(&mapper, case.begun(&mapper, lookahead, searches), &case.request);
+        let Case { model, request, .. } = &case;
+        let node = |step: &CommittedStep| case.node(step);
         let n = request["demonstration"].as_array().unwrap().len() - 1;
-        let starts = oracle::starts(&model, &request);
+        let starts = oracle::starts(model, request);
         let step_cost = |step: &CommittedStep| step.step.action_cost + step.step.distance;
         // What it costs at least to come to the observation `to` from a node, or from before the start.
         let to_go = |request: &Value, from: Option<(usize, usize)>, to: usize, ends: bool| match from {
-            Some(node) => oracle::cost_to_go(&model, request, node, to, ends),
-            None => oracle::cost_from(&model, request, &starts, to, ends),
+            Some(node) => oracle::cost_to_go(model, request, node, to, ends),
+            None => oracle::cost_from(model, request, &starts, to, ends),
         };
 
         // A run of forced steps, up to the one that advances, is decided at once.
@@ -120,8 +77,8 @@ proptest! {
             let window = |lookahead: u32| from.map_or(0, |(i, _)| i + 1) + lookahead as usize - 1;
             if committed[index].is_proven {
                 // Whatever is still to come: this end of the demonstration, and, unless it had ended, another.
-                let other = (after <= n).then(|| another_end(&request, after, turn));
-                for request in [Some(&request), other.as_ref()].into_iter().flatten() {
+                let other = (after <= n).then(|| another_end(request, after, turn));
+                for request in [Some(request), other.as_ref()].into_iter().flatten() {
                     let last = request["demonstration"].as_array().unwrap().len() - 1;
                     let best = to_go(request, from, last, true);
                     let taken = cost + to_go(request, Some(node(&committed[index])), last, true);
@@ -136,8 +93,8 @@ proptest! {
                 }
                 let window = window(lookahead.unwrap());
                 prop_assert_eq!(after, window + 1, "decided when the lookahead was used up, not before and not after");
-                let best = to_go(&request, from, window, false);
-                let taken = cost + to_go(&request, Some(node(&committed[end])), window, false);
+                let best = to_go(request, from, window, false);
+                let taken = cost + to_go(request, Some(node(&committed[end])), window, false);
                 prop_assert!(close(best, taken), "steps {index}..={end}: {taken} where {best} was possible");
             }
             // Never later than the lookahead allows.
@@ -147,7 +104,7 @@ proptest! {
         }
 
         prop_assert_eq!(mapping.status, if is_forced_once { Status::Local } else { Status::Optimal });
-        let optimum = oracle::optimal_cost(&model, &request);
+        let optimum = oracle::optimal_cost(model, request);
         if mapping.status == Status::Optimal {
             prop_assert!(close(mapping.cost.total, optimum), "{} against {optimum}", mapping.cost.total);
             prop_assert_eq!(mapping.lower_bound, Some(mapping.cost.total));
@@ -163,23 +120,24 @@ proptest! {
 
     #[test]
     fn a_step_whose_time_is_up_is_the_first_of_the_cheapest_way_to_what_has_come(
-        (model, request) in prop_oneof![problem(), line()],
+        case in case(),
         lookahead in prop::option::weighted(0.5, 1u32..6),
+        searches in any::<bool>(),
         times in prop::collection::vec(0..3_u32, 25),
     ) {
-        let mapper = mapper(&model);
-        let (weights, conditions) = conditions(&mapper, &request);
-        let lookahead = lookahead.and_then(NonZeroU32::new);
-        let mut online = OnlineMapping::new(&mapper, weights, conditions, lookahead);
-        let starts = oracle::starts(&model, &request);
+        let mapper = case.mapper();
+        let mut online = case.begun(&mapper, lookahead, searches);
+        let Case { model, request, .. } = &case;
+        let node = |step: &CommittedStep| case.node(step);
+        let starts = oracle::starts(model, request);
         let to_go = |from: Option<(usize, usize)>, to: usize| match from {
-            Some(node) => oracle::cost_to_go(&model, &request, node, to, false),
-            None => oracle::cost_from(&model, &request, &starts, to, false),
+            Some(node) => oracle::cost_to_go(model, request, node, to, false),
+            None => oracle::cost_from(model, request, &starts, to, false),
         };
         prop_assert_eq!(online.decide(&mut Uninterrupted).unwrap(), []);
         let mut at = None;
         let mut is_forced_once = false;
-        for (i, (observation, n_up)) in observations(&mapper, &request).into_iter().zip(times).enumerate() {
+        for (i, (observation, n_up)) in observations(&mapper, request).into_iter().zip(times).enumerate() {
             let observed = online.observe(&observation, None, &mut Uninterrupted).unwrap();
             is_forced_once |= observed.iter().any(|step| !step.is_proven);
             at = observed.last().map(node).or(at);
@@ -204,15 +162,14 @@ proptest! {
 
     #[test]
     fn a_mapping_that_goes_on_from_its_root_gives_what_the_unbroken_one_gives(
-        (model, request) in prop_oneof![problem(), line()],
+        case in case(),
         lookahead in prop::option::weighted(0.8, 1u32..6),
+        searches in any::<bool>(),
         times in prop::collection::vec(prop::bool::weighted(0.3), 25),
         (kept, broken) in (0_usize..25, 0_usize..25),
     ) {
-        let mapper = mapper(&model);
-        let (weights, conditions) = conditions(&mapper, &request);
-        let lookahead = lookahead.and_then(NonZeroU32::new);
-        let observations = observations(&mapper, &request);
+        let mapper = case.mapper();
+        let observations = observations(&mapper, &case.request);
         let take = |online: &mut OnlineMapping, i: usize| {
             let mut steps = online.observe(&observations[i], None, &mut Uninterrupted).unwrap();
             if times[i] {
@@ -220,7 +177,8 @@ proptest! {
             }
             steps
         };
-        let mut unbroken = OnlineMapping::new(&mapper, weights.clone(), conditions.clone(), lookahead);
+        let new = || case.begun(&mapper, lookahead, searches);
+        let mut unbroken = new();
         // The root is kept once so many observations have come, and others come after it.
         let (kept, broken) = (kept.min(broken) % observations.len(), kept.max(broken) % observations.len());
         (0..kept).for_each(|i| drop(take(&mut unbroken, i)));
@@ -229,11 +187,9 @@ proptest! {
         prop_assert_eq!(root, unbroken.root());
         prop_assert_eq!(root.n_steps(), unbroken.n_steps());
 
-        let moves_before = moves.iter().copied().take(moves.len().saturating_sub(1));
-        let missing = OnlineMapping::resume(&mapper, weights.clone(), conditions.clone(), lookahead, &root, moves_before);
-        prop_assert_eq!(missing.is_some(), moves.is_empty());
-        let resumed = OnlineMapping::resume(&mapper, weights, conditions, lookahead, &root, moves);
-        let mut resumed = resumed.unwrap();
+        let moves_before = moves.iter().take(moves.len().saturating_sub(1)).cloned();
+        prop_assert_eq!(new().resumed(&root, moves_before).is_some(), moves.is_empty());
+        let mut resumed = new().resumed(&root, moves).unwrap();
         prop_assert_eq!(resumed.root(), root);
         prop_assert_eq!(resumed.n_observed(), root.first_observation());
         for observation in &observations[root.first_observation() as usize..kept] {
@@ -257,7 +213,7 @@ fn figure_4_reaches_its_optimum_with_a_lookahead_of_8_and_commits_early_without(
     let mapper = Arc::new(mapper(&example("figure-4/model.json")));
     let demonstration = example("figure-4/demonstration.json");
     let request = json!({"model": "m", "demonstration": demonstration});
-    let total = |lookahead| follow(&mapper, &request, lookahead).1.cost.total;
+    let total = |lookahead| follow(&mapper, begun(&mapper, &request, lookahead, false), &request).1.cost.total;
     assert_eq!(total(None), 48.2);
     assert_eq!(total(Some(16)), 48.2);
     assert!(total(Some(8)) <= 48.2 * 1.01, "{}", total(Some(8)));

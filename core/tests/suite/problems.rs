@@ -69,7 +69,7 @@ fn value(attribute: &Value, n: usize) -> Value {
 
 /// Where a request may say that the imitator starts, what counts, and what the body lacks; often the defaults. By numbers that are made to
 /// fit.
-fn conditions() -> impl Strategy<Value = Value> {
+pub(crate) fn conditions() -> impl Strategy<Value = Value> {
     let weight = || prop_oneof![2 => Just(1.0), 1 => Just(0.0), 1 => 0.0..3.0];
     (
         prop::option::weighted(0.3, prop::collection::vec(0usize..100, 1..4)),

@@ -2,6 +2,7 @@
 
 mod buffers;
 mod by_default;
+mod online;
 mod search_bytes;
 
 use std::any::Any;
@@ -271,31 +272,6 @@ impl Mapper {
 
     fn check(&self, problem: &Problem<'_>) {
         assert!(std::ptr::eq(problem.model, &raw const *self.model), "the problem must be of this mapper's model");
-    }
-
-    /// A mapping of `problem` that begins with `moves` and goes on greedily, as `stopped_by` ran out; of whole states, as for a
-    /// lookahead. Nothing is proven of it.
-    ///
-    /// # Errors
-    ///
-    /// [`Cancelled`] if `interrupt` said so.
-    pub(in crate::mapping) fn complete(
-        &self,
-        problem: &Problem<'_>,
-        moves: Vec<Move>,
-        stopped_by: StoppedBy,
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<Mapping, Cancelled> {
-        let found = Found {
-            paths: vec![moves],
-            is_complete: false,
-            stopped_by: Some(stopped_by),
-            least_f: 0.0,
-            n_expanded: 0,
-            n_generated: 0,
-        };
-        let mapping = conclude(problem, &mut self.model.whole(), &Projected::blind(problem), found, interrupt)?;
-        Ok(Mapping { status: Status::Local, lower_bound: None, stopped_by: Some(stopped_by), ..mapping })
     }
 }
 

@@ -1,98 +1,64 @@
-//! The mapping while the demonstration is still running: observations in, one by one, committed steps out. What is told here of
-//! windows, memory and ties holds for all files of this folder.
+//! The mapping while the demonstration is still running: observations in, one by one, committed steps out.
 //!
-//! Of every state, the cheapest way from the last committed node, the *root*, to that state at the newest observation is known;
-//! these ways form a tree whose leaves are the *survivors*. A new observation adds a layer to the tree, from the layer before it
-//! alone; branches that no survivor hangs on die. Work for an observation is `O(|E| + |V| log |V|)`, at most `H` times that where
-//! a lookahead of `H` decides, however many observations came before.
+//! From the last committed node, the *root*, cheapest ways lead through the observations that have come since. What is committed is final:
 //!
-//! ```text
-//!  committed          tree                   newest layer
-//!  o---o---o ----+---o---o---+---o---o
-//!          root  |           +---o---o   survivors: every state that can be reached
-//!                +---o-------+---o---o
-//! ```
-//!
-//! What is committed is final:
-//!
-//! - a step that all survivors share is *proven*: whatever is still to come, the cheapest mapping that begins with the
+//! - a step that the cheapest ways to all states share is *proven*: whatever is still to come, the cheapest mapping that begins with the
 //!   steps committed before it goes on with this one, or with one of equal cost;
-//! - where there are several start states, the tree hangs on a root before all of them, from which each is reached for nothing: a start is
-//!   committed as a move from there is;
 //! - with a lookahead of H, once the observation H past the root's has come, the cheapest way to it decides: it is
-//!   committed up to its first move that advances, and the ways that do not begin so are given up: the (at most H) layers after the
-//!   new root are swept again. So it is where the caller says that the time for a step is up ([`OnlineMapping::decide`]), whatever has
-//!   come by then.
+//!   committed up to its first move that advances. So it is where the caller says that the time for a step is up
+//!   ([`OnlineMapping::decide`]), whatever has come by then. With several start states, the start is a move that advances, from before the
+//!   first observation;
+//! - at the end, the cheapest way to it, what ending costs included.
 //!
-//! Hence all that is still to be committed follows from the root and the observations from its own on, and a mapping can go on from there
-//! after a restart ([`OnlineMapping::resume`]): with the same steps, to the bit.
+//! How the ways are found is [`Ahead`]'s:
 //!
-//! **What can be left out.** Nothing is known of what is to come, so no survivor is ruled out by its cost: an observation may
-//! still come that only it is close to. What rules one out for good is that another reaches it as cheaply, and that is what
-//! extras within the newest layer do: such a state is kept, on the other's branch. A bound from the model's projections
-//! rules out no more: they bound what is to come of known observations, and a survivor's way is wanted whether it is
-//! the cheapest or not, or else nothing would be proven. But two things are never looked at:
+//! | ahead | is | is chosen |
+//! |---|---|---|
+//! | [`layers`] | the cheapest ways to all states, extended with each observation, and found anew after a decision: it is known which steps are proven | without a lookahead, and where a window has [few nodes](ahead::keeps_layers) |
+//! | [`windows`] | a search from the root for each decision, which looks at a small part of the nodes; only the end is proven | else, and always if the model is searched lazily |
 //!
-//! - states that cannot be reached from the root any more (what was grabbed stays grabbed);
-//! - extras from a state that costs no less than it did at the observation before, if an extra pays the whole distance: the same action
-//!   would have led from there as a match, to the same state, for no more.
+//! All that is still to be committed follows from the root and the observations from its own on, so a mapping can go on from there
+//! after a restart ([`OnlineMapping::resume`]), with the same steps to the bit.
 //!
-//! **Memory.** Older layers keep the observation and the nodes that survivors hang on, at most 8 bytes per state; but no costs, and no
-//! distances: of the few states that steps lead to, these are computed again. Requests with a lookahead beyond [`longest_lookahead`] are
-//! refused.
-//!
-//! **Ties.** The way found first is kept: a skip, then matches, from the lower state first, then extras, from the cheaper state
-//! first; of actions between the same two states the cheapest, the first among equals. Among survivors the lower state is the cheapest.
-//! All this depends on the root and the observations alone, so that the same ones give the same steps.
+//! **Ties.** In layers, the way found first is kept: a skip, then matches, from the lower state first, then extras, from the cheaper state
+//! first; of actions between the same two states the cheapest, the first among equals; among survivors the lower state is the cheapest.
+//! A window is searched as any problem is, with its ties.
 
+mod ahead;
 mod committed;
-mod layer;
-mod memory;
+mod decided;
+mod layers;
 mod root;
-mod window;
+mod windows;
 
 use std::num::NonZeroU32;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
-use super::distances::{EndDistances, ObservedDistances};
-use super::policy::StepWriter;
-use super::problem::Starts;
-use super::{Conditions, Mapper, Mapping, Move, MoveKind, PolicyEnd, Status};
+use super::{Budget, Conditions, Mapper, Mapping, Move, Problem, Status};
 use crate::attribute::{Value, Weights};
-use crate::interrupt::{Cancelled, Interrupt, Signal};
-use crate::model::{Model, StateIdx};
-pub use committed::{CommittedStep, Stopped};
-use layer::{Layer, Source, Sweep};
-pub(crate) use memory::longest_lookahead;
-use memory::n_terms;
-pub use root::{CommittedMove, Root};
-use window::{NodePlace, Window};
+use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
+use crate::model::{Model, States};
+use ahead::{Ahead, keeps_layers};
+use committed::Committed;
+pub use committed::{CommittedMove, CommittedStep, Stopped};
+pub(in crate::mapping) use decided::Halt;
+use decided::{Decided, Rest};
+pub(crate) use layers::longest_lookahead;
+pub use root::Root;
 
 /// A mapping in the making.
 #[derive(Debug)]
 pub struct OnlineMapping {
     model: Arc<Model>,
-    weights: Weights,
     conditions: Conditions,
     lookahead: Option<NonZeroU32>,
+    budget: Budget,
     n_observed: u32,
-    /// The newest observation. Shape `[n_attributes]`.
-    newest: Vec<Option<Value>>,
-    n_swept: u64,
-    window: Window,
-    /// The cost of the way to the window's root, summed as the layers' costs are.
-    root_cost: f64,
-    sweep: Sweep,
-    writer: StepWriter,
-    moves: Vec<Move>,
-    /// What the action of each of these costs.
-    action_costs: Vec<f64>,
+    committed: Committed,
     was_forced: bool,
-    /// How many terms of distances an observation has, one for each value of an attribute that weighs something.
-    n_terms: usize,
-    max_bytes: usize,
-    /// Whether the survivors' ways are what they should be: not while an observation is taken, nor after one that was broken off.
-    is_whole: bool,
+    ahead: Ahead,
+    /// The cheapest way to the end, once it was asked for.
+    rest: OnceLock<Rest>,
 }
 
 impl OnlineMapping {
@@ -101,39 +67,48 @@ impl OnlineMapping {
     ///
     /// # Panics
     ///
-    /// If the model is searched lazily: each layer looks at all states.
+    /// If the model is searched lazily and there is no lookahead, for which the ways to all states are needed.
     #[must_use]
-    pub fn new(mapper: &Mapper, weights: Weights, conditions: Conditions, lookahead: Option<NonZeroU32>) -> Self {
-        let model = mapper.shared_model();
-        assert!(!model.is_lazy(), "each layer needs all states");
-        let n_terms = n_terms(&model, |position| weights.as_slice()[position] > 0.0);
-        let sweep = Sweep::new(&model, &conditions);
-        let window = Window::new(model.states().len());
+    pub fn new(mapper: &Arc<Mapper>, weights: Weights, conditions: Conditions, lookahead: Option<NonZeroU32>) -> Self {
+        let keeps_layers = keeps_layers(mapper.model(), lookahead);
+        Self::looking_ahead(mapper, weights, conditions, lookahead, keeps_layers)
+    }
+
+    /// The same, which searches for ways when it needs them, however small the model is, and so proves nothing before the end.
+    #[must_use]
+    pub fn searching(mapper: &Arc<Mapper>, weights: Weights, conditions: Conditions, lookahead: NonZeroU32) -> Self {
+        Self::looking_ahead(mapper, weights, conditions, Some(lookahead), false)
+    }
+
+    fn looking_ahead(
+        mapper: &Arc<Mapper>,
+        weights: Weights,
+        conditions: Conditions,
+        lookahead: Option<NonZeroU32>,
+        keeps_layers: bool,
+    ) -> Self {
         Self {
-            model,
-            weights,
-            conditions,
+            model: mapper.shared_model(),
             lookahead,
+            budget: Budget { max_bytes: usize::MAX, ..Budget::DEFAULT },
             n_observed: 0,
-            newest: Vec::new(),
-            n_swept: 0,
-            window,
-            root_cost: 0.0,
-            sweep,
-            writer: StepWriter::default(),
-            moves: Vec::new(),
-            action_costs: Vec::new(),
+            committed: Committed::new(mapper.model()),
             was_forced: false,
-            n_terms,
-            max_bytes: usize::MAX,
-            is_whole: true,
+            ahead: Ahead::new(mapper, weights, &conditions, keeps_layers),
+            conditions,
+            rest: OnceLock::new(),
         }
     }
 
-    /// The same, in about `max_bytes` at most: an observation that would take more is not taken.
+    /// The same, in about `max_bytes` at most, searches included: an observation that would take more is not taken.
     #[must_use]
     pub fn within(self, max_bytes: usize) -> Self {
-        Self { max_bytes, ..self }
+        self.spending(Budget { max_bytes, ..Budget::DEFAULT })
+    }
+
+    /// The same, with this budget.
+    pub(super) fn spending(self, budget: Budget) -> Self {
+        Self { budget, ..self }
     }
 
     /// How many observations have come.
@@ -145,37 +120,47 @@ impl OnlineMapping {
     /// How many steps were committed.
     #[must_use]
     pub fn n_steps(&self) -> usize {
-        self.moves.len()
+        self.committed.moves.len()
     }
 
-    /// How many nodes of observations from the last committed one on survivors hang on. Looks at each of these observations.
+    /// How many nodes of observations from the last committed one on are kept, if any are. Looks at each of these observations.
     #[must_use]
     pub fn n_nodes(&self) -> usize {
-        self.window.n_alive()
+        self.ahead.n_nodes()
     }
 
-    /// How many nodes were looked at: every state once for each layer that was swept.
-    pub(super) fn n_expanded(&self) -> u64 {
-        self.n_swept * self.model.graph().n_states() as u64
+    /// Approximate size in memory, in bytes, without the model, between observations. Does not look at each of these.
+    #[must_use]
+    pub fn size_bytes(&self) -> usize {
+        size_of::<Self>() + self.ahead.size_bytes() + self.committed.size_bytes()
     }
 
-    /// How many nodes the next observation looks at, at most.
-    pub(super) fn next_expanded(&self) -> u64 {
-        let lookahead = self.lookahead.map_or(0, NonZeroU32::get);
-        // Whatever is decided leaves so many layers that are swept again.
-        let is_due = self.lookahead.is_some() && self.window.n_before.saturating_add(lookahead) <= self.n_observed + 1;
-        let n_sweeps = 1 + if is_due { u64::from(lookahead) } else { 0 };
-        n_sweeps.saturating_mul(self.model.graph().n_states() as u64)
+    /// About how much memory a mapping of `problem`'s demonstration takes at most, in bytes, also while it takes an observation: if all
+    /// ways to all states are alike, as when nothing tells them apart.
+    ///
+    /// # Panics
+    ///
+    /// If `problem` is of another model than `mapper`.
+    #[must_use]
+    pub fn most_bytes(mapper: &Mapper, problem: &Problem<'_>, lookahead: Option<NonZeroU32>) -> usize {
+        let (model, n_observations) = (mapper.model(), problem.demonstration.len());
+        let moves = n_observations.saturating_mul(MOVES_PER_OBSERVATION * (size_of::<Move>() + size_of::<f64>()));
+        let ahead = match lookahead.filter(|_| !keeps_layers(model, lookahead)) {
+            Some(lookahead) => windows::most_bytes(mapper, problem, lookahead),
+            None => layers::most_bytes(model, lookahead, n_observations),
+        };
+        ahead.saturating_add(moves + BASE_BYTES)
     }
 
-    /// How many transitions were looked at.
-    pub(super) fn n_generated(&self) -> u64 {
-        self.n_swept * self.model.graph().n_transitions() as u64
+    /// Nodes and transitions that were looked at.
+    pub(super) fn n_looked_at(&self) -> (u64, u64) {
+        let work = self.ahead.work();
+        (work.n_expanded, work.n_generated)
     }
 
-    /// The cheapest way to what has come; where an observation was broken off, the committed steps.
-    pub(super) fn into_moves(self) -> Vec<Move> {
-        if self.is_whole { self.end().map(|(_, mapping)| mapping.moves).unwrap_or_default() } else { self.moves }
+    /// The committed steps, and their states, if the model is searched lazily.
+    pub(super) fn into_moves(self) -> (Vec<Move>, Option<States>) {
+        (self.committed.moves, self.committed.passed.map(|passed| passed.states))
     }
 
     /// Takes the next observation, shape `[n_attributes]`, and gives the steps that it commits. `observation_weight` is
@@ -183,7 +168,7 @@ impl OnlineMapping {
     ///
     /// # Errors
     ///
-    /// [`Stopped::Cancelled`] if `interrupt` said so; it is not asked to finish. [`Stopped::Memory`] if the mapping would come to take
+    /// [`Stopped::Cancelled`] if `interrupt` said so, or said to finish. [`Stopped::Memory`] if the mapping would come to take
     /// more than it [may](Self::within). The mapping is then of no more use.
     pub fn observe(
         &mut self,
@@ -191,206 +176,142 @@ impl OnlineMapping {
         observation_weight: Option<f64>,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Vec<CommittedStep>, Stopped> {
-        self.check_memory(self.next_layer_bytes())?;
-        self.is_whole = false;
-        let of_conditions = || self.conditions.observation_weight(self.n_observed as usize);
-        let observation_weight = observation_weight.unwrap_or_else(of_conditions);
-        let committed = self.take(observation, observation_weight, interrupt)?;
-        self.is_whole = true;
-        Ok(committed)
+        Ok(self.take(observation, observation_weight, interrupt)?)
     }
 
-    fn take(
+    /// As [`Self::observe`], which tells what ran out.
+    pub(super) fn take(
         &mut self,
         observation: &[Option<Value>],
-        observation_weight: f64,
+        observation_weight: Option<f64>,
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Vec<CommittedStep>, Stopped> {
-        let mut committed = Vec::new();
-        let model = &*Arc::clone(&self.model);
-        let observed = ObservedDistances::new(model, observation, &self.weights, observation_weight);
+    ) -> Result<Vec<CommittedStep>, Halt> {
+        let of_conditions = || self.conditions.observation_weight(self.n_observed as usize);
+        let observation_weight = observation_weight.unwrap_or_else(of_conditions);
+        let budget = self.budget_left();
+        self.ahead.observe(observation, observation_weight, budget, interrupt)?;
+        self.rest.take();
         self.n_observed += 1;
-        self.newest.clear();
-        self.newest.extend_from_slice(observation);
-        if self.is_resumed() {
-            self.begin(&[(self.window.root, self.root_cost)], Source::NONE, observed);
-        } else if self.n_observed == 1 {
-            let starts = Starts::of(model, self.conditions.starts.as_deref());
-            let arrived = |state: &StateIdx| {
-                let distance = observed.distance(model, *state);
-                (*state, self.sweep.recurrence.arrive(MoveKind::Start, 0.0, distance))
-            };
-            let first: Vec<(StateIdx, f64)> = starts.states().iter().map(arrived).collect();
-            self.window.add(Layer::before_starts(model.graph().n_states()));
-            self.begin(&first, Source::before(self.window.root), observed);
-        } else {
-            let layer = self.follow(observed, interrupt)?;
-            self.window.push(layer);
-        }
-        self.commit_shared(&mut committed);
+        let mut steps = Vec::new();
+        self.commit_shared(&mut steps);
         while self.must_decide() {
-            self.commit_cheapest(&mut committed, interrupt)?;
+            self.commit_cheapest(&mut steps, interrupt)?;
         }
-        Ok(committed)
+        Ok(steps)
     }
 
     /// Commits the cheapest way to the newest observation, up to and including its first move that advances from the root's, for a step
-    /// whose time is up; and whatever all ways that are left share then. The start counts as a move that advances from before the first
-    /// observation. Commits nothing if no observation has come after the root's. What is decided so is forced: the status is local.
+    /// whose time is up; and whatever all ways that are left are known to share then. The start counts as a move that advances from before
+    /// the first observation. Commits nothing if no observation has come after the root's. What is decided so is forced: the status is local.
     ///
     /// # Errors
     ///
     /// As [`Self::observe`].
     pub fn decide(&mut self, interrupt: &mut dyn Interrupt) -> Result<Vec<CommittedStep>, Stopped> {
-        let mut committed = Vec::new();
-        if self.window.layers.len() > 1 {
-            self.is_whole = false;
-            self.commit_cheapest(&mut committed, interrupt)?;
-            self.is_whole = true;
+        let mut steps = Vec::new();
+        if self.n_passed() < self.n_observed {
+            self.rest.take();
+            self.commit_cheapest(&mut steps, interrupt)?;
         }
-        Ok(committed)
+        Ok(steps)
     }
 
     /// How many steps would be committed if the demonstration ended now.
     #[must_use]
     pub fn n_rest(&self) -> usize {
-        self.survivor().map_or(0, |survivor| self.window.path(survivor).len())
+        let rest = self.rest(&mut Uninterrupted).ok().flatten();
+        rest.map_or(0, |rest| rest.steps.len())
     }
 
-    /// The state in which the cheapest mapping of what has come ends; `None` if nothing has.
-    fn survivor(&self) -> Option<StateIdx> {
-        let newest = self.window.layers.back()?;
-        match self.end_distances() {
-            Some(end) => newest.cheapest_to_end(|state| end.cost(self.model.states().row(state))),
-            None => newest.cheapest(),
+    /// Finds the rest of the cheapest mapping, before it is [ended](Self::end), unless that was done since the last observation.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so. If it says to finish, the best way is followed that was found.
+    pub fn find_rest(&self, interrupt: &mut dyn Interrupt) -> Result<(), Cancelled> {
+        self.rest(interrupt).map(drop)
+    }
+
+    fn rest(&self, interrupt: &mut dyn Interrupt) -> Result<Option<&Rest>, Cancelled> {
+        if self.rest.get().is_none() {
+            let Some(rest) = self.ahead.rest(self.budget_left(), interrupt)? else { return Ok(None) };
+            return Ok(Some(self.rest.get_or_init(|| rest)));
         }
-    }
-
-    /// What ending costs now, unless it is free.
-    fn end_distances(&self) -> Option<EndDistances> {
-        let (schema, states, end_weight) = (self.model.schema(), self.model.states(), self.conditions.end_weight);
-        (end_weight > 0.0).then(|| EndDistances::new(schema, states, &self.newest, &self.weights, end_weight))
+        Ok(self.rest.get())
     }
 
     /// Ends the demonstration, and commits the rest of the cheapest mapping. `None` if nothing was observed.
     #[must_use]
     pub fn end(mut self) -> Option<(Vec<CommittedStep>, Mapping)> {
-        let survivor = self.survivor()?;
-        let row = self.model.states().row(survivor);
-        let end_cost = self.end_distances().map_or(0.0, |end| end.cost(row));
-        let end = PolicyEnd::at(&self.model, row, &self.newest, &self.weights);
-        let path = self.window.path(survivor);
-        let committed = path.into_iter().map(|place| self.commit_at(place, true)).collect();
-        let status = if self.was_forced { Status::Local } else { Status::Optimal };
-        let cost = self.writer.cost_with_end(end_cost);
-        let lower_bound = (status == Status::Optimal).then_some(cost.total);
-        let (n_expanded, n_generated) = (self.n_expanded(), self.n_generated());
+        self.find_rest(&mut Uninterrupted).ok()?;
+        let Rest { steps, end_cost, end, stopped_by, lower_bound, work } = self.rest.take()?;
+        let is_proven = stopped_by.is_none();
+        let steps = steps.into_iter().map(|decided| self.commit(&decided, is_proven)).collect();
+        let cost = self.committed.writer.cost_with_end(end_cost);
+        let (status, lower_bound) = match (self.was_forced, is_proven) {
+            (true, _) => (Status::Local, None),
+            (false, true) => (Status::Optimal, Some(cost.total)),
+            (false, false) => (Status::Bounded, Some(lower_bound)),
+        };
+        let mut looked_at = self.ahead.work();
+        looked_at += work;
+        let Committed { moves, action_costs, passed, .. } = self.committed;
         let mapping = Mapping {
-            moves: self.moves,
-            action_costs: self.action_costs,
+            moves,
+            action_costs,
             cost,
             end,
             status,
             lower_bound,
-            stopped_by: None,
-            n_expanded,
-            n_generated,
-            states: None,
+            stopped_by,
+            n_expanded: looked_at.n_expanded,
+            n_generated: looked_at.n_generated,
+            states: passed.map(|passed| passed.states),
         };
-        Some((committed, mapping))
+        Some((steps, mapping))
+    }
+
+    /// What is left to spend on what is ahead.
+    fn budget_left(&self) -> Budget {
+        self.budget.beside(size_of::<Self>() + self.committed.size_bytes())
+    }
+
+    /// How many observations are passed: up to the root's.
+    fn n_passed(&self) -> u32 {
+        self.committed.moves.last().map_or(0, |step| step.observation + 1)
     }
 
     /// Whether the lookahead past the root is used up.
     fn must_decide(&self) -> bool {
-        // So many layers are before the one of the newest observation.
-        let newest = self.n_observed;
-        self.lookahead.is_some_and(|lookahead| self.window.n_before.saturating_add(lookahead.get()) <= newest)
+        self.lookahead.is_some_and(|lookahead| self.n_passed().saturating_add(lookahead.get()) <= self.n_observed)
     }
 
-    /// Commits every step that all survivors share.
-    fn commit_shared(&mut self, committed: &mut Vec<CommittedStep>) {
-        while let Some(child) = self.window.only_child(&self.model) {
-            committed.push(self.commit_at(child, true));
-            self.window.advance(child);
+    /// Commits every step that all ways are known to share.
+    fn commit_shared(&mut self, steps: &mut Vec<CommittedStep>) {
+        while let Some(decided) = self.ahead.shared() {
+            steps.push(self.commit(&decided, true));
         }
     }
 
     /// Commits the cheapest way to the newest observation, up to its first move that advances, and what all ways share that are left.
-    fn commit_cheapest(
-        &mut self,
-        committed: &mut Vec<CommittedStep>,
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<(), Stopped> {
+    fn commit_cheapest(&mut self, steps: &mut Vec<CommittedStep>, interrupt: &mut dyn Interrupt) -> Result<(), Halt> {
         self.was_forced = true;
-        let survivor = self.window.layers.back().and_then(Layer::cheapest);
-        for place in survivor.map(|survivor| self.window.path(survivor)).unwrap_or_default() {
-            committed.push(self.commit_at(place, false));
-            let (index, _) = place;
-            if index > 0 {
-                self.window.advance(place);
-                break;
-            }
+        let budget = self.budget_left();
+        for decided in self.ahead.decide(budget, interrupt)? {
+            steps.push(self.commit(&decided, false));
         }
-        self.restore(interrupt)?;
-        self.commit_shared(committed);
+        self.commit_shared(steps);
         Ok(())
     }
 
-    fn commit_at(&mut self, place: NodePlace, is_proven: bool) -> CommittedStep {
-        let (step, action_cost) = self.window.step(&self.model, &self.sweep.body, place);
-        let (model, recurrence) = (&self.model, self.sweep.recurrence);
-        let layer = &self.window.layers[self.window.index_of(step.observation)];
-        let distance = layer.observed.distance(model, step.state);
-        self.root_cost = recurrence.arrive(step.kind, self.root_cost + action_cost, distance);
-        let terms = layer.observed.terms(model, step.state);
-        let paid = terms.map(|(position, term)| (position, recurrence.paid(step.kind, term)));
-        let written = self.writer.write(model, model.states(), &step, action_cost, paid);
-        self.moves.push(step);
-        self.action_costs.push(action_cost);
-        CommittedStep { step: written, is_proven, after: self.n_observed }
-    }
-
-    /// Finds the ways from the root anew.
-    fn restore(&mut self, interrupt: &mut dyn Interrupt) -> Result<(), Stopped> {
-        let model = &*Arc::clone(&self.model);
-        let root = self.window.root;
-        let mut observed = self.window.clear().into_iter();
-        if let Some(mut first) = observed.next() {
-            first.fill_tables(model);
-            self.window.root = root;
-            self.begin(&[(root, self.root_cost)], Source::NONE, first);
-        }
-        for mut observed in observed {
-            observed.fill_tables(model);
-            let layer = self.follow(observed, interrupt)?;
-            self.window.push(layer);
-        }
-        Ok(())
-    }
-
-    /// Begins with the layer of these states, which come from `source`, and to which the way costs so much.
-    fn begin(&mut self, first: &[(StateIdx, f64)], source: Source, observed: ObservedDistances) {
-        self.n_swept += 1;
-        let spare = self.window.spare();
-        let first = first.iter().map(|(state, cost)| (*state, *cost, source));
-        let layer = self.sweep.begin(&self.model, first, &self.window.reached, observed, spare);
-        self.window.add(layer);
-        self.window.shrink();
-        self.window.recount();
-    }
-
-    /// The layer of the observation after the newest.
-    fn follow(&mut self, observed: ObservedDistances, interrupt: &mut dyn Interrupt) -> Result<Layer, Stopped> {
-        if interrupt.poll() == Signal::Cancel {
-            return Err(Cancelled.into());
-        }
-        self.check_memory(self.window.layer_bytes(self.model.graph().n_states()))?;
-        self.n_swept += 1;
-        let spare = self.window.spare();
-        let before = self.window.layers.back().expect("the first observation's layer begins a window");
-        Ok(self.sweep.follow(&self.model, &before.costs, &self.window.reached, observed, spare))
+    fn commit(&mut self, decided: &Decided, is_proven: bool) -> CommittedStep {
+        let step = self.committed.add(&self.model, self.conditions.recurrence(), decided);
+        CommittedStep { step, is_proven, after: self.n_observed }
     }
 }
 
-#[cfg(test)]
-mod tests;
+/// What there is however small the model.
+const BASE_BYTES: usize = 1 << 12;
+
+/// About how many steps an observation has at most, with the room for more: bodies that need more are rare.
+const MOVES_PER_OBSERVATION: usize = 8;

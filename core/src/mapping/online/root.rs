@@ -1,13 +1,16 @@
 //! What is committed, so that a mapping can go on after a restart.
 
 use std::num::NonZeroU32;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
 use super::OnlineMapping;
+use super::committed::{Committed, CommittedMove};
+use super::decided::{RootNode, Work};
 use crate::attribute::Weights;
 use crate::mapping::policy::StepWriter;
-use crate::mapping::{Conditions, Mapper, Move};
+use crate::mapping::{Conditions, Mapper};
 use crate::model::StateIdx;
 
 /// Where a mapping in the making has come to: the last committed node, and of what was committed before it as much as the rest needs.
@@ -22,17 +25,8 @@ pub struct Root {
     writer: StepWriter,
     /// Whether some step was forced.
     was_forced: bool,
-    /// How many layers were swept for it.
-    n_swept: u64,
-}
-
-/// A committed step, as far as a mapping must know it to go on.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct CommittedMove {
-    /// The step.
-    pub step: Move,
-    /// What its action costs; 0 without one.
-    pub action_cost: f64,
+    /// How much was looked at for it.
+    work: Work,
 }
 
 impl Root {
@@ -54,19 +48,17 @@ impl OnlineMapping {
     #[must_use]
     pub fn root(&self) -> Root {
         Root {
-            node: self.moves.last().map(|step| (step.observation, step.state)),
-            cost: self.root_cost,
-            writer: self.writer,
+            node: self.committed.moves.last().map(|step| (step.observation, step.state)),
+            cost: self.ahead.root_cost(),
+            writer: self.committed.writer,
             was_forced: self.was_forced,
-            // Those after it will be swept again.
-            n_swept: self.n_swept - self.n_layers_kept(),
+            work: self.ahead.work_before(),
         }
     }
 
     /// The committed steps from the one with the number `first` on, counted from 0.
     pub fn moves_from(&self, first: usize) -> impl Iterator<Item = CommittedMove> {
-        let moves = self.moves.iter().zip(&self.action_costs).skip(first);
-        moves.map(|(step, action_cost)| CommittedMove { step: *step, action_cost: *action_cost })
+        (first..self.n_steps()).map(|number| self.committed.move_at(number))
     }
 
     /// Goes on from `root` with what was given to [`Self::new`] and the steps that are committed at this root: those that
@@ -86,48 +78,39 @@ impl OnlineMapping {
     /// As [`Self::new`].
     #[must_use]
     pub fn resume(
-        mapper: &Mapper,
+        mapper: &Arc<Mapper>,
         weights: Weights,
         conditions: Conditions,
         lookahead: Option<NonZeroU32>,
         root: &Root,
         moves: impl IntoIterator<Item = CommittedMove>,
     ) -> Option<Self> {
-        let model = mapper.model();
-        let (moves, action_costs): (Vec<_>, Vec<_>) = moves.into_iter().map(|own| (own.step, own.action_cost)).unzip();
-        let are_known = moves.iter().all(|step| {
-            let has_action = step.action.is_none_or(|action| usize::from(action) < model.actions().len());
-            has_action && step.state < model.states().len()
-        });
-        let last = moves.last().map(|step| (step.observation, step.state));
-        if !are_known || moves.len() != root.n_steps() || last != root.node {
+        Self::new(mapper, weights, conditions, lookahead).resumed(root, moves)
+    }
+
+    /// [`Self::resume`] for a mapping that was made as the one that is gone on with, and has observed nothing.
+    #[must_use]
+    pub fn resumed(self, root: &Root, moves: impl IntoIterator<Item = CommittedMove>) -> Option<Self> {
+        let committed = Committed::of(&self.model, moves)?;
+        let last = committed.moves.last().map(|step| (step.observation, step.state));
+        if committed.moves.len() != root.n_steps() || last != root.node {
             return None;
         }
-        let mut online = Self::new(mapper, weights, conditions, lookahead);
-        if let Some((observation, state)) = root.node {
-            online.window.n_before = observation + 1;
-            online.window.root = state;
-        }
+        let node = last.map(|(observation, state)| RootNode {
+            observation,
+            state,
+            row: committed.last_row(),
+            cost: root.cost,
+        });
         Some(Self {
             n_observed: root.first_observation(),
-            n_swept: root.n_swept,
-            root_cost: root.cost,
-            writer: root.writer,
-            moves,
-            action_costs,
+            committed: Committed { writer: root.writer, ..committed },
             was_forced: root.was_forced,
-            ..online
+            ahead: match node {
+                Some(node) => self.ahead.at(node, root.work),
+                None => self.ahead,
+            },
+            ..self
         })
-    }
-
-    /// Whether the root's layer is still to be made.
-    pub(super) fn is_resumed(&self) -> bool {
-        self.window.layers.is_empty() && self.window.n_before > 0
-    }
-
-    /// How many layers there are of observations.
-    fn n_layers_kept(&self) -> u64 {
-        let is_before_starts = self.window.n_before == 0;
-        self.window.layers.len().saturating_sub(usize::from(is_before_starts)) as u64
     }
 }

@@ -1,14 +1,18 @@
 use proptest::prelude::*;
 use serde_json::json;
 
+use std::num::NonZeroU32;
+
 use super::*;
 use crate::interrupt::Uninterrupted;
 use crate::mapping::by_definition::{fitted, prepared};
-use crate::mapping::{Demonstration, HeuristicName, Problem, Settings};
-use crate::model::Origin;
+use crate::mapping::online::ahead::Ahead;
+use crate::mapping::{
+    CommittedStep, Demonstration, HeuristicName, Mapper, OnlineMapping, Problem, Settings, Status, Stopped,
+};
 
 /// States on a line, in any order, with any transitions.
-fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Mapper {
+fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Arc<Mapper> {
     let states: Vec<_> = places.iter().map(|x| json!([x])).collect();
     let actions = [("a", 0.0), ("b", 0.5), ("c", 2.0)];
     let transitions = fitted(transitions.to_vec(), places.len());
@@ -17,22 +21,29 @@ fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Mapper {
         "actions": actions.map(|(name, cost)| json!({"name": name, "cost": cost})),
         "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
     });
-    prepared(&document)
+    Arc::new(prepared(&document))
 }
 
 /// Two loops of as many states each. From state 0 either can be entered, and none is left. All attributes tell all states
 /// apart.
-fn loops(n_each: usize, n_attributes: usize) -> Mapper {
+fn loops(n_each: usize, n_attributes: usize) -> Arc<Mapper> {
     let on = |first: usize| (0..n_each).map(move |n| json!([first + n, "on", first + (n + 1) % n_each]));
     let entries = [json!([0, "left", 1]), json!([0, "right", 1 + n_each])];
     let transitions: Vec<_> = entries.into_iter().chain(on(1)).chain(on(1 + n_each)).collect();
     let states: Vec<Vec<usize>> = (0..=2 * n_each).map(|state| vec![state; n_attributes]).collect();
     let attributes = (0..n_attributes).map(|n| json!({"name": format!("a{n}"), "kind": "number"}));
-    prepared(&json!({
+    Arc::new(prepared(&json!({
         "attributes": attributes.collect::<Vec<_>>(),
         "actions": [{"name": "left"}, {"name": "right"}, {"name": "on"}],
         "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
-    }))
+    })))
+}
+
+fn layers(online: &OnlineMapping) -> &Layers {
+    match &online.ahead {
+        Ahead::Layers(layers) => layers,
+        Ahead::Windows(_) => panic!("it has layers"),
+    }
 }
 
 #[test]
@@ -44,7 +55,7 @@ fn without_a_lookahead_an_observation_that_commits_nothing_keeps_no_distances() 
     for n in 0..900_u32 {
         let observation = vec![Some(Value::Number(f64::from(1 + n % 150))); n_attributes];
         online.observe(&observation, None, &mut Uninterrupted).unwrap();
-        assert!(online.window.knows_its_size());
+        assert!(layers(&online).tree.knows_its_size());
         sizes.push(online.size_bytes());
     }
     // Nobody knows yet that the other loop is not meant.
@@ -65,14 +76,14 @@ fn an_observation_that_would_take_more_memory_than_there_is_is_not_taken_and_wha
     };
     for lookahead in [None, Some(100), Some(10_000)] {
         let lookahead = lookahead.and_then(NonZeroU32::new);
-        let new = || OnlineMapping::new(&mapper, weights.clone(), Conditions::default(), lookahead);
+        let new = || OnlineMapping::looking_ahead(&mapper, weights.clone(), Conditions::default(), lookahead, true);
         let mut unbounded = new();
         let mut most = 0;
         for n in 0..300 {
             observe(&mut unbounded, n).unwrap();
             most = most.max(unbounded.size_bytes());
         }
-        let foretold = OnlineMapping::most_bytes(mapper.model(), lookahead, 300);
+        let foretold = most_bytes(mapper.model(), lookahead, 300) + 300 * 100;
         assert!(most <= foretold, "{most} of {foretold}");
         for max_bytes in [0, 10_000, most / 4, most / 2, most - 1] {
             let mut online = new().within(max_bytes);
@@ -84,8 +95,6 @@ fn an_observation_that_would_take_more_memory_than_there_is_is_not_taken_and_wha
             assert_eq!(stopped, Some(Stopped::Memory), "{max_bytes} of {most}");
             let n_observed = online.n_observed();
             assert_eq!(n_observed > 0, max_bytes > 10_000, "{n_observed} in {max_bytes} of {most}");
-            let moves = online.into_moves();
-            assert!(n_observed == 0 || !moves.is_empty());
         }
     }
 }
@@ -116,7 +125,7 @@ proptest! {
         let mut at = (0, 0);
         for (i, observation) in (0..).zip(&observations) {
             let committed = online.observe(observation, None, &mut Uninterrupted).unwrap();
-            prop_assert!(online.window.knows_its_size());
+            prop_assert!(layers(&online).tree.knows_its_size());
             let mut paid = 0.0;
             let mut from = at;
             for (n, CommittedStep { step, is_proven, after }) in committed.iter().enumerate() {
@@ -137,19 +146,19 @@ proptest! {
                 (from, paid) = (at, 0.0);
             }
             // Every survivor's way, also where no commit depends on it: as that of a sweep that begins at the root.
-            let (first, root) = (online.window.n_before as usize - 1, online.window.root);
+            let (first, root) = (layers(&online).tree.n_before as usize - 1, layers(&online).tree.root);
             let mut swept = OnlineMapping::new(&mapper, weights.clone(), Conditions::starting_at(Origin::State(root)), None);
             for observation in &observations[first..=i as usize] {
                 swept.observe(observation, None, &mut Uninterrupted).unwrap();
             }
-            let before = online.root_cost - online.window.layers[0].observed.distance(mapper.model(), root);
-            let newest = |online: &OnlineMapping| online.window.layers.back().unwrap().costs.clone();
+            let before = layers(&online).root_cost - layers(&online).tree.layers[0].observed.distance(mapper.model(), root);
+            let newest = |online: &OnlineMapping| layers(online).tree.layers.back().unwrap().costs.clone();
             for (cost, swept) in newest(&online).into_iter().zip(newest(&swept)) {
                 let is_same = cost == before + swept || (cost - before - swept).abs() <= 1e-9 * (1.0 + cost);
                 prop_assert!(is_same, "{cost}, not {before} + {swept}");
             }
         }
-        let cost = online.writer.cost_with_end(0.0).total;
+        let cost = online.committed.writer.cost_with_end(0.0).total;
         let rest = to_go(at, u32::try_from(observations.len()).unwrap() - 1);
         let (_, mapping) = online.end().unwrap();
         prop_assert!((mapping.cost.total - cost - rest).abs() <= 1e-9 * (1.0 + cost + rest));

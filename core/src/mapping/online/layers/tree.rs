@@ -8,12 +8,12 @@ use crate::mapping::distances::ObservedDistances;
 use crate::mapping::{Move, MoveKind};
 use crate::model::{ActionIdx, Model, StateIdx};
 
-/// A node's place: the index of its layer in the window, and its state.
+/// A node's place: the index of its layer in the tree, and its state.
 pub(super) type NodePlace = (usize, StateIdx);
 
 /// Layers from the root's to the newest.
 #[derive(Debug)]
-pub(super) struct Window {
+pub(super) struct Tree {
     pub(super) layers: VecDeque<Layer>,
     /// How many layers there were before the first one. The layer of the observation i has i + 1 before it: the one
     /// [before the starts](Layer::before_starts), and those of earlier observations.
@@ -27,7 +27,7 @@ pub(super) struct Window {
     layer_bytes: usize,
 }
 
-impl Window {
+impl Tree {
     pub(super) fn new(n_states: StateIdx) -> Self {
         let reached = (0..n_states).collect();
         Self { layers: VecDeque::new(), n_before: 0, root: 0, reached, spare: Vec::new(), layer_bytes: 0 }
@@ -39,9 +39,10 @@ impl Window {
         self.layer_bytes + spare + self.reached.capacity() * size_of::<StateIdx>()
     }
 
-    /// The place of an observation's layer. It must be there.
-    pub(super) fn index_of(&self, observation: u32) -> usize {
-        (observation + 1 - self.n_before) as usize
+    /// How many layers there are of observations.
+    pub(super) fn n_layers_of_observations(&self) -> usize {
+        let is_before_starts = self.n_before == 0;
+        self.layers.len().saturating_sub(usize::from(is_before_starts))
     }
 
     /// How many nodes survivors hang on. Looks at every layer.

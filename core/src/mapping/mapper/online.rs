@@ -1,0 +1,78 @@
+//! What a lookahead asks of a mapper: the search of a window, and what is done when the budget of all of them runs out.
+
+use super::{Mapper, Mapping, Settings, Status, conclude, renumber};
+use crate::interrupt::{Cancelled, Interrupt};
+use crate::mapping::heuristic::projected::Projected;
+use crate::mapping::search::Found;
+use crate::mapping::{Budget, Move, MoveKind, Problem, StoppedBy};
+use crate::model::{Space, States};
+
+impl Mapper {
+    /// The cheapest mapping of a window.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    pub(in crate::mapping) fn map_window(
+        &self,
+        problem: &Problem<'_>,
+        budget: Budget,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        let max_bytes = budget.max_bytes.min(Budget::DEFAULT.max_bytes);
+        let budget = Budget { max_bytes, ..budget };
+        self.map(problem, Settings { budget, ..Settings::default() }, interrupt)
+    }
+
+    /// A mapping of `problem` that begins with `moves`, if there are any, and goes on greedily, as `stopped_by` ran out. Their states are
+    /// numbered in `states`, if the model is searched lazily. Nothing is proven of it.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    pub(in crate::mapping) fn complete(
+        &self,
+        problem: &Problem<'_>,
+        mut moves: Vec<Move>,
+        states: Option<&States>,
+        stopped_by: StoppedBy,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
+        let mut rows = problem.starts.rows().to_vec();
+        if moves.is_empty() {
+            let (kind, state) = (MoveKind::Start, problem.closest_start());
+            moves.push(Move { kind, action: None, observation: 0, state });
+        } else if let Some(states) = states {
+            rows = (0..states.len()).map(|state| states.row(state).to_vec()).collect();
+        }
+        let Some(mut explored) = self.model.explore_from(&rows) else {
+            return complete_in(&mut self.model.whole(), problem, moves, stopped_by, interrupt);
+        };
+        for step in &moves {
+            explored.explore(step.state);
+        }
+        let mut mapping = complete_in(&mut explored, problem, moves, stopped_by, interrupt)?;
+        mapping.states = Some(explored.keep(&renumber(&mut mapping.moves)));
+        Ok(mapping)
+    }
+}
+
+/// A mapping that begins with `moves` and goes on greedily.
+fn complete_in<S: Space>(
+    space: &mut S,
+    problem: &Problem<'_>,
+    moves: Vec<Move>,
+    stopped_by: StoppedBy,
+    interrupt: &mut dyn Interrupt,
+) -> Result<Mapping, Cancelled> {
+    let found = Found {
+        paths: vec![moves],
+        is_complete: false,
+        stopped_by: Some(stopped_by),
+        least_f: 0.0,
+        n_expanded: 0,
+        n_generated: 0,
+    };
+    let mapping = conclude(problem, space, &Projected::blind(problem), found, interrupt)?;
+    Ok(Mapping { status: Status::Local, lower_bound: None, stopped_by: Some(stopped_by), ..mapping })
+}

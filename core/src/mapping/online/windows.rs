@@ -1,0 +1,155 @@
+//! The cheapest way through the observations ahead, searched for best first each time that a step must be decided.
+//!
+//! A window is a problem of its own: it starts in the root, or in one of the start states, and ends wherever is cheapest at the newest
+//! observation; what ending costs counts only when the demonstration has ended. So it costs what a search of so few observations costs,
+//! whatever the model and whatever came before, and models are searched that do not list their states. What is proven is what the last
+//! window decides, of which the end is known: whether others would go on alike however the demonstration does is not asked, as that would
+//! take the ways to all states.
+
+use std::collections::VecDeque;
+use std::num::NonZeroU32;
+use std::sync::Arc;
+
+use super::decided::{Decided, Halt, Rest, RootNode, Work};
+use crate::attribute::{Value, Weights};
+use crate::interrupt::{Cancelled, Interrupt, Signal};
+use crate::mapping::{
+    Budget, Conditions, Demonstration, Mapper, Mapping, Move, MoveKind, Problem, Settings, Status, StoppedBy,
+};
+use crate::model::{Origin, OriginRow};
+
+/// The observations ahead.
+#[derive(Debug)]
+pub(super) struct Windows {
+    mapper: Arc<Mapper>,
+    weights: Weights,
+    /// Those of the whole, without weights of observations.
+    conditions: Conditions,
+    /// From the root's on, with their weights; each of shape `[n_attributes]`.
+    observations: VecDeque<(Vec<Option<Value>>, f64)>,
+    /// The number of the first of them.
+    first: u32,
+    /// The last committed state; `None` before the start.
+    root: Option<Origin>,
+    pub(super) work: Work,
+}
+
+impl Windows {
+    /// Nothing was observed yet.
+    pub(super) fn new(mapper: Arc<Mapper>, weights: Weights, conditions: &Conditions) -> Self {
+        let conditions = Conditions { observation_weights: Vec::new(), collapse: None, ..conditions.clone() };
+        let (observations, work) = (VecDeque::new(), Work::default());
+        Self { mapper, weights, conditions, observations, first: 0, root: None, work }
+    }
+
+    /// Goes on from `root`, when nothing was observed yet.
+    pub(super) fn go_to(&mut self, root: RootNode, work: Work) {
+        self.first = root.observation;
+        self.root = Some(root.row.map_or(Origin::State(root.state), Origin::Row));
+        self.work = work;
+    }
+
+    /// Keeps an observation.
+    pub(super) fn observe(&mut self, observation: &[Option<Value>], observation_weight: f64) {
+        self.observations.push_back((observation.to_vec(), observation_weight));
+    }
+
+    /// The first steps of the cheapest way to the newest observation.
+    pub(super) fn decide(&mut self, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Vec<Decided>, Halt> {
+        match interrupt.poll() {
+            Signal::Continue => {}
+            Signal::Finish => return Err(Halt::OutOf(StoppedBy::Deadline)),
+            Signal::Cancel => return Err(Halt::Cancelled),
+        }
+        let Some(problem) = self.problem(false) else { return Ok(Vec::new()) };
+        let mapping = self.mapper.map_window(&problem, self.budget_left(budget), interrupt)?;
+        if mapping.status != Status::Optimal {
+            return Err(Halt::OutOf(mapping.stopped_by.unwrap_or(StoppedBy::Memory)));
+        }
+        let mut steps: Vec<_> = self.steps(&problem, &mapping).collect();
+        let work = Work { n_expanded: mapping.n_expanded, n_generated: mapping.n_generated };
+        let advances = |step: &Decided| match self.root {
+            Some(_) => step.step.observation > self.first,
+            None => step.step.kind == MoveKind::Start,
+        };
+        let n_decided = steps.iter().position(advances).map_or(steps.len(), |at| at + 1);
+        drop(problem);
+        steps.truncate(n_decided);
+        if let Some(last) = steps.last() {
+            let state = last.row.clone().map_or(Origin::State(last.step.state), Origin::Row);
+            self.root = Some(state);
+            while self.first < last.step.observation {
+                self.observations.pop_front();
+                self.first += 1;
+            }
+        }
+        self.work += work;
+        Ok(steps)
+    }
+
+    /// The cheapest way to the end.
+    pub(super) fn rest(&self, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Option<Rest>, Cancelled> {
+        let Some(problem) = self.problem(true) else { return Ok(None) };
+        let mapping = self.mapper.map_window(&problem, self.budget_left(budget), interrupt)?;
+        Ok(Some(Rest {
+            steps: self.steps(&problem, &mapping).collect(),
+            end_cost: mapping.cost.end,
+            stopped_by: mapping.stopped_by,
+            lower_bound: mapping.lower_bound.unwrap_or(0.0),
+            work: Work { n_expanded: mapping.n_expanded, n_generated: mapping.n_generated },
+            end: mapping.end,
+        }))
+    }
+
+    /// Approximate size in memory, in bytes.
+    pub(super) fn size_bytes(&self) -> usize {
+        let n_attributes = self.weights.as_slice().len();
+        let each = size_of::<(Vec<Option<Value>>, f64)>() + n_attributes * size_of::<Option<Value>>();
+        size_of::<Self>() + self.observations.capacity() * each
+    }
+
+    /// What a search may spend.
+    fn budget_left(&self, budget: Budget) -> Budget {
+        let max_expansions = budget.max_expansions.saturating_sub(self.work.n_expanded);
+        Budget { max_expansions, ..budget.beside(self.size_bytes()) }
+    }
+
+    /// The way from the root to the newest observation as a problem; `None` if nothing was observed. What ending costs counts if it `ends`.
+    fn problem(&self, ends: bool) -> Option<Problem<'_>> {
+        let demonstration = Demonstration::of(self.observations.iter().map(|(values, _)| values.clone()))?;
+        let conditions = Conditions {
+            starts: self.root.as_ref().map(|root| vec![root.clone()]).or_else(|| self.conditions.starts.clone()),
+            observation_weights: self.observations.iter().map(|(_, weight)| *weight).collect(),
+            end_weight: if ends { self.conditions.end_weight } else { 0.0 },
+            ..self.conditions.clone()
+        };
+        Some(Problem::new(self.mapper.model(), demonstration, self.weights.clone(), conditions))
+    }
+
+    /// The steps of a mapping of the window that are not committed yet.
+    fn steps(&self, problem: &Problem<'_>, mapping: &Mapping) -> impl Iterator<Item = Decided> {
+        let n_committed = usize::from(self.root.is_some());
+        let steps = mapping.moves.iter().zip(&mapping.action_costs).skip(n_committed);
+        let states = mapping.states.as_ref();
+        steps.map(move |(step, action_cost)| {
+            let row = states.unwrap_or_else(|| problem.model.states()).row(step.state);
+            Decided {
+                step: Move { observation: self.first + step.observation, ..*step },
+                action_cost: *action_cost,
+                terms: problem.distances.terms(step.observation as usize, row).collect(),
+                row: states.map(|_| OriginRow(row.to_vec())),
+            }
+        })
+    }
+}
+
+/// About how much memory windows of `problem`'s demonstration take at most, in bytes, also while one is searched.
+pub(super) fn most_bytes(mapper: &Mapper, problem: &Problem<'_>, lookahead: NonZeroU32) -> usize {
+    let n_observations = usize::try_from(lookahead.get()).unwrap_or(usize::MAX).saturating_add(1);
+    let window = problem.demonstration.iter().take(n_observations).map(<[_]>::to_vec);
+    let Some(window) = Demonstration::of(window) else { return 0 };
+    let observed_bytes = 2 * window.size_bytes();
+    let conditions = Conditions { collapse: None, ..problem.conditions.clone() };
+    let window = Problem::new(problem.model, window, problem.weights.clone(), conditions);
+    mapper.search_bytes(&window, Settings::default()).saturating_add(observed_bytes)
+}
