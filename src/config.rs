@@ -55,7 +55,7 @@ pub struct ServeConfig {
     /// Largest model after decompression.
     #[arg(long, env = "ETUDE_MAX_MODEL_TEXT_BYTES", value_parser = parse_bytes::<u64>, default_value_t = 512 * 1024 * 1024, value_name = "BYTES")]
     pub max_model_text_bytes: u64,
-    /// Most states of a model; a wumpus world of more is searched lazily.
+    /// Most states of a model; a world of rules, or a wumpus world, of more is searched lazily.
     #[arg(long, env = "ETUDE_MAX_STATES", value_parser = parse_whole::<usize>, default_value_t = model::Limits::DEFAULT.max_states, value_name = "N")]
     pub max_states: usize,
     /// Most transitions of a model.

@@ -13,7 +13,7 @@
 //! Each module uses only those to its left; a test of the service holds that order.
 //!
 //! ```text
-//! interrupt, document <- attribute <- model <- mapping <- inspection, learning <- world
+//! interrupt, document <- attribute <- expression <- model <- mapping <- inspection, learning <- world
 //! ```
 //!
 //! | module | is |
@@ -21,6 +21,7 @@
 //! | [`interrupt`] | how a long computation is stopped from outside |
 //! | [`document`] | reading JSON with all its faults, each with its pointer |
 //! | [`attribute`] | attributes of states: kinds, values, weights, distance |
+//! | `expression` | expressions of CEL: checked once, evaluated often |
 //! | [`model`] | what a body can do: dynamics of any kind, compiled to one state graph, or searched lazily |
 //! | [`mapping`] | the cheapest way to follow a demonstration: problem, search, heuristics, streams, policy |
 //! | [`inspection`] | what can be said of a body before it follows anything, and what of a demonstration it can never meet |
@@ -54,6 +55,8 @@
 
 pub mod attribute;
 pub mod document;
+#[cfg(feature = "rules")]
+mod expression;
 pub mod inspection;
 pub mod interrupt;
 pub mod learning;

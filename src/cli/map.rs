@@ -165,7 +165,7 @@ pub(super) fn read_model(path: &Path) -> Result<(Definition, Model), CliError> {
         CompileError::OutOfTime => Interrupted::OutOfTime.into(),
     };
     let definition = Definition::read(&read_json(path)?, Limits::NONE, &mut Uninterrupted).map_err(model_error)?;
-    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted)?;
+    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).map_err(model_error)?;
     Ok((definition, model))
 }
 

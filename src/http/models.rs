@@ -57,7 +57,7 @@ struct Counts {
     attributes: usize,
     /// Actions.
     actions: usize,
-    /// States; of a wumpus world, those that the body can reach. `null` if there are more of these than the limit: such a world is
+    /// States; where they follow from rules, those that the body can reach. `null` if there are more of these than the limit: such a world is
     /// searched lazily, each search finds and numbers the states that it comes to.
     states: Option<u64>,
     /// Transitions; `null` if the states are.

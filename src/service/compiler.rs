@@ -30,7 +30,7 @@ use crate::store::{ModelKey, ModelSize, ModelSummary, Store, StoredDefinition};
 use etude_core::document::Faults;
 use etude_core::interrupt::{Interrupt, Interrupted, Signal};
 use etude_core::mapping::Mapper;
-use etude_core::model::{Definition, Format, Limits, Model, ReadError};
+use etude_core::model::{CompileError, Definition, Format, Limits, Model, ReadError};
 
 /// Makes models ready, and keeps as many as fit.
 #[derive(Clone, Debug)]
@@ -271,6 +271,16 @@ impl Interrupt for LimitedTime<'_> {
         let signal = self.inner.poll();
         self.last = self.clock.instant();
         if signal == Signal::Continue && self.left.is_zero() { Signal::Finish } else { signal }
+    }
+}
+
+impl From<CompileError> for ServiceError {
+    fn from(error: CompileError) -> Self {
+        match error {
+            CompileError::Faults(faults) => faults.into(),
+            CompileError::Cancelled(cancelled) => Interrupted::from(cancelled).into(),
+            CompileError::OutOfTime => Interrupted::OutOfTime.into(),
+        }
     }
 }
 

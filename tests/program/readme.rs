@@ -67,5 +67,5 @@ fn examples_of_maps_streams_and_the_demo_print_what_the_readme_says() {
             );
         }
     }
-    assert!(n_examples >= 7, "{n_examples}");
+    assert!(n_examples >= 10, "{n_examples}");
 }

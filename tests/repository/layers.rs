@@ -5,8 +5,15 @@ use std::collections::BTreeMap;
 use crate::sources::{Module, modules, references};
 
 /// Modules of the core. Those of a layer may use those before it.
-const CORE: [&[&str]; 6] =
-    [&["interrupt", "document"], &["attribute"], &["model"], &["mapping"], &["inspection", "learning"], &["world"]];
+const CORE: [&[&str]; 7] = [
+    &["interrupt", "document"],
+    &["attribute"],
+    &["expression"],
+    &["model"],
+    &["mapping"],
+    &["inspection", "learning"],
+    &["world"],
+];
 
 /// Modules of the service.
 const SERVICE: [&[&str]; 10] = [

@@ -29,6 +29,7 @@ mod limits;
 mod protocol;
 mod replacement;
 mod reports;
+mod rules;
 mod stored_policies;
 mod stream;
 mod trials;

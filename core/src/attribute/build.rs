@@ -124,13 +124,18 @@ impl Attribute {
     /// ```
     #[must_use]
     pub fn number(name: impl Into<String>) -> Self {
-        Self { name: name.into(), kind: Kind::Number { scale: 1.0 }, weight: 1.0 }
+        Self { name: name.into(), kind: Kind::Number { scale: 1.0 }, weight: 1.0, is_hidden: false }
     }
 
     /// Numbers on a circle of circumference `period`, with scale 1 and weight 1.
     #[must_use]
     pub fn cyclic(name: impl Into<String>, period: f64) -> Self {
-        Self { name: name.into(), kind: Kind::Cyclic { scale: 1.0, cycle: Cycle::Period(period) }, weight: 1.0 }
+        Self {
+            name: name.into(),
+            kind: Kind::Cyclic { scale: 1.0, cycle: Cycle::Period(period) },
+            weight: 1.0,
+            is_hidden: false,
+        }
     }
 
     /// Labels, in order around a circle, one unit apart, with scale 1 and weight 1.
@@ -138,13 +143,13 @@ impl Attribute {
     pub fn labelled<L: AsRef<str>>(name: impl Into<String>, labels: impl IntoIterator<Item = L>) -> Self {
         let labels: Vec<L> = labels.into_iter().collect();
         let cycle = Cycle::Labels(Labels::new(labels.iter().map(AsRef::as_ref)));
-        Self { name: name.into(), kind: Kind::Cyclic { scale: 1.0, cycle }, weight: 1.0 }
+        Self { name: name.into(), kind: Kind::Cyclic { scale: 1.0, cycle }, weight: 1.0, is_hidden: false }
     }
 
     /// Strings, integers and booleans without order, with weight 1.
     #[must_use]
     pub fn category(name: impl Into<String>) -> Self {
-        Self { name: name.into(), kind: Kind::Category, weight: 1.0 }
+        Self { name: name.into(), kind: Kind::Category, weight: 1.0, is_hidden: false }
     }
 
     /// The same attribute, with another `scale`: the difference of values that counts as 1. A category has no scale and stays as it is.
@@ -162,6 +167,12 @@ impl Attribute {
     #[must_use]
     pub fn with_weight(self, weight: f64) -> Self {
         Self { weight, ..self }
+    }
+
+    /// The same attribute, part of the state, but never observed nor compared. Its weight is 0.
+    #[must_use]
+    pub fn hidden(self) -> Self {
+        Self { weight: 0.0, is_hidden: true, ..self }
     }
 
     /// The value of this attribute that is written as `scalar`.

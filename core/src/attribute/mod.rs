@@ -12,6 +12,7 @@
 
 mod build;
 mod by_attribute;
+mod document;
 mod labels;
 mod reading;
 mod schema;
@@ -25,9 +26,10 @@ use serde::Serialize;
 pub use build::BuildError;
 pub(crate) use build::{check_cost, check_count, check_name};
 pub use by_attribute::ByAttribute;
+pub use document::{AttributeDocument, KindName, ValuesDocument};
 pub use labels::Labels;
 pub(crate) use reading::ValueSeed;
-pub use schema::{AttributeDocument, KindName, Schema};
+pub use schema::Schema;
 pub use value::{Scalar, Value};
 pub use weights::Weights;
 
@@ -47,6 +49,8 @@ pub struct Attribute {
     /// Weight in the distance where a request names none. Finite, at least 0; however large, the attribute adds at most
     /// [`MAX_COST`] to a distance.
     pub weight: f64,
+    /// Whether it tells states apart and is never observed nor compared; its weight is then 0.
+    pub is_hidden: bool,
 }
 
 /// How the values of an attribute are written and compared.
@@ -225,7 +229,7 @@ mod tests {
     use super::*;
 
     fn attribute(kind: Kind) -> Attribute {
-        Attribute { name: "a".to_owned(), kind, weight: 1.0 }
+        Attribute { name: "a".to_owned(), kind, weight: 1.0, is_hidden: false }
     }
 
     #[test]

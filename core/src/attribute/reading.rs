@@ -8,7 +8,7 @@ use super::{Attribute, Cycle, Kind, Value};
 use crate::document::whole;
 
 /// Reads a value of this attribute, or `null`: not observed. It accepts exactly the values that [`Attribute::read_value`] accepts, which a
-/// property test of demonstrations holds. Its errors do not explain what is wrong; the faults of `read_value` do.
+/// property test of demonstrations holds; of a hidden attribute, none. Its errors do not explain what is wrong; the faults of `read_value` do.
 pub(crate) struct ValueSeed<'a>(pub(crate) &'a Attribute);
 
 impl<'de> DeserializeSeed<'de> for ValueSeed<'_> {
@@ -32,7 +32,7 @@ impl Visitor<'_> for ValueSeed<'_> {
 
     fn visit_bool<E: Error>(self, flag: bool) -> Result<Self::Value, E> {
         let read = matches!(self.0.kind, Kind::Category).then_some(Value::Boolean(flag));
-        checked(read)
+        self.checked(read)
     }
 
     fn visit_i64<E: Error>(self, integer: i64) -> Result<Self::Value, E> {
@@ -40,7 +40,7 @@ impl Visitor<'_> for ValueSeed<'_> {
             Kind::Category => Some(Value::Integer(integer)),
             _ => exact(integer.into()).and_then(|number| self.number(number)),
         };
-        checked(read)
+        self.checked(read)
     }
 
     fn visit_u64<E: Error>(self, integer: u64) -> Result<Self::Value, E> {
@@ -48,7 +48,7 @@ impl Visitor<'_> for ValueSeed<'_> {
             Kind::Category => i64::try_from(integer).ok().map(Value::Integer),
             _ => exact(integer.into()).and_then(|number| self.number(number)),
         };
-        checked(read)
+        self.checked(read)
     }
 
     fn visit_f64<E: Error>(self, number: f64) -> Result<Self::Value, E> {
@@ -56,7 +56,7 @@ impl Visitor<'_> for ValueSeed<'_> {
             Kind::Category => whole(number).map(Value::Integer),
             _ => self.number(number),
         };
-        checked(read)
+        self.checked(read)
     }
 
     fn visit_str<E: Error>(self, text: &str) -> Result<Self::Value, E> {
@@ -65,7 +65,7 @@ impl Visitor<'_> for ValueSeed<'_> {
             Kind::Cyclic { cycle: Cycle::Labels(labels), .. } => labels.position(text).map(Value::Label),
             Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. } => None,
         };
-        checked(read)
+        self.checked(read)
     }
 }
 
@@ -75,6 +75,11 @@ impl ValueSeed<'_> {
         // Adding 0.0 turns -0.0 into 0.0, so that equal numbers have equal bits.
         let is_number = matches!(self.0.kind, Kind::Number { .. } | Kind::Cyclic { cycle: Cycle::Period(_), .. });
         (is_number && number.is_finite()).then_some(Value::Number(number + 0.0))
+    }
+
+    /// The value that was `read`; an error if there is none, or may be none.
+    fn checked<E: Error>(&self, read: Option<Value>) -> Result<Option<Value>, E> {
+        if read.is_some() && !self.0.is_hidden { Ok(read) } else { Err(E::custom("not a value of the attribute")) }
     }
 }
 
@@ -89,9 +94,4 @@ pub(super) fn exact(integer: i128) -> Option<f64> {
         let number = integer as f64;
         (number as i128 == integer).then_some(number)
     }
-}
-
-/// The value that was `read`; an error if there is none.
-fn checked<E: Error>(read: Option<Value>) -> Result<Option<Value>, E> {
-    if read.is_some() { Ok(read) } else { Err(E::custom("not a value of the attribute")) }
 }

@@ -3,8 +3,6 @@
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
-use serde::{Deserialize, Serialize};
-
 use super::{Attribute, ByAttribute, Cycle, Kind, Labels, Value, Weights, read_text};
 use crate::document::{Faults, Path, Place, Quoted, Range, TWICE, list_known, normal};
 
@@ -86,6 +84,10 @@ impl Schema {
         for (name, member) in object.iter() {
             let weight = member.number(Range::NonNegative, faults);
             match (self.position(name), weight) {
+                // As they are written, so that they can be sent back.
+                (Some(position), Some(weight)) if self.attributes[position].is_hidden && weight > 0.0 => {
+                    faults.note(&member, HIDDEN);
+                }
                 (Some(position), _) if named.iter().any(|(known, _)| *known == position) => faults.note(&member, TWICE),
                 (Some(position), Some(weight)) => named.push((position, weight)),
                 (None, _) => self.note_unknown(name, &member, faults),
@@ -98,14 +100,36 @@ impl Schema {
     /// Reads an observation: an object by attribute name, or an array in attribute order. Shape
     /// `[n_attributes]`; `None` where an attribute is missing or null.
     pub fn read_observation(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Option<Value>>> {
+        self.read_some_values(place, false, faults)
+    }
+
+    /// As [`Self::read_observation`], of a state: hidden attributes may have values as others.
+    pub(crate) fn read_state(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Option<Value>>> {
+        self.read_some_values(place, true, faults)
+    }
+
+    fn read_some_values(
+        &self,
+        place: &Place<'_, '_>,
+        with_hidden: bool,
+        faults: &mut Faults,
+    ) -> Option<Vec<Option<Value>>> {
         use serde_json::Value as Json;
+        let read = |position: usize, place: &Place<'_, '_>, faults: &mut Faults| {
+            let attribute: &Attribute = &self.attributes[position];
+            if attribute.is_hidden && !with_hidden {
+                faults.note(place, HIDDEN);
+                return None;
+            }
+            attribute.read_value(place, faults)
+        };
         let mut observation = vec![None; self.len()];
         match place.value {
             Json::Array(items) if items.len() == self.len() => {
                 for (position, item) in items.iter().enumerate() {
                     let item = place.item(position, item);
                     if !item.value.is_null() {
-                        observation[position] = self.attributes[position].read_value(&item, faults);
+                        observation[position] = read(position, &item, faults);
                     }
                 }
             }
@@ -130,7 +154,7 @@ impl Schema {
                     match position {
                         Some(_) if member.value.is_null() => {}
                         Some(position) => {
-                            observation[position] = self.attributes[position].read_value(&member, faults);
+                            observation[position] = read(position, &member, faults);
                         }
                         None => self.note_unknown(name, &member, faults),
                     }
@@ -149,6 +173,22 @@ impl Schema {
     /// Reads the attributes of a model: `None` for each that is faulty, so that states can still be checked
     /// against the others.
     pub(crate) fn read(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Option<Attribute>>> {
+        let attributes = Self::read_with_values(place, faults)?;
+        for (n, item) in place.value.as_array().into_iter().flatten().enumerate() {
+            if let Some(values) = item.get("values").filter(|values| !values.is_null()) {
+                let item = place.item(n, item);
+                let place = Place { value: values, path: Path::Member(&item.path, "values") };
+                faults.note(
+                    &place,
+                    "the values of an attribute are told where states follow from rules, and nowhere else",
+                );
+            }
+        }
+        Some(attributes)
+    }
+
+    /// As [`Self::read`]; the member `values` of the attributes is left to the caller.
+    pub(crate) fn read_with_values(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Option<Attribute>>> {
         let items = place.array(faults)?;
         if items.is_empty() || items.len() > Self::MAX_ATTRIBUTES {
             let detail = format!("expected 1 to {} attributes, found {}", Self::MAX_ATTRIBUTES, items.len());
@@ -172,11 +212,21 @@ impl Schema {
 }
 
 fn read_attribute(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Attribute> {
-    let object = place.object(&["name", "kind", "scale", "period", "labels", "weight"], faults)?;
+    let object = place.object(&["name", "kind", "scale", "period", "labels", "weight", "hidden", "values"], faults)?;
     let name = object.required("name", faults).and_then(|place| read_name(&place, faults));
+    let is_hidden = match object.optional("hidden") {
+        Some(place) => place.boolean(faults),
+        None => Some(false),
+    };
     let weight = match object.optional("weight") {
-        Some(place) => place.number(Range::NonNegative, faults),
-        None => Some(1.0),
+        Some(place) => {
+            let weight = place.number(Range::NonNegative, faults);
+            if is_hidden == Some(true) && weight.is_some_and(|weight| weight > 0.0) {
+                faults.note(&place, HIDDEN);
+            }
+            weight
+        }
+        None => Some(if is_hidden == Some(true) { 0.0 } else { 1.0 }),
     };
     let scale = match object.optional("scale") {
         Some(place) => place.number(Range::Positive, faults),
@@ -212,8 +262,10 @@ fn read_attribute(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Attribut
         }
         _ => return kind.mismatch("one of \"number\", \"cyclic\", \"category\"", faults),
     };
-    Some(Attribute { name: name?, kind, weight: weight? })
+    Some(Attribute { name: name?, kind, weight: weight?, is_hidden: is_hidden? })
 }
+
+const HIDDEN: &str = "this attribute is hidden: it is never observed nor compared";
 
 fn read_name(place: &Place<'_, '_>, faults: &mut Faults) -> Option<String> {
     let name = normal(place.string(faults)?);
@@ -241,72 +293,4 @@ fn read_labels(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Labels> {
         }
     }
     (labels.len() == items.len()).then(|| Labels::new(labels.into_iter()))
-}
-
-/// How the values of an attribute are compared: as numbers, as numbers or labels on a circle, or as equal or not.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[serde(rename_all = "lowercase")]
-pub enum KindName {
-    /// `delta = |o - s| / scale`.
-    Number,
-    /// `delta = min(d mod p, p - d mod p) / scale`, `d = |o - s|`, `p` the period or the number of labels.
-    Cyclic,
-    /// `delta = 0` if equal, else 1. Strings have at most 1024 bytes.
-    Category,
-}
-
-/// An attribute, as it is written in JSON.
-///
-/// The distance between an observation `o` and a state `s` is the sum of `weight * delta^2` over all attributes, where `delta` is
-///
-/// - of a `number`: `|o - s| / scale`;
-/// - of a `cyclic`: `min(d mod p, p - d mod p) / scale`, where `d = |o - s|` and `p` is the `period`, or how many `labels` there are, which
-///   count as 0, 1, 2, .. in their order;
-/// - of a `category`: 0 if they are equal, else 1.
-///
-/// What was not observed adds nothing. An example: `x` is a `number` of `scale` 2, `heading` a `cyclic` with the `labels` east, north, west and
-/// south, and `door` a `category` of `weight` 5. Between the observation x = 0, east, open and the state x = 3, south, shut, the distance is
-/// `1 * (3 / 2)^2 + 1 * 1^2 + 5 * 1^2 = 8.25`: from east to south it is one step around the circle.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
-#[cfg_attr(feature = "openapi", schema(as = Attribute))]
-pub struct AttributeDocument {
-    /// Unique within the model; 1 to 64 characters.
-    #[cfg_attr(feature = "openapi", schema(example = "heading"))]
-    pub name: String,
-    /// How its values are compared.
-    pub kind: KindName,
-    /// `number` and `cyclic`: what counts as a difference of 1. Above 0; 1 if left out.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "openapi", schema(exclusive_minimum = 0.0))]
-    pub scale: Option<f64>,
-    /// `cyclic`: the circumference of the circle that values (numbers) lie on. Above 0. Either this or `labels`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "openapi", schema(exclusive_minimum = 0.0))]
-    pub period: Option<f64>,
-    /// `cyclic`: the values, in order around the circle: 1 to 65,536, each of at most 1024 bytes. All different.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub labels: Option<Vec<String>>,
-    /// Default weight `w` in the distance, to which the attribute adds `w * delta^2`, at most 1e150. At least 0; 1 if left
-    /// out.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[cfg_attr(feature = "openapi", schema(minimum = 0.0))]
-    pub weight: Option<f64>,
-}
-
-impl From<&Attribute> for AttributeDocument {
-    fn from(attribute: &Attribute) -> Self {
-        let (kind, scale, period, labels) = match &attribute.kind {
-            Kind::Number { scale } => (KindName::Number, Some(*scale), None, None),
-            Kind::Cyclic { scale, cycle: Cycle::Period(period) } => {
-                (KindName::Cyclic, Some(*scale), Some(*period), None)
-            }
-            Kind::Cyclic { scale, cycle: Cycle::Labels(labels) } => {
-                (KindName::Cyclic, Some(*scale), None, Some(labels.names().iter().map(ToString::to_string).collect()))
-            }
-            Kind::Category => (KindName::Category, None, None, None),
-        };
-        Self { name: attribute.name.clone(), kind, scale, period, labels, weight: Some(attribute.weight) }
-    }
 }

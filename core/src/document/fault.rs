@@ -51,6 +51,12 @@ impl Faults {
         }
     }
 
+    /// Notes a fault at what is called by a JSON pointer, in a document of several lines in a line of it.
+    #[cfg(feature = "rules")]
+    pub(crate) fn note_in(&mut self, line: Option<u64>, pointer: String, detail: impl Into<String>) {
+        self.list(Fault { line, pointer, detail: detail.into() });
+    }
+
     /// Lists a fault, if there is room for it.
     pub(super) fn list(&mut self, fault: Fault) {
         if self.listed.len() < Self::MAX_LISTED {

@@ -18,7 +18,7 @@ pub enum Path<'p> {
 
 impl Path<'_> {
     /// The line that it leads into, in a document of several.
-    pub(super) fn line(&self) -> Option<u64> {
+    pub(crate) fn line(&self) -> Option<u64> {
         match self {
             Path::Root => None,
             Path::Line(line) => Some(*line),

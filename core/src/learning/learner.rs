@@ -238,6 +238,7 @@ mod tests {
                 name: (*name).to_owned(),
                 kind: crate::attribute::Kind::Category,
                 weight: 4.0,
+                is_hidden: false,
             });
             Schema::of(attributes.collect())
         };

@@ -46,7 +46,8 @@ impl utoipa::ToSchema for ObservedDocument {
 }
 
 /// A state, or a list of states: an index, or attribute values that exactly one state has. In a world that is searched lazily, all
-/// attribute values but that of `gold`, which may be left out; there, only the start has an index, 0.
+/// attribute values, also those of hidden attributes, but that of `gold` in a wumpus world, which may be left out; there, only the start
+/// has an index, 0.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(untagged)]

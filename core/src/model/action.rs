@@ -37,7 +37,7 @@ pub struct ActionDocument {
     /// Unique within the model; 1 to 64 characters.
     #[cfg_attr(feature = "openapi", schema(value_type = String, example = "forward"))]
     pub name: Arc<str>,
-    /// What the body pays for it: 0 to 1e150. Left out: 1 in a table, 0.3 in a wumpus world.
+    /// What the body pays for it: 0 to 1e150. Left out: 1, in a wumpus world 0.3.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[cfg_attr(feature = "openapi", schema(minimum = 0.0, example = 0.3))]
     pub cost: Option<f64>,

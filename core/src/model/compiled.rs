@@ -86,22 +86,30 @@ impl Model {
         if dynamics.least_states(&mut meter)? > max_states as u64 {
             return Ok(Self::unexplored(schema, actions, dynamics));
         }
+        let work = dynamics.work().max(actions.len() as u64);
         let mut explored = dynamics.explore_from_start();
         let start = start_of(explored.n_found());
         let mut from = 0;
         while from < explored.n_found() {
             let n_bytes = explored.found_bytes() + explored.n_transitions() * TRANSITION_BYTES;
             if explored.n_found() > max_states || n_bytes > limits.max_bytes {
+                let n_stochastic = explored.n_stochastic();
                 drop(explored);
-                return Ok(Self::unexplored(schema, actions, dynamics));
+                return Ok(Self { n_stochastic, ..Self::unexplored(schema, actions, dynamics) });
             }
-            meter.spend_or_stop(actions.len() as u64)?;
+            meter.spend_or_stop(work)?;
             #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
             explored.explore(from as StateIdx);
             from += 1;
         }
+        let (n_stochastic, unsafe_states) = (explored.n_stochastic(), explored.unsafe_states().to_vec());
         let (states, graph) = explored.into_parts(&mut meter)?;
-        Ok(Self::listed(schema, actions, Arc::new(states), graph, start))
+        let mut is_unsafe = vec![false; if unsafe_states.is_empty() { 0 } else { states.len() as usize }];
+        for state in &unsafe_states {
+            is_unsafe[*state as usize] = true;
+        }
+        let listed = Self::listed(schema, actions, Arc::new(states), graph, start);
+        Ok(Self { n_stochastic, is_unsafe, n_unsafe: unsafe_states.len(), ..listed })
     }
 
     /// The model of which nothing but the start is known.
@@ -146,6 +154,11 @@ impl Model {
     /// For a model that is searched lazily: every way in which its actions change attributes. `None` if the model lists its transitions.
     pub(crate) fn operators(&self) -> Option<Box<dyn Iterator<Item = Operator> + '_>> {
         Some(self.unexplored.as_ref()?.operators())
+    }
+
+    /// Whether the [operators](Self::operators) tell all changes of the attribute at `attribute`; so do listed transitions.
+    pub(crate) fn is_told(&self, attribute: usize) -> bool {
+        self.unexplored.as_ref().is_none_or(|unexplored| unexplored.is_told(attribute))
     }
 
     /// What searches see of a model that lists its states.

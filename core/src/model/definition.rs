@@ -136,12 +136,13 @@ impl Model {
     ///
     /// # Errors
     ///
-    /// What `interrupt` said, if that was not to continue.
+    /// What `interrupt` said, if that was not to continue. [`CompileError::Faults`], where states follow from expressions, with those that
+    /// have no value, or none that their attribute may have, in a state that the body comes to.
     pub fn compile(
         definition: &Definition,
         limits: Limits,
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Self, Interrupted> {
+    ) -> Result<Self, CompileError> {
         Arc::clone(&definition.0).compile(limits, interrupt)
     }
 }
@@ -188,11 +189,11 @@ fn read_dynamics(
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[cfg_attr(feature = "openapi", schema(as = ModelDefinition))]
 pub struct DefinitionDocument {
-    /// The attributes of a state, in order: 1 to 256. Required with `table` dynamics; implied by `wumpus` dynamics
-    /// and then left out.
+    /// The attributes of a state, in order: 1 to 256. Required with `table` dynamics, and with `rules`, where they have `values`; implied
+    /// by `wumpus` dynamics and then left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub attributes: Option<Vec<AttributeDocument>>,
-    /// The actions of this body. Required with `table` dynamics; left out with `wumpus` dynamics: all six.
+    /// The actions of this body. Required with `table` dynamics and with `rules`; left out with `wumpus` dynamics: all six.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actions: Option<Vec<ActionDocument>>,
     /// Which states there are, and how actions lead from one to another.

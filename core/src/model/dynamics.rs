@@ -13,7 +13,7 @@ use std::sync::Arc;
 use serde::Serialize;
 
 use super::reading::{RawStates, RawTransitions};
-use super::{Action, ActionDocument, Limits, Model};
+use super::{Action, ActionDocument, CompileError, Limits, Model};
 use crate::attribute::{AttributeDocument, Schema};
 use crate::document::{Faults, Object, Place};
 use crate::interrupt::{Interrupt, Interrupted, Meter};
@@ -30,8 +30,9 @@ pub(crate) trait Dynamics: Any + Debug + Send + Sync {
     ///
     /// # Errors
     ///
-    /// What `interrupt` said, if that was not to continue.
-    fn compile(self: Arc<Self>, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted>;
+    /// What `interrupt` said, if that was not to continue; [`CompileError::Faults`] with what shows only where states are found: that
+    /// something leads out of what there is.
+    fn compile(self: Arc<Self>, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, CompileError>;
 
     /// Writes the definition as JSON in canonical form, with [`write_definition`].
     ///
@@ -61,7 +62,7 @@ pub(super) struct Description<'v, 'p> {
 /// their `kind`.
 pub(super) fn write_definition(
     writer: &mut dyn io::Write,
-    attributes: Option<&Schema>,
+    attributes: Option<Vec<AttributeDocument>>,
     actions: &[Action],
     dynamics: &impl Serialize,
 ) -> io::Result<()> {
@@ -72,7 +73,6 @@ pub(super) fn write_definition(
         actions: Vec<ActionDocument>,
         dynamics: &'d D,
     }
-    let attributes = attributes.map(|schema| schema.attributes().iter().map(AttributeDocument::from).collect());
     let actions = actions.iter().map(ActionDocument::from).collect();
     // A token at a time would be a virtual call at a time.
     let mut writer = io::BufWriter::with_capacity(1 << 16, writer);

@@ -34,6 +34,12 @@ struct Found {
     transitions: Vec<Transition>,
     /// One for each of the first transitions, as far as one has a cost of its own; the others have none.
     own_costs: Vec<OwnCost>,
+    /// Likewise, as far as one is one of several outcomes; the others are certain.
+    probabilities: Vec<f64>,
+    /// Of how many states and actions there are several outcomes.
+    n_stochastic: usize,
+    /// Unsafe states, which only stochastic actions lead into, ascending.
+    unsafe_states: Vec<StateIdx>,
 }
 
 impl Found {
@@ -43,6 +49,12 @@ impl Found {
             self.own_costs.push(OwnCost::of(own_cost));
         }
         self.transitions.push(transition);
+    }
+
+    /// Says how probable the last transition is.
+    fn set_probability(&mut self, probability: f64) {
+        self.probabilities.resize(self.transitions.len() - 1, 1.0);
+        self.probabilities.push(probability);
     }
 }
 
@@ -87,12 +99,25 @@ impl<D: Implicit> Frontier for NumberedStates<'_, D> {
     fn explore(&mut self, from: StateIdx, found: &mut Found) {
         let dynamics = self.dynamics;
         let state = self.states[from as usize].clone();
+        let mut last_stochastic = None;
         for (action, outcome) in dynamics.successors(&state) {
-            debug_assert!(outcome.is_certain(), "searches know no others");
-            if outcome.to != state && !dynamics.is_unsafe(&outcome.to) {
-                let to = self.number_of(outcome.to, found);
-                found.push(Transition { action, to }, outcome.cost);
+            if outcome.is_certain() {
+                if outcome.to != state && !dynamics.is_unsafe(&outcome.to) {
+                    let to = self.number_of(outcome.to, found);
+                    found.push(Transition { action, to }, outcome.cost);
+                }
+                continue;
             }
+            let is_unsafe = dynamics.is_unsafe(&outcome.to);
+            let n_known = self.states.len();
+            let to = self.number_of(outcome.to, found);
+            if is_unsafe && self.states.len() > n_known {
+                found.unsafe_states.push(to);
+                found.bounds[to as usize] = (0, 0);
+            }
+            found.push(Transition { action, to }, outcome.cost);
+            found.set_probability(outcome.probability);
+            found.n_stochastic += usize::from(last_stochastic.replace(action) != Some(action));
         }
     }
 
@@ -102,7 +127,7 @@ impl<D: Implicit> Frontier for NumberedStates<'_, D> {
 
     fn state_bytes(&self) -> usize {
         // The index is at most half empty just after it has grown.
-        size_of::<D::State>() + 2 * size_of::<(D::State, StateIdx)>()
+        size_of::<D::State>() + 2 * size_of::<(D::State, StateIdx)>() + 2 * self.dynamics.state_bytes()
     }
 }
 
@@ -110,7 +135,15 @@ impl<'d> Explored<'d> {
     /// Only the states `first`, numbered from 0, none of them explored.
     fn new<D: Implicit>(dynamics: &'d D, first: impl IntoIterator<Item = D::State>) -> Self {
         let states = States::new(dynamics.domains(), Vec::new());
-        let mut found = Found { states, bounds: Vec::new(), transitions: Vec::new(), own_costs: Vec::new() };
+        let mut found = Found {
+            states,
+            bounds: Vec::new(),
+            transitions: Vec::new(),
+            own_costs: Vec::new(),
+            probabilities: Vec::new(),
+            n_stochastic: 0,
+            unsafe_states: Vec::new(),
+        };
         let mut numbered = NumberedStates { dynamics, states: Vec::new(), numbers: FxHashMap::default() };
         for state in first {
             numbered.number_of(state, &mut found);
@@ -121,6 +154,16 @@ impl<'d> Explored<'d> {
     /// How many states were found.
     pub(super) fn n_found(&self) -> usize {
         self.found.bounds.len()
+    }
+
+    /// Of how many states and actions several outcomes were found.
+    pub(super) fn n_stochastic(&self) -> usize {
+        self.found.n_stochastic
+    }
+
+    /// The unsafe states that were found, ascending.
+    pub(super) fn unsafe_states(&self) -> &[StateIdx] {
+        &self.found.unsafe_states
     }
 
     /// How many transitions were found.
@@ -144,16 +187,17 @@ impl<'d> Explored<'d> {
     ///
     /// What the interrupt of `meter` said, if that was not to continue.
     pub(super) fn into_parts(self, meter: &mut Meter<'_>) -> Result<(States, Graph), Interrupted> {
-        let Self { found: Found { states, bounds, transitions, own_costs }, .. } = self;
+        let Self { found: Found { states, bounds, transitions, own_costs, probabilities, .. }, .. } = self;
         let explored = (0..).zip(&bounds).filter(|(_, bounds)| **bounds != UNEXPLORED);
         let numbers =
             explored.flat_map(|(from, (begin, end))| (*begin as usize..*end as usize).map(move |n| (from, n)));
         let n_states = states.len() as usize;
-        let graph = if own_costs.is_empty() {
+        let graph = if own_costs.is_empty() && probabilities.is_empty() {
             Graph::new(n_states, numbers.map(|(from, n)| (from, transitions[n])), meter)?
         } else {
             let own_cost = |n: usize| own_costs.get(n).copied().unwrap_or(OwnCost::NONE);
-            let edges = numbers.map(|(from, n)| (from, (transitions[n], own_cost(n), 1.0)));
+            let probability = |n: usize| probabilities.get(n).copied().unwrap_or(1.0);
+            let edges = numbers.map(|(from, n)| (from, (transitions[n], own_cost(n), probability(n))));
             Graph::of_outcomes(n_states, edges, meter)?
         };
         Ok((states, graph))
@@ -204,6 +248,7 @@ impl Space for Explored<'_> {
         make_room(&mut self.found.bounds, growth);
         make_room(&mut self.found.transitions, growth);
         make_room(&mut self.found.own_costs, growth);
+        make_room(&mut self.found.probabilities, growth);
         self.found.states.make_room(growth);
         self.frontier.make_room(growth);
     }
@@ -214,6 +259,7 @@ impl Space for Explored<'_> {
         let state_bytes = self.frontier.state_bytes() + size_of::<(u32, u32)>() + row_bytes;
         let transition_bytes =
             size_of_val(self.found.transitions.as_slice()) + size_of_val(self.found.own_costs.as_slice());
+        let transition_bytes = transition_bytes + size_of_val(self.found.probabilities.as_slice());
         self.n_found() * state_bytes + transition_bytes
     }
 }
@@ -234,6 +280,9 @@ pub(crate) trait Unexplored: Debug + Send + Sync {
 
     /// As [`Implicit::operators`].
     fn operators(&self) -> Box<dyn Iterator<Item = Operator> + '_>;
+
+    /// As [`Implicit::is_told`].
+    fn is_told(&self, attribute: usize) -> bool;
 }
 
 impl<D: Implicit> Unexplored for D {
@@ -258,5 +307,9 @@ impl<D: Implicit> Unexplored for D {
 
     fn operators(&self) -> Box<dyn Iterator<Item = Operator> + '_> {
         Box::new(Implicit::operators(self))
+    }
+
+    fn is_told(&self, attribute: usize) -> bool {
+        Implicit::is_told(self, attribute)
     }
 }

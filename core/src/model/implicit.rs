@@ -126,12 +126,28 @@ pub trait Implicit: Debug + Send + Sync + 'static {
     /// Whether `state` must never be entered.
     fn is_unsafe(&self, state: &Self::State) -> bool;
 
-    /// Where each action leads from `state`, in the order of the actions. An action may be left out, or lead nowhere else, if it has no
-    /// effect; and it may lead into an unsafe state.
+    /// Where each action leads from `state`, in the order of the actions; if it may lead to several states, these are different. An action
+    /// may be left out, or lead nowhere else, if it has no effect; and it may lead into an unsafe state.
     fn successors(&self, state: &Self::State) -> impl Iterator<Item = (ActionIdx, Outcome<Self::State>)>;
 
     /// Every way in which the actions change attributes. See [`Operator`] for what these must cover.
     fn operators(&self) -> impl Iterator<Item = Operator>;
+
+    /// Whether the operators tell all changes of the attribute at `attribute`. Searches estimate nothing by another.
+    fn is_told(&self, attribute: usize) -> bool {
+        let _ = attribute;
+        true
+    }
+
+    /// About how much work it is to find the successors of a state, in tens of nanoseconds.
+    fn work(&self) -> u64 {
+        1
+    }
+
+    /// How much memory a state takes besides its own size, in bytes.
+    fn state_bytes(&self) -> usize {
+        0
+    }
 
     /// How many states the body is certain to reach. If these are more than a model may have, nothing is explored in vain.
     ///

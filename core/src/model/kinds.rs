@@ -3,20 +3,28 @@
 use serde::{Deserialize, Serialize};
 
 use super::dynamics::Read;
+#[cfg(feature = "rules")]
+use super::rules::{self, RulesDocument};
 use super::table::{self, TableDocument};
 use super::wumpus::{self, WumpusDocument};
 
 /// Each kind's name in JSON, and what reads it.
-const KINDS: [(&str, Read); 2] = [("table", table::read), ("wumpus", wumpus::read)];
+const KINDS: &[(&str, Read)] = &[
+    ("table", table::read),
+    ("wumpus", wumpus::read),
+    #[cfg(feature = "rules")]
+    ("rules", rules::read),
+];
 
 /// What reads the dynamics of the kind called `name`.
 pub(super) fn reader(name: &str) -> Option<Read> {
-    KINDS.into_iter().find(|(known, _)| *known == name).map(|(_, read)| read)
+    KINDS.iter().find(|(known, _)| *known == name).map(|(_, read)| *read)
 }
 
 /// The names of all kinds, as they are listed in a fault.
 pub(super) fn names() -> String {
-    KINDS.map(|(name, _)| format!("{name:?}")).join(", ")
+    let names: Vec<String> = KINDS.iter().map(|(name, _)| format!("{name:?}")).collect();
+    names.join(", ")
 }
 
 /// Which states there are, and how actions lead from one to another.
@@ -31,4 +39,8 @@ pub enum DynamicsDocument {
     /// They follow from the rules of the wumpus world.
     #[cfg_attr(feature = "openapi", schema(title = "WumpusDynamics"))]
     Wumpus(WumpusDocument),
+    /// They follow from rules that the model tells.
+    #[cfg(feature = "rules")]
+    #[cfg_attr(feature = "openapi", schema(title = "RulesDynamics"))]
+    Rules(RulesDocument),
 }

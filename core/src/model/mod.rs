@@ -20,7 +20,7 @@
 //! | `implicit`, `explored` | rules by which states follow from one another; what was found by them |
 //! | `reach`, `compiled`, `origin` | which values states have; the model; where a request says that the imitator starts |
 //! | `dynamics` | the seam: what every kind of dynamics is to the rest |
-//! | `table`, `wumpus` | the kinds, a folder each |
+//! | `table`, `wumpus`, `rules` | the kinds, a folder each |
 //! | `kinds` | the list of kinds |
 //! | `definition`, `builder`, `import` | what a client registers, as JSON, by calls, or from the files of other tools |
 //!
@@ -43,6 +43,8 @@ mod reach;
 mod reading;
 mod room;
 mod rows;
+#[cfg(feature = "rules")]
+mod rules;
 mod space;
 mod states;
 mod table;
@@ -62,6 +64,8 @@ pub use origin::{Origin, OriginRow};
 pub use reading::{Format, MAX_LINE_BYTES, ReadError};
 pub(crate) use room::{make_room, room_to_make};
 pub(crate) use rows::Rows;
+#[cfg(feature = "rules")]
+pub use rules::{OutcomeDocument, RuleDocument, RulesDocument, StatesDocument};
 pub(crate) use space::{Space, Whole};
 pub use states::{Start, StateIdx, States};
 pub use table::{ActionReference, StartDocument, Table, TableDocument, TransitionDocument};

@@ -4,8 +4,9 @@ use super::ActionIdx;
 
 /// A way in which an action changes the values of some attributes. Values are indices into the domains.
 ///
-/// The operators of a model allow all that its transitions do, and may allow more: every transition has an operator of its action that
-/// changes the same attributes from and to the same values, and that keeps nothing but what the transition keeps.
+/// The operators of a model allow all that its transitions do, and may allow more. For each attribute that a transition changes, there is
+/// an operator of its action that changes this attribute from and to the same values, that changes all others that the transition changes,
+/// in whatever way, that keeps nothing but what the transition keeps, and that costs no more.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Operator {
     /// The action.

@@ -182,7 +182,7 @@ impl Model {
 
     fn read_wanted(&self, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Vec<Option<Value>>> {
         let n_before = faults.count();
-        let wanted = self.schema.read_observation(place, faults)?;
+        let wanted = self.schema.read_state(place, faults)?;
         (faults.count() == n_before).then_some(wanted)
     }
 

@@ -1,8 +1,8 @@
 //! What it takes to make models ready to be searched.
 
-use etude_core::interrupt::{Cancelled, Interrupt, Interrupted, Signal, Uninterrupted};
+use etude_core::interrupt::{Cancelled, Interrupt, Signal, Uninterrupted};
 use etude_core::mapping::Mapper;
-use etude_core::model::{Definition, Limits, Model};
+use etude_core::model::{CompileError, Definition, Limits, Model};
 use serde_json::{Value, json};
 
 /// A line of states, of which each leads on to the next two; the attribute tells all of them apart.
@@ -20,9 +20,9 @@ fn read(definition: &Value) -> Definition {
     Definition::read(definition, Limits::DEFAULT, &mut Uninterrupted).unwrap()
 }
 
-fn compile(definition: &Definition, interrupt: &mut dyn Interrupt) -> Result<Mapper, Interrupted> {
+fn compile(definition: &Definition, interrupt: &mut dyn Interrupt) -> Result<Mapper, CompileError> {
     let model = Model::compile(definition, Limits::DEFAULT, interrupt)?;
-    Mapper::new(model, interrupt)
+    Ok(Mapper::new(model, interrupt)?)
 }
 
 #[test]
@@ -37,15 +37,15 @@ fn compiling_asks_again_and_again_whether_to_go_on_and_has_no_result_if_its_time
         };
         assert!(compile(&definition, &mut count).is_ok());
         assert!(n_polls > 10, "{n_polls}");
-        let ends = [(Signal::Finish, Interrupted::OutOfTime), (Signal::Cancel, Interrupted::Cancelled(Cancelled))];
+        let ends = [(Signal::Finish, CompileError::OutOfTime), (Signal::Cancel, CompileError::Cancelled(Cancelled))];
         for n in (1..=n_polls).step_by(n_polls / 10) {
-            for (signal, expected) in ends {
+            for (signal, expected) in ends.clone() {
                 let mut n_left = n;
                 let compiled = compile(&definition, &mut || {
                     n_left -= 1;
                     if n_left == 0 { signal } else { Signal::Continue }
                 });
-                assert_eq!(compiled.err(), Some(expected), "{n} of {n_polls}");
+                assert_eq!(compiled.err().as_ref(), Some(&expected), "{n} of {n_polls}");
             }
         }
     }

@@ -18,3 +18,5 @@ mod mapping;
 mod online;
 mod oracle;
 mod problems;
+#[cfg(feature = "rules")]
+mod rules;

@@ -208,13 +208,17 @@ mod tests {
     use crate::document::{self, Faults, Place};
 
     fn schema() -> Schema {
-        let attribute = |name: &str, kind| Attribute { name: name.to_owned(), kind, weight: 1.0 };
+        schema_with_door(false)
+    }
+
+    fn schema_with_door(is_hidden: bool) -> Schema {
+        let attribute = |name: &str, kind| Attribute { name: name.to_owned(), kind, weight: 1.0, is_hidden: false };
         let cyclic = |cycle| Kind::Cyclic { scale: 1.0, cycle };
         Schema::of(vec![
             attribute("x", Kind::Number { scale: 1.0 }),
             attribute("angle", cyclic(Cycle::Period(360.0))),
             attribute("heading", cyclic(Cycle::Labels(Labels::of(["east", "north", "tr\u{e4}ge"])))),
-            attribute("door", Kind::Category),
+            Attribute { is_hidden, ..attribute("door", Kind::Category) },
         ])
     }
 
@@ -287,9 +291,10 @@ mod tests {
         #[test]
         fn what_is_well_formed_is_read_alike_and_the_rest_is_left_alone(
             observations in proptest::collection::vec(observation(), 0..4),
+            is_door_hidden in any::<bool>(),
             after in prop_oneof![30 => Just(""), 1 => Just(" "), 1 => Just("]"), 1 => Just(",1")],
         ) {
-            let schema = schema();
+            let schema = schema_with_door(is_door_hidden);
             let text = format!("[{}]{after}", observations.join(" ,"));
             let document = document::parse(text.as_bytes());
             let mut faults = Faults::default();

@@ -118,6 +118,9 @@ impl Projections {
         let states = model.states();
         let positions = (0..model.schema().len()).filter(|position| states.domain(*position).len() > 1);
         let mut found = EdgeSets::of(positions.collect(), max_edges);
+        for (position, edges) in found.positions.iter().zip(&mut found.edges) {
+            *edges = edges.take().filter(|_| model.is_told(*position));
+        }
         match model.operators() {
             None => {
                 let graph = model.graph();

@@ -12,9 +12,9 @@ pub(super) use edges::{Edges, Uneven};
 pub(super) use reading::read;
 
 use super::dynamics::{Dynamics, write_definition};
-use super::{Action, Graph, Limits, Model, Start, StateIdx, States};
-use crate::attribute::Schema;
-use crate::interrupt::{Interrupt, Interrupted, Meter};
+use super::{Action, CompileError, Graph, Limits, Model, Start, StateIdx, States};
+use crate::attribute::{AttributeDocument, Schema};
+use crate::interrupt::{Interrupt, Meter};
 
 /// Cost of an action that names none.
 const DEFAULT_ACTION_COST: f64 = 1.0;
@@ -79,7 +79,7 @@ impl Dynamics for Table {
 
     /// Leaves out transitions that no mapping can use: those into unsafe states, and those without effect, as a `skip` costs no action. Of an
     /// action with several outcomes, all of them stay.
-    fn compile(self: Arc<Self>, _: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted> {
+    fn compile(self: Arc<Self>, _: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, CompileError> {
         /// How many transitions are looked at between two looks at the interrupt: less than a millisecond.
         const POLL_EVERY: u64 = 1 << 14;
         let mut meter = Meter::new(interrupt, POLL_EVERY);
@@ -110,7 +110,8 @@ impl Dynamics for Table {
     }
 
     fn write(&self, writer: &mut dyn io::Write) -> io::Result<()> {
-        write_definition(writer, Some(&self.schema), &self.actions, self)
+        let attributes = self.schema.attributes().iter().map(AttributeDocument::from);
+        write_definition(writer, Some(attributes.collect()), &self.actions, self)
     }
 }
 

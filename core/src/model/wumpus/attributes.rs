@@ -20,8 +20,12 @@ pub(super) fn schema(n_wumpi: usize, n_gold: usize) -> Schema {
     let number = Kind::Number { scale: 1.0 };
     let labels = Labels::of(Heading::ALL.map(Heading::name));
     let heading = Kind::Cyclic { scale: 1.0, cycle: Cycle::Labels(labels) };
-    let attribute =
-        |name: &str, kind: &Kind, weight: f64| Attribute { name: name.to_owned(), kind: kind.clone(), weight };
+    let attribute = |name: &str, kind: &Kind, weight: f64| Attribute {
+        name: name.to_owned(),
+        kind: kind.clone(),
+        weight,
+        is_hidden: false,
+    };
     let mut attributes = vec![
         attribute("x", &number, 1.0),
         attribute("y", &number, 1.0),

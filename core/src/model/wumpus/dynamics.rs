@@ -10,7 +10,7 @@ use super::{Act, Cave, CaveState, Heading, cell_index};
 use crate::attribute::{Schema, Value};
 use crate::interrupt::{Interrupt, Interrupted, Meter};
 use crate::model::dynamics::{Dynamics, write_definition};
-use crate::model::{ActionIdx, Implicit, Limits, Model, Operator, Outcome, StateIdx};
+use crate::model::{ActionIdx, CompileError, Implicit, Limits, Model, Operator, Outcome, StateIdx};
 
 impl Dynamics for Cave {
     fn schema(&self) -> &Schema {
@@ -30,8 +30,8 @@ impl Dynamics for Cave {
         compiled.saturating_add(n_states.saturating_mul(EXPLORED_BYTES)).min(limits.max_bytes as u64)
     }
 
-    fn compile(self: Arc<Self>, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, Interrupted> {
-        Model::explore(self.schema.clone(), self.actions.clone(), self, limits, interrupt)
+    fn compile(self: Arc<Self>, limits: Limits, interrupt: &mut dyn Interrupt) -> Result<Model, CompileError> {
+        Ok(Model::explore(self.schema.clone(), self.actions.clone(), self, limits, interrupt)?)
     }
 
     fn write(&self, writer: &mut dyn io::Write) -> io::Result<()> {
