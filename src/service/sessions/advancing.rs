@@ -16,7 +16,7 @@ use etude_core::mapping::{OnlineMapping, Stopped};
 impl Session {
     /// The mapping as it was after the last step that is `kept`, if any is, of which the session takes note.
     pub(super) fn begin(&mut self, kept: Option<&Kept>) -> Result<OnlineMapping, SessionError> {
-        let (mapper, weights, conditions) = (&*self.mapper, self.weights.clone(), self.conditions.clone());
+        let (mapper, weights, conditions) = (&self.mapper, self.weights.clone(), self.conditions.clone());
         let Some(kept) = kept else { return Ok(OnlineMapping::new(mapper, weights, conditions, self.lookahead)) };
         let online = OnlineMapping::resume(mapper, weights, conditions, self.lookahead, &kept.root, kept.moves());
         let online =

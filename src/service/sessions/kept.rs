@@ -19,7 +19,7 @@ const MANY: usize = 256;
 const FEW: usize = 8;
 
 /// A committed step, as it was told, in short. Floats keep their bits.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ShortStep {
     step: CommittedMove,
     told: Told,
@@ -44,7 +44,7 @@ impl ShortStep {
     /// Committed step number `number`, of `model`. Of its distance, the terms by attribute are not kept.
     #[must_use]
     pub fn written(&self, number: u32, model: &Model) -> CommittedStep {
-        let Self { step: CommittedMove { step, action_cost }, told } = self;
+        let Self { step: CommittedMove { step, action_cost, row: _ }, told } = self;
         let Told { distance, cost, is_proven, after } = *told;
         let step = Step {
             step: number,
@@ -156,6 +156,6 @@ impl Kept {
 
     /// The steps, as the mapping goes on from them.
     pub(super) fn moves(&self) -> impl Iterator<Item = CommittedMove> {
-        self.steps.iter().map(|step| step.step)
+        self.steps.iter().map(|step| step.step.clone())
     }
 }
