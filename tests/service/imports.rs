@@ -15,11 +15,15 @@ async fn put(service: &Service, path: &str, content_type: &str, body: Vec<u8>) -
 #[tokio::test]
 async fn a_file_is_registered_by_its_content_type_as_the_model_that_it_gives() {
     let service = Service::start(&[]).await;
-    let cases = [(ImportFormat::Gymnasium, "gymnasium/taxi.json", "?without=w*&cost=dropoff=1&rename=east=right")];
+    let cases = [
+        (ImportFormat::Gymnasium, "gymnasium/taxi.json", "?without=w*&cost=dropoff=1&rename=east=right"),
+        (ImportFormat::Sas, "planning/blocksworld-4.sas", "?without=stack%20c%20*"),
+    ];
     for (format, path, query) in cases {
         let body = example_bytes(path);
         let mut edits = Edits::default();
-        for (name, value) in query.trim_start_matches('?').split('&').filter_map(|part| part.split_once('=')) {
+        let query_text = query.replace("%20", " ");
+        for (name, value) in query_text.trim_start_matches('?').split('&').filter_map(|part| part.split_once('=')) {
             match name {
                 "without" => edits.without.push(value.to_owned()),
                 "cost" => edits.add_cost(value).unwrap(),

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::dynamics::Read;
+use super::planning::{self, PlanningDocument};
 #[cfg(feature = "rules")]
 use super::rules::{self, RulesDocument};
 use super::table::{self, TableDocument};
@@ -11,6 +12,7 @@ use super::wumpus::{self, WumpusDocument};
 /// Each kind's name in JSON, and what reads it.
 const KINDS: &[(&str, Read)] = &[
     ("table", table::read),
+    ("planning", planning::read),
     ("wumpus", wumpus::read),
     #[cfg(feature = "rules")]
     ("rules", rules::read),
@@ -36,6 +38,9 @@ pub enum DynamicsDocument {
     /// States and transitions are listed.
     #[cfg_attr(feature = "openapi", schema(title = "TableDynamics"))]
     Table(TableDocument),
+    /// Actions need some values and change some.
+    #[cfg_attr(feature = "openapi", schema(title = "PlanningDynamics"))]
+    Planning(PlanningDocument),
     /// They follow from the rules of the wumpus world.
     #[cfg_attr(feature = "openapi", schema(title = "WumpusDynamics"))]
     Wumpus(WumpusDocument),

@@ -20,7 +20,7 @@
 //! | `implicit`, `explored` | rules by which states follow from one another; what was found by them |
 //! | `reach`, `compiled`, `origin` | which values states have; the model; where a request says that the imitator starts |
 //! | `dynamics` | the seam: what every kind of dynamics is to the rest |
-//! | `table`, `wumpus`, `rules` | the kinds, a folder each |
+//! | `table`, `planning`, `rules`, `wumpus` | the kinds, a folder each |
 //! | `kinds` | the list of kinds |
 //! | `definition`, `builder`, `import` | what a client registers, as JSON, by calls, or from the files of other tools |
 //!
@@ -39,6 +39,7 @@ mod kinds;
 mod limits;
 mod operator;
 mod origin;
+mod planning;
 mod reach;
 mod reading;
 mod room;
@@ -61,6 +62,7 @@ pub use kinds::DynamicsDocument;
 pub use limits::{CompileError, Limits};
 pub use operator::Operator;
 pub use origin::{Origin, OriginRow};
+pub use planning::{ConditionalDocument, OperatorDocument, PackedState, Planning, PlanningDocument};
 pub use reading::{Format, MAX_LINE_BYTES, ReadError};
 pub(crate) use room::{make_room, room_to_make};
 pub(crate) use rows::Rows;

@@ -47,6 +47,18 @@ impl Table {
 }
 
 impl Table {
+    /// The table of a model that lists its states, none of which is unsafe. `edges` are its transitions.
+    pub(super) fn of_model(model: &Model, edges: Edges) -> Self {
+        Self {
+            schema: model.schema.clone(),
+            actions: model.actions.clone(),
+            states: Arc::clone(&model.states),
+            edges,
+            start: model.start.clone(),
+            unsafe_states: Vec::new(),
+        }
+    }
+
     /// How many states there are.
     #[must_use]
     pub fn n_states(&self) -> usize {
