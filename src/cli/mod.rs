@@ -6,6 +6,7 @@ mod drawing;
 mod experiment;
 mod healthcheck;
 mod input;
+mod inspect;
 mod learner;
 mod map;
 mod model;
@@ -51,7 +52,7 @@ enum Command {
     Stream(stream::Stream),
     /// Start a service, send it the demonstration of figure 4, and show what comes back.
     Demo,
-    /// Make models from the files of other tools.
+    /// Make models from the files of other tools, and inspect models.
     Model(model::ModelCommand),
     /// Check, export and import learners.
     Learner(learner::LearnerCommand),

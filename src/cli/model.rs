@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::inspect::Inspect;
 use super::{CliError, note};
 use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Definition, Edits, ImportError, ImportFile, ImportFormat, Limits, Table, import};
@@ -23,6 +24,8 @@ enum Command {
     ///
     /// Compressed files (gzip, zstd) are read as they are.
     Import(Import),
+    /// Tell what a body comes to, what it cannot undo, how far a stream should look ahead, and what of a demonstration it can never meet.
+    Inspect(Inspect),
 }
 
 #[derive(Args, Debug)]
@@ -51,6 +54,7 @@ impl ModelCommand {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
         match &self.command {
             Command::Import(import) => import.run(out),
+            Command::Inspect(inspect) => inspect.run(out),
         }
     }
 }

@@ -206,13 +206,13 @@ impl FromStr for Lookahead {
     }
 }
 
-fn parse_start(text: &str) -> Result<Value, String> {
+pub(super) fn parse_start(text: &str) -> Result<Value, String> {
     parse_json(text).map_err(|_| {
         r#"expected a state's index, or attribute values such as '{"x": 0, "heading": "east"}'"#.to_owned()
     })
 }
 
-fn parse_weight(text: &str) -> Result<(String, f64), String> {
+pub(super) fn parse_weight(text: &str) -> Result<(String, f64), String> {
     parse_named_number(text, "expected ATTRIBUTE=WEIGHT, such as x=2")
 }
 

@@ -22,25 +22,25 @@ pub(super) fn width() -> usize {
 pub(super) const WIDTH: usize = 100;
 
 /// A column of a table.
-struct Column {
+pub(super) struct Column {
     header: &'static str,
     alignment: CellAlignment,
     cells: Vec<String>,
 }
 
 impl Column {
-    fn new(header: &'static str, alignment: CellAlignment, cells: impl Iterator<Item = String>) -> Self {
+    pub(super) fn new(header: &'static str, alignment: CellAlignment, cells: impl Iterator<Item = String>) -> Self {
         Self { header, alignment, cells: cells.collect() }
     }
 
     /// How wide it is.
-    fn width(&self) -> usize {
+    pub(super) fn width(&self) -> usize {
         let lines = self.cells.iter().flat_map(|cell| cell.lines());
         lines.chain([self.header]).map(|line| line.chars().count()).max().unwrap_or(0)
     }
 
     /// Breaks its lines between words, so that it is no wider than `width`, but for words that are.
-    fn wrap(&mut self, width: usize) {
+    pub(super) fn wrap(&mut self, width: usize) {
         self.cells.iter_mut().for_each(|cell| *cell = wrapped(cell, width).join("\n"));
     }
 }
@@ -96,7 +96,7 @@ pub(super) fn steps(policy: &Policy, width: usize) -> String {
 }
 
 /// The columns side by side.
-fn table(columns: &[Column], gap: usize) -> String {
+pub(super) fn table(columns: &[Column], gap: usize) -> String {
     let mut table = Table::new();
     table.load_preset(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
     table.set_style(TableComponent::HeaderLines, '─').remove_style(TableComponent::VerticalLines);

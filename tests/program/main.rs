@@ -10,6 +10,7 @@ mod commands;
 mod disk;
 mod imports;
 mod inputs;
+mod inspect;
 mod kill_rewards;
 mod kill_streams;
 mod readme;

@@ -37,7 +37,7 @@ pub struct Report {
     /// How many actions it takes to undo one. `null` if there was no time for it.
     pub undo: Option<UndoReport>,
     /// How many observations a stream should look ahead: one more than the most actions that it takes to undo one, at most 100,000. With fewer, a
-    /// body that has to go a long way round does not see that it is worth it. `null`: see `unknown`.
+    /// body that has to go a long way round does not see that it is worth it. What can never be undone may need more. `null`: see `unknown`.
     pub lookahead: Option<u64>,
     /// What of the demonstration the body can never meet; `null` without one.
     pub demonstration: Option<DemonstrationReport>,
@@ -72,7 +72,7 @@ pub struct ReachReport {
     pub starts: u64,
     /// To how many states the body comes, start states among them.
     pub states: u64,
-    /// How many ways there are between these: one for each action and state that it may lead to, if that is another.
+    /// How many transitions there are between these, without those that lead to where they begin or that the body cannot or must not make.
     pub transitions: u64,
     /// The states to which it never comes, without unsafe ones.
     pub unreachable: StatesReport,
@@ -146,7 +146,7 @@ pub struct AttributeReport {
     pub span: Option<Span>,
     /// Its values; `null` if they are numbers, or more than 32.
     pub values: Option<Vec<Scalar>>,
-    /// How many ways between states change it; 0: it stays what it is at the start. `null` if it may change and it is not known how often.
+    /// How many of the transitions change it; 0: it stays what it is at the start. `null` if it may change and it is not known how often.
     pub changed_by: Option<u64>,
 }
 
@@ -173,19 +173,19 @@ pub struct ActionReport {
     pub applies_in: Option<u64>,
     /// The most actions that it takes to undo it, as far as that was looked for; `null` if it was never seen to be undone.
     pub undone_in: Option<u64>,
-    /// How many of its ways, as far as they were looked at, nothing undoes. `null` if there was no time for it.
+    /// How many of its transitions, as far as they were looked at, nothing undoes. `null` if there was no time for it.
     pub never_undone: Option<u64>,
 }
 
-/// How many actions it takes to undo one: after a way from one state to another, the fewest by which the body comes to a state with the
+/// How many actions it takes to undo one: after a transition from one state to another, the fewest by which the body comes to a state with the
 /// values of the first, in all attributes that weigh something. If actions have several outcomes, those that are wanted are what counts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct UndoReport {
-    /// Whether all ways were looked at, and what was found of each is certain. If not, ways from an even sample of the states were, or of a model
+    /// Whether all transitions were looked at, and what was found of each is certain. If not, those from an even sample of the states were, or of a model
     /// that is searched lazily, from states close to the start; and more actions may be needed elsewhere.
     pub exact: bool,
-    /// How many ways there are, as far as they are known.
+    /// How many transitions there are, as far as they are known.
     pub transitions: u64,
     /// How many of them were looked at.
     pub examined: u64,

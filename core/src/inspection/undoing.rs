@@ -1,5 +1,7 @@
 //! How many actions it takes until everything that is compared is as it was before an action.
 
+use std::borrow::Cow;
+
 use super::report::{Steps, UndoReport, Unknown};
 use super::{Classes, Extent, Parts, Reached};
 use crate::attribute::Weights;
@@ -7,8 +9,8 @@ use crate::interrupt::{Interrupted, Meter};
 use crate::mapping::Demonstration;
 use crate::model::{ActionIdx, Model, Rows};
 
-/// How many ways are looked at in all: about a second.
-const MAX_WORK: u64 = 1 << 27;
+/// How many ways are looked at in all: a second or two.
+const MAX_WORK: u64 = 1 << 26;
 
 /// How many states are looked at for one way.
 const MAX_SEEN: usize = 1 << 16;
@@ -64,8 +66,10 @@ impl Undoing {
             Some(_) if classes.len() < reached.n_states() => Some(parts_of_classes(reached, &classes, meter)?),
             _ => None,
         };
-        let is_identity = classes.len() == reached.n_states();
-        let parts = of_classes.as_ref().or(parts.filter(|_| is_identity));
+        let parts: Option<Cow<'_, [u32]>> = match &of_classes {
+            Some(of_classes) => Some(classes.of.iter().map(|class| of_classes.of[*class as usize]).collect()),
+            None => parts.map(|parts| Cow::Borrowed(&*parts.of)),
+        };
         let n_from = match reached.extent {
             Extent::Whole => reached.n_states(),
             Extent::Part => reached.ways.n_rows() / EXPLORED_FOR_EACH,
@@ -77,9 +81,9 @@ impl Undoing {
             n_ways: reached.ways.n_items() as u64,
             n_undone: Vec::new(),
         };
-        let mut search =
-            Search { reached, classes: &classes, parts, seen: Vec::new(), n_searches: 0, queue: Vec::new() };
-        search.seen.resize(reached.n_states(), 0);
+        let seen = vec![0; reached.n_states()];
+        let (classes, parts) = (&*classes.of, parts.as_deref());
+        let mut search = Search { reached, classes, parts, seen, n_searches: 0, queue: Vec::new() };
         let mut work = 0;
         for from in evenly(n_from) {
             for way in reached.ways.of(from as usize) {
@@ -126,7 +130,9 @@ impl Undoing {
 
     /// Why there is no lookahead, if there is none.
     pub(super) fn unknown(&self) -> Option<Unknown> {
-        let detail = if self.all.n_unknown > 0 {
+        let detail = if self.n_ways == 0 {
+            "the body can do nothing where it is, so that no lookahead makes a difference"
+        } else if self.all.n_unknown > 0 {
             "whatever the body does takes longer to be undone than was looked for, if it can be undone at all: no lookahead can be told"
         } else {
             "nothing that the body does can be undone, so that a step of a stream that is committed too early is never made good: give \
@@ -168,20 +174,21 @@ fn parts_of_classes(reached: &Reached<'_>, classes: &Classes, meter: &mut Meter<
     Parts::of_graph(classes.len(), |class| rows.of(class as usize), |to| *to, meter)
 }
 
-/// The numbers below `n`, each once, so that the first ones of them are spread evenly.
+/// The numbers below `n`, each once, so that the first ones of them are spread evenly: a few neighbours at a time, whose surroundings are the same.
+#[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
 fn evenly(n: usize) -> impl Iterator<Item = u32> {
+    const NEIGHBOURS: usize = 64;
     /// The golden section: of all numbers, its multiples leave the most even gaps.
     const GOLDEN: f64 = 0.618_033_988_749_894_9;
-    #[expect(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "about")]
-    let about = ((n as f64 * GOLDEN) as usize).max(1);
-    let step = (about..=about + n).find(|step| greatest_divisor(*step, n) == 1).unwrap_or(1);
-    let mut at = 0;
-    (0..n).map(move |_| {
-        let next = (at + step) % n;
-        #[expect(clippy::cast_possible_truncation, reason = "limits keep states far below 2^32")]
-        let this = std::mem::replace(&mut at, next) as u32;
-        this
-    })
+    let n_groups = n.div_ceil(NEIGHBOURS);
+    #[expect(clippy::cast_precision_loss, clippy::cast_sign_loss, reason = "about")]
+    let about = ((n_groups as f64 * GOLDEN) as usize).max(1);
+    let step = (about..=about + n_groups).find(|step| greatest_divisor(*step, n_groups) == 1).unwrap_or(1);
+    let groups = (0..n_groups).scan(0, move |at, _| {
+        let next = (*at + step) % n_groups;
+        Some(std::mem::replace(at, next))
+    });
+    groups.flat_map(move |group| group * NEIGHBOURS..n.min((group + 1) * NEIGHBOURS)).map(|state| state as u32)
 }
 
 fn greatest_divisor(one: usize, other: usize) -> usize {
@@ -191,9 +198,10 @@ fn greatest_divisor(one: usize, other: usize) -> usize {
 /// Searches, one after the other.
 struct Search<'r> {
     reached: &'r Reached<'r>,
-    classes: &'r Classes,
-    /// The parts of the graph of classes, if it is known whole.
-    parts: Option<&'r Parts>,
+    /// By state, the class of those that look like it.
+    classes: &'r [u32],
+    /// By state, its class's part in the graph of classes, if that is known whole.
+    parts: Option<&'r [u32]>,
     /// By state, the last search that has seen it.
     seen: Vec<u32>,
     n_searches: u32,
@@ -203,12 +211,12 @@ struct Search<'r> {
 impl Search<'_> {
     /// How many actions it takes from the state `from` to one that looks like `to`: breadth first.
     fn back(&mut self, from: u32, to: u32, work: &mut u64, meter: &mut Meter<'_>) -> Result<Back, Interrupted> {
-        let class_of = |state: u32| self.classes.of[state as usize];
+        let class_of = |state: u32| self.classes[state as usize];
         let wanted = class_of(to);
         if class_of(from) == wanted {
             return Ok(Back::Steps(0));
         }
-        let part_of = |state: u32| self.parts.map(|parts| parts.of[class_of(state) as usize]);
+        let part_of = |state: u32| self.parts.map(|parts| parts[state as usize]);
         let part = part_of(to);
         // A way back stays within the part.
         if part_of(from) != part {
