@@ -382,7 +382,6 @@ fn read_shared(
 ) -> Option<(Weights, Options)> {
     let options = Options::read(object, model, &Options::default(), faults);
     Options::check_model(model, object, faults);
-    Options::check_lookahead_is_possible(model, object, faults);
     let base = base_weights(model, learner, faults)?;
     let options = options?;
     Some((options.weights_over(base), Options { weights: Vec::new(), ..options }))

@@ -5,7 +5,7 @@ use std::num::{NonZeroU32, NonZeroU64};
 use super::learners::LearnerState;
 use super::requests::{Names, base_weights};
 use etude_core::attribute::Weights;
-use etude_core::document::{Faults, Object, Path};
+use etude_core::document::{Faults, Object};
 use etude_core::mapping::{Conditions, Demonstration, Mapper, Options};
 
 /// Lookahead of a session that names none.
@@ -71,14 +71,11 @@ pub(super) fn read(
     let model = mapper.model();
     // What is wrong with it was noted if it is none.
     let lookahead_ms = read_lookahead_ms(object, faults);
-    if model.is_lazy() {
-        let detail = "this world is searched lazily, which needs the whole demonstration: ask for a policy instead";
-        faults.note_at(&Path::Member(&Path::Root, "model"), detail);
-    }
     Options::check_model(model, object, faults);
     let weights = base_weights(model, learner, faults);
     // Without the general options, a fault was noted.
     let options = general.unwrap_or_default().read_of_model(object, model, faults)?;
+    options.check_has_lookahead(model, object, faults);
     if object.optional("lookahead").is_some() {
         options.check_lookahead(model, Demonstration::MAX_OBSERVATIONS, max_bytes, object, faults);
     }

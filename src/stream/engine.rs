@@ -17,7 +17,7 @@ use crate::service::{
     AcceptedReward, Caller, Client, Ended, Etude, Received, Resumed, RewardState, ServiceError, Session, SessionError,
 };
 use etude_core::document::{self, Place};
-use etude_core::mapping::CommittedStep;
+use etude_core::mapping::{CommittedStep, PassedStates};
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
@@ -173,8 +173,12 @@ impl Connection<'_> {
                     self.etude.resume_session(&session, caller).await.map_err(|error| ends(&error))?;
                 let mapper = session.mapper();
                 self.opened(session).await?;
-                for (number, kept) in (0..).zip(&kept).skip(step as usize) {
-                    self.send(&ServerFrame::Step((&kept.written(number, mapper.model())).into())).await?;
+                let mut passed = PassedStates::new(mapper.model());
+                for (number, kept) in (0..).zip(&kept) {
+                    kept.pass(&mut passed);
+                    if number >= step {
+                        self.send(&ServerFrame::Step((&kept.written(number, &passed)).into())).await?;
+                    }
                 }
                 let n_kept = kept.len();
                 self.send_steps(steps.get((step as usize).saturating_sub(n_kept)..).unwrap_or_default()).await?;

@@ -191,7 +191,7 @@ fn what_is_wrong_is_told_of_the_flag_or_the_file_that_says_it() {
 }
 
 #[test]
-fn a_stream_of_a_world_that_is_searched_lazily_is_refused_at_once() {
+fn a_stream_of_a_world_that_is_searched_lazily_needs_a_lookahead() {
     let files = Files::new();
     let gold: Vec<[u16; 2]> = (0..20).map(|n| [n + 5, 7]).collect();
     let cave = json!({
@@ -199,13 +199,18 @@ fn a_stream_of_a_world_that_is_searched_lazily_is_refused_at_once() {
     });
     files.file("cave.json", &cave.to_string());
     files.file("seen.csv", "x\n0\n");
-    let told = files.told(&["stream", "--model", "cave.json", "--demonstration", "seen.csv"]);
-    assert!(told.contains("cave.json: this world has so many states that it is searched lazily"), "{told}");
-    let told = files.told(&["map", "--model", "cave.json", "--demonstration", "seen.csv", "--lookahead", "3"]);
-    assert!(told.contains("--lookahead 3: this world is searched lazily"), "{told}");
-    let mapped =
-        etude(&["map", "--model", "cave.json", "--demonstration", "seen.csv"]).current_dir(files.0.path()).output();
-    assert!(mapped.unwrap().status.success());
+    let run = |command, lookahead| {
+        let arguments = [command, "--model", "cave.json", "--demonstration", "seen.csv", "--lookahead", lookahead];
+        etude(&arguments).current_dir(files.0.path()).output().unwrap()
+    };
+    let refused = run("stream", "none");
+    let told = text(&refused.stderr);
+    assert!(told.contains("--lookahead null: this world is searched lazily"), "{told}");
+    assert!(told.contains("set a number, such as 8"), "{told}");
+    for (command, lookahead) in [("stream", "3"), ("map", "3"), ("map", "none")] {
+        let done = run(command, lookahead);
+        assert!(done.status.success(), "{command} {lookahead}: {}", text(&done.stderr));
+    }
 }
 
 #[test]

@@ -84,7 +84,7 @@ pub use end::PolicyEnd;
 pub use heuristic::HeuristicName;
 pub use mapper::{Mapper, Mapping, Settings, Status};
 pub(crate) use online::longest_lookahead;
-pub use online::{CommittedMove, CommittedStep, OnlineMapping, Root, Stopped};
+pub use online::{CommittedMove, CommittedStep, OnlineMapping, PassedStates, Root, Stopped};
 pub use options::{Options, RequestKind};
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
 pub use problem::Problem;

@@ -108,7 +108,7 @@ pub struct Options {
     pub start: Option<Vec<Origin>>,
     /// How many observations past the current one a decision may wait for; `null`: all. With a number, the policy is what a
     /// stream with this lookahead gives, and the global optimum is found in the background (`refined_by`). It may reach so far that
-    /// the observations it spans times the model's states are 134 million. Not for a world that is searched lazily.
+    /// the observations it spans times the model's states are 134 million.
     #[cfg_attr(feature = "openapi", schema(value_type = Option<u32>, minimum = 1, maximum = 100_000))]
     pub lookahead: Option<NonZeroU32>,
     /// The weight of each observation, at least 0 (`null`: 1), as many as there are observations; all 1 if left out. The distances to an
@@ -292,10 +292,11 @@ impl Options {
         }
     }
 
-    /// Notes a lookahead at all in a world that is searched lazily.
-    pub fn check_lookahead_is_possible(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
-        if let Some(place) = object.optional("lookahead").filter(|_| model.is_lazy()) {
-            faults.note(&place, "this world is searched lazily, which needs the whole demonstration: leave this out");
+    /// Notes that a demonstration cannot be followed without a lookahead while it is running, if `model` is searched lazily.
+    pub fn check_has_lookahead(&self, model: &Model, object: &Object<'_, '_>, faults: &mut Faults) {
+        if self.lookahead.is_none() && model.is_lazy() {
+            let detail = "this world is searched lazily, and what is proven follows from the ways to all states: set a number, such as 8";
+            faults.note_at(&Path::Member(&object.path, "lookahead"), detail);
         }
     }
 

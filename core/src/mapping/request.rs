@@ -59,7 +59,6 @@ impl<'m> Request<'m> {
     ) -> Option<Self> {
         let options = Options::read(object, model, shared, faults);
         Options::check_model(model, object, faults);
-        Options::check_lookahead_is_possible(model, object, faults);
         let n_observations = demonstration.as_ref().map_or(0, Demonstration::len);
         if let Some(options) = &options {
             options.check_lookahead(model, n_observations, Budget::DEFAULT.max_bytes, object, faults);

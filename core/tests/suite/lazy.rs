@@ -92,6 +92,18 @@ proptest! {
             prop_assert_eq!(policy.status == Status::Optimal, bound >= policy.cost.total);
         }
 
+        // With a lookahead, as far as the budget lasts.
+        for max_expansions in [None, Some(max_expansions)] {
+            let mut request = request.clone();
+            request["lookahead"] = 3.into();
+            request["max_expansions"] = max_expansions.into();
+            let policy = solve(&lazy, &request);
+            check_legal(&model, first, &policy);
+            prop_assert_eq!(policy.steps.last().unwrap().observation as usize + 1, walk.len() + 1);
+            prop_assert!(optimum.cost.total <= policy.cost.total * (1.0 + 1e-9));
+            prop_assert!(policy.search.stopped_by.is_none() || max_expansions.is_some_and(|most| policy.search.expanded <= most));
+        }
+
         // From any other state, too.
         let state = start.index(known.model().states().len() as usize) as u32;
         let mut request = request;

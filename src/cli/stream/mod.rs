@@ -99,10 +99,6 @@ impl Stream {
             return Err(CliError::Faulty(format!("--model {}: {detail}", self.model.display())));
         }
         let (_, model) = read_model(&self.model)?;
-        if model.is_lazy() {
-            let detail = "this world has so many states that it is searched lazily, which needs the whole demonstration: use etude map";
-            return Err(CliError::Faulty(format!("{}: {detail}", self.model.display())));
-        }
         let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
         let schema = mapper.model().schema();
         let mut observations =
@@ -114,7 +110,9 @@ impl Stream {
         let lookahead_ms = object.as_ref().and_then(|object| read_lookahead_ms(object, &mut faults));
         let options = object.and_then(|object| {
             Options::check_model(mapper.model(), &object, &mut faults);
-            Options::read(&object, mapper.model(), &Options::default(), &mut faults)
+            let options = Options::read(&object, mapper.model(), &Options::default(), &mut faults)?;
+            options.check_has_lookahead(mapper.model(), &object, &mut faults);
+            Some(options)
         });
         let source = Arc::clone(observations.source());
         let told = |faults: Faults| request.told_of(&faults, &source, &[]);

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use super::SessionError;
 use crate::service::ServiceError;
 use crate::store::{NewSteps, StoredSteps};
-use etude_core::mapping::{CommittedMove, CommittedStep, OnlineMapping, Root, Step, Watch};
+use etude_core::mapping::{CommittedMove, CommittedStep, OnlineMapping, PassedStates, Root, Step, Watch};
 use etude_core::model::Model;
 
 /// So many steps are written together where they cost less to be found again than to be written.
@@ -41,17 +41,23 @@ impl From<&CommittedStep> for Told {
 }
 
 impl ShortStep {
-    /// Committed step number `number`, of `model`. Of its distance, the terms by attribute are not kept.
+    /// Passes the step's state.
+    pub fn pass(&self, passed: &mut PassedStates<'_>) {
+        passed.pass(&self.step);
+    }
+
+    /// This step, which is number `number` and was [passed](Self::pass), as it was told. Of its distance, the terms by attribute are not kept.
     #[must_use]
-    pub fn written(&self, number: u32, model: &Model) -> CommittedStep {
-        let Self { step: CommittedMove { step, action_cost, row: _ }, told } = self;
+    pub fn written(&self, number: u32, passed: &PassedStates<'_>) -> CommittedStep {
+        let state = passed.values(&self.step);
+        let Self { step: CommittedMove { step, action_cost, .. }, told } = self;
         let Told { distance, cost, is_proven, after } = *told;
         let step = Step {
             step: number,
             observation: step.observation,
             kind: step.kind,
-            action: step.action.map(|action| model.action_name(action)),
-            state: model.describe(step.state),
+            action: step.action.map(|action| passed.model().action_name(action)),
+            state,
             state_index: step.state,
             action_cost: *action_cost,
             distance,
@@ -152,6 +158,11 @@ impl Kept {
     /// How many observations they have met.
     pub(super) fn n_met(&self) -> u32 {
         self.steps.last().map_or(0, |last| last.step.step.observation + 1)
+    }
+
+    /// Whether they are of `model`, as far as that is told: whether it lists its states.
+    pub(super) fn fit(&self, model: &Model) -> bool {
+        self.steps.first().is_none_or(|first| first.step.row.is_some() == model.is_lazy())
     }
 
     /// The steps, as the mapping goes on from them.

@@ -90,10 +90,12 @@ impl Etude {
         let place = self.pool.admit_when_needed(caller.client).waiting_until(deadline);
         let (hash, mapper) = self.mapper(&row.model, "/model", Some(&place), deadline).await?;
         drop(place);
+        let name = format!("{} with hash {}", row.model, row.model_hash);
+        let gone = move || SessionError::from(ServiceError::Unknown { kind: Kind::Model, name, pointer: None });
         // Registered anew, the same world may have become too large to be known in full.
-        if hash != row.model_hash || mapper.model().is_lazy() {
-            let name = format!("{} with hash {}", row.model, row.model_hash);
-            return Err(ServiceError::Unknown { kind: Kind::Model, name, pointer: None }.into());
+        let can_be_followed = row.lookahead.is_some() || !mapper.model().is_lazy();
+        if hash != row.model_hash || !can_be_followed || !row.conditions.fit(mapper.model()) {
+            return Err(gone());
         }
         let weights = weights_in_order(&row.weights, mapper.model().schema(), &row.id)?;
         let lookahead = row.lookahead.and_then(NonZeroU32::new);
@@ -124,6 +126,9 @@ impl Etude {
         let is_done = row.status == SessionStatus::Done;
         let mut steps = CommittedSteps::default();
         let kept = self.kept_steps(&session.id, &mut steps).await?;
+        if kept.as_ref().is_some_and(|kept| !kept.fit(session.mapper.model())) {
+            return Err(gone());
+        }
         let online = session.begin(kept.as_ref())?;
         let first = online.n_observed();
         session.reserve(online.size_bytes() as u64)?;

@@ -13,9 +13,10 @@ use super::ending::{Ended, conclude, take_for_end, written_bytes};
 use super::kept::Unwritten;
 use super::left::Leaving;
 use super::waits::Waits;
-use crate::memory::Held;
+use crate::memory::{Held, SMALL_BYTES};
 use crate::service::owners::Ownership;
 use crate::service::requests::STATES;
+use crate::service::search::take_beyond_small;
 use crate::service::{Client, Etude, ServiceError};
 use crate::store::{AcceptedReward, NewObservations, Owner, SessionEnd, StoredObservations, TrialRecord};
 use etude_core::attribute::{ByAttribute, Weights};
@@ -282,8 +283,10 @@ impl Session {
 
     /// Whether so many observations are mapped where they arrive.
     pub(super) fn is_inline(&self, n_observations: usize) -> bool {
-        let graph = self.mapper.model().graph();
-        is_inline(graph.n_states() + graph.n_transitions(), self.lookahead, n_observations)
+        let model = self.mapper.model();
+        let graph = model.graph();
+        // Of a world that is searched lazily, nobody knows the size.
+        !model.is_lazy() && is_inline(graph.n_states() + graph.n_transitions(), self.lookahead, n_observations)
     }
 
     /// Ends the demonstration, which must have `seq` observations, and stores its policy.
@@ -320,7 +323,13 @@ impl Session {
             lookahead: self.lookahead.map(NonZeroU32::get),
             ..Stamp::default()
         };
-        let job = move |_: &mut dyn Interrupt| {
+        let held_bytes = self.held.n_bytes();
+        let job = move |interrupt: &mut dyn Interrupt| {
+            let spare = take_beyond_small(u64::MAX, &memory);
+            let most_bytes = held_bytes + SMALL_BYTES + spare.as_ref().map_or(0, Held::n_bytes);
+            let online = online.within(usize::try_from(most_bytes).unwrap_or(usize::MAX));
+            online.find_rest(interrupt)?;
+            drop(spare);
             let steps = take_for_end(&online, n_committed, mapper.model(), &memory);
             let concluded = steps
                 .map_err(|no_room| ServiceError::from(no_room).into())

@@ -222,16 +222,51 @@ async fn what_was_received_is_ignored_and_what_is_missing_is_asked_for() {
 }
 
 #[tokio::test]
-async fn a_world_that_is_searched_lazily_is_not_streamed() {
-    let service = Service::start(&["--max-states", "10"]).await;
-    let cave = json!({"dynamics": {"kind": "wumpus", "width": 9, "height": 9}});
+async fn a_world_that_is_searched_lazily_is_streamed_with_a_lookahead_and_goes_on_after_restarts() {
+    let mut service = Service::start(&["--max-states", "10"]).await;
+    let cave = json!({"dynamics": {"kind": "wumpus", "width": 9, "height": 9, "gold": [[3, 0]], "wumpi": [[2, 2]]}});
     assert_eq!(service.put("/v1/models/large", &cave).await.0, 201);
     let mut client = Client::connect(&service).await;
-    client.send(json!({"type": "open", "model": "large"})).await;
+    client.send(json!({"type": "open", "model": "large", "lookahead": null})).await;
     let error = client.receive().await;
     assert_eq!(error["problem"]["type"], "/problems/invalid", "{error}");
-    assert_eq!(error["problem"]["errors"][0]["pointer"], "/model", "{error}");
+    assert_eq!(error["problem"]["errors"][0]["pointer"], "/lookahead", "{error}");
     assert_eq!(client.closed().await, 4400);
+
+    // Along the wall and back, again and again.
+    let seen: Vec<Value> = (0..60_i64).map(|i| json!({"x": (i % 16 - 8).abs(), "y": 0})).collect();
+    let open = json!({"type": "open", "model": "large", "lookahead": 4});
+    let mut client = Client::connect(&service).await;
+    client.open(open.clone()).await;
+    client.send(json!({"type": "observe", "seq": 0, "states": seen})).await;
+    client.send(json!({"type": "end", "seq": 60})).await;
+    let unbroken = client.receive_until("done").await;
+    let (wanted, done) = (steps(&unbroken), unbroken.last().unwrap());
+    assert_eq!(done["status"], "local");
+    let request = json!({"model": "large", "lookahead": 4, "demonstration": seen});
+    let (status, policy) = service.post("/v1/policies", &request).await;
+    assert_eq!((status, &policy["cost"], &policy["actions"]), (201, &done["cost"], &done["actions"]));
+
+    let mut client = Client::connect(&service).await;
+    let session = client.open(open).await;
+    let mut committed = Vec::new();
+    for (n, states) in seen.chunks(12).enumerate() {
+        client.send(json!({"type": "observe", "seq": 12 * n, "states": states})).await;
+        client.receive_until("received").await;
+        drop(client);
+        let directory = service.stop().await;
+        service = Service::start_in(directory, &["--max-states", "10"]).await;
+        client = Client::connect(&service).await;
+        client.send(json!({"type": "resume", "session": session, "step": committed.len()})).await;
+        let opened = client.receive().await;
+        assert_eq!(opened["received"], 12 * (n + 1));
+        for _ in committed.len() as u64..opened["steps"].as_u64().unwrap() {
+            committed.push(client.receive().await);
+        }
+    }
+    client.send(json!({"type": "end", "seq": 60})).await;
+    committed.extend(steps(&client.receive_until("done").await));
+    assert_eq!(committed, wanted);
 }
 
 #[tokio::test]

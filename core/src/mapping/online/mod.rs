@@ -44,7 +44,7 @@ pub use committed::{CommittedMove, CommittedStep, Stopped};
 pub(in crate::mapping) use decided::Halt;
 use decided::{Decided, Rest};
 pub(crate) use layers::longest_lookahead;
-pub use root::Root;
+pub use root::{PassedStates, Root};
 
 /// A mapping in the making.
 #[derive(Debug)]

@@ -8,10 +8,10 @@ use serde::{Deserialize, Serialize};
 use super::OnlineMapping;
 use super::committed::{Committed, CommittedMove};
 use super::decided::{RootNode, Work};
-use crate::attribute::Weights;
+use crate::attribute::{ByAttribute, Scalar, Weights};
 use crate::mapping::policy::StepWriter;
 use crate::mapping::{Conditions, Mapper};
-use crate::model::StateIdx;
+use crate::model::{Model, OriginRow, StateIdx, States};
 
 /// Where a mapping in the making has come to: the last committed node, and of what was committed before it as much as the rest needs.
 /// As it is stored, floats must keep their bits.
@@ -40,6 +40,46 @@ impl Root {
     #[must_use]
     pub fn n_steps(&self) -> usize {
         self.writer.n_steps() as usize
+    }
+}
+
+/// The states that committed steps pass, as they were told.
+#[derive(Debug)]
+pub struct PassedStates<'m> {
+    model: &'m Model,
+    /// If the model is searched lazily, in the order in which they are first passed.
+    found: States,
+}
+
+impl<'m> PassedStates<'m> {
+    /// Before the first step of a mapping in `model`.
+    #[must_use]
+    pub fn new(model: &'m Model) -> Self {
+        Self { model, found: model.states().keep(&[]) }
+    }
+
+    /// The model.
+    #[must_use]
+    pub fn model(&self) -> &'m Model {
+        self.model
+    }
+
+    /// Passes the state of the next step. The steps must be passed in their order, from the first on.
+    pub fn pass(&mut self, step: &CommittedMove) {
+        if let Some(OriginRow(row)) = &step.row {
+            self.found.push(row.iter().copied());
+        }
+    }
+
+    /// The values of the state of a step that was passed.
+    ///
+    /// # Panics
+    ///
+    /// If it was not, or is of another model.
+    #[must_use]
+    pub fn values(&self, step: &CommittedMove) -> ByAttribute<Scalar> {
+        let states = if self.model.is_lazy() { &self.found } else { self.model.states() };
+        self.model.describe_one_of(states, step.step.state)
     }
 }
 

@@ -15,7 +15,7 @@ use super::*;
 use crate::clock::Clock;
 use crate::service::{Caller, Client, Etude, ModelText, Name, Settings};
 use etude_core::document::Place;
-use etude_core::mapping::CommittedStep;
+use etude_core::mapping::{CommittedStep, PassedStates};
 use etude_core::model::Format;
 
 /// How long steps wait in these sessions.
@@ -74,7 +74,11 @@ impl Service {
     async fn resume(&self, id: &str) -> (Session, Vec<CommittedStep>) {
         let Resumed { session, kept, steps, .. } = self.etude.resume_session(id, self.caller()).await.unwrap();
         let model = session.mapper();
-        let kept = (0..).zip(&kept).map(|(number, kept)| kept.written(number, model.model()));
+        let mut passed = PassedStates::new(model.model());
+        let kept = (0..).zip(&kept).map(|(number, kept)| {
+            kept.pass(&mut passed);
+            kept.written(number, &passed)
+        });
         (session, kept.chain(steps.iter().cloned()).collect())
     }
 
