@@ -104,7 +104,18 @@ impl Import {
             let detail = format!("this is of no format that is known here: {known}. Say which by --format");
             return Err(failed(ImportError::Unfit(detail)));
         };
-        let files = vec![ImportFile { name: String::new(), content }];
+        let parts = format.parts();
+        let own = self.file.extension().and_then(|own| own.to_str()).filter(|own| parts.contains(own));
+        // It is told of by name where there are several.
+        let name = own.map(|_| name).unwrap_or_default();
+        let mut files = vec![ImportFile { name, content }];
+        for part in parts.iter().filter(|part| own.is_some_and(|own| own != **part)) {
+            let path = self.file.with_extension(part);
+            if path.exists() {
+                let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+                files.push(ImportFile { name, content: open(&path, &ProgressBar::hidden())? });
+            }
+        }
         let read = import(format, files, edits, Limits::NONE, &mut Uninterrupted);
         bar.finish_and_clear();
         read.map_err(failed)

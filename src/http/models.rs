@@ -110,7 +110,8 @@ struct WholeModelBody {
 /// Faults then carry the `line`, and a `pointer` within it.
 ///
 /// A file of another tool is imported, by its content type: `application/vnd.gymnasium+json` is the table `P` of a Gymnasium environment, as
-/// `examples/gymnasium/export.py` writes it; `application/vnd.fast-downward.sas` is a SAS+ task, as Fast Downward translates it from PDDL. Then the query may say `without` (actions that the body lacks, by name; `*` stands for any text), `cost` (`ACTION=COST`,
+/// `examples/gymnasium/export.py` writes it; `application/vnd.fast-downward.sas` is a SAS+ task, as Fast Downward translates it from PDDL; `application/vnd.umb`, `application/vnd.storm.drn` and
+/// `application/vnd.prism+tar` (the explicit files in a tar archive) are models of verification tools. Then the query may say `without` (actions that the body lacks, by name; `*` stands for any text), `cost` (`ACTION=COST`,
 /// in place of what the file says; or the name of the reward that is the cost) and `rename` (`OLD=NEW`), each any number of times.
 ///
 /// With `If-Match`, the model takes the place of the one that has this hash, at once: requests from then on use it. Policies keep the hash of
@@ -130,6 +131,9 @@ struct WholeModelBody {
         (DefinitionDocument = "application/json"),
         (serde_json::Value = "application/vnd.gymnasium+json"),
         (String = "application/vnd.fast-downward.sas"),
+        (Vec<u8> = "application/vnd.umb"),
+        (String = "application/vnd.storm.drn"),
+        (Vec<u8> = "application/vnd.prism+tar"),
         (String = "application/x-ndjson", example = "{\"attributes\":[{\"name\":\"x\",\"kind\":\"number\"}],\"actions\":[{\"name\":\"on\"}],\"dynamics\":{\"kind\":\"table\",\"start\":0}}\n{\"states\":[[0],[1]]}\n{\"transitions\":[[0,\"on\",1]]}\n"),
     )),
     responses(

@@ -70,6 +70,9 @@ pub enum ModelText {
 /// Opens a text, on the thread that will read it, as opening already reads its beginning.
 pub type OpenText = Box<dyn FnOnce() -> io::Result<Box<dyn BufRead + Send>> + Send>;
 
+/// How what is compressed by gzip begins.
+const GZIP: &[u8] = &[0x1f, 0x8b];
+
 /// What the text of a model is.
 #[derive(Clone, Debug)]
 pub enum ModelForm {
@@ -98,10 +101,14 @@ impl ModelText {
                 Definition::parse_from(open()?, *format, limits, interrupt)
             }
             (ModelForm::Imported(format, edits), text) => {
-                let content: Box<dyn BufRead> = match text {
+                let mut content: Box<dyn BufRead> = match text {
                     Self::Whole(text) => Box::new(io::Cursor::new(text)),
                     Self::Packed(open) | Self::Arriving(open) => open()?,
                 };
+                // Archives are compressed by what makes them, and have their limit as they are read.
+                if *format == ImportFormat::Umb && content.fill_buf()?.starts_with(GZIP) {
+                    content = Box::new(io::BufReader::new(flate2::bufread::MultiGzDecoder::new(content)));
+                }
                 let file = ImportFile { name: String::new(), content };
                 Ok(import(*format, vec![file], edits, limits, interrupt)?)
             }

@@ -61,3 +61,19 @@ fn what_is_wrong_with_a_file_or_a_flag_is_told_in_a_line() {
     let missing = run(&["model", "import", "no-such-file.json"]);
     assert_eq!(text(&missing.stderr), "etude: cannot read no-such-file.json: No such file or directory\n");
 }
+
+#[test]
+fn the_files_of_prism_that_lie_beside_each_other_are_one_model() {
+    let told = |file: &str| {
+        let done = run(&["model", "import", file]);
+        assert!(done.status.success(), "{}", text(&done.stderr));
+        text(&done.stdout).to_owned()
+    };
+    let by_transitions = told("examples/verification/slippery.tra");
+    assert_eq!(by_transitions, told("examples/verification/slippery.lab"));
+    assert!(by_transitions.contains("{\"name\":\"lane\""), "{by_transitions}");
+    let failed = run(&["model", "import", "examples/verification/slippery.tra", "--cost", "energy"]);
+    let expected = "etude: cannot import examples/verification/slippery.tra: cost: expected ACTION=COST, found \"energy\": \
+        prism has no rewards with names\n";
+    assert_eq!(text(&failed.stderr), expected);
+}

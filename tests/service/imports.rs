@@ -18,6 +18,8 @@ async fn a_file_is_registered_by_its_content_type_as_the_model_that_it_gives() {
     let cases = [
         (ImportFormat::Gymnasium, "gymnasium/taxi.json", "?without=w*&cost=dropoff=1&rename=east=right"),
         (ImportFormat::Sas, "planning/blocksworld-4.sas", "?without=stack%20c%20*"),
+        (ImportFormat::Drn, "verification/slippery.drn", "?cost=time"),
+        (ImportFormat::Umb, "verification/slippery.umb", "?cost=energy&rename=lane=y"),
     ];
     for (format, path, query) in cases {
         let body = example_bytes(path);
@@ -30,7 +32,12 @@ async fn a_file_is_registered_by_its_content_type_as_the_model_that_it_gives() {
                 _ => edits.add_rename(value).unwrap(),
             }
         }
-        let file = ImportFile { name: String::new(), content: Box::new(std::io::Cursor::new(body.clone())) };
+        let content = std::io::Cursor::new(body.clone());
+        let content: Box<dyn std::io::BufRead> = match body.as_slice() {
+            [0x1f, 0x8b, ..] => Box::new(std::io::BufReader::new(flate2::bufread::GzDecoder::new(content))),
+            _ => Box::new(content),
+        };
+        let file = ImportFile { name: String::new(), content };
         let definition = import(format, vec![file], &edits, Limits::NONE, &mut Uninterrupted).unwrap();
         let name = format.name();
         let (status, registered) = put(&service, &format!("{name}{query}"), format.media_type(), body.clone()).await;

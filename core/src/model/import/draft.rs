@@ -56,8 +56,8 @@ pub(super) struct Draft {
 
 struct DraftAction {
     name: String,
-    /// The cost that most of its transitions have, if most have one (Boyer & Moore 1981), and by how many votes it leads.
-    most: (f64, u64),
+    /// The cost that most of its transitions have, if most have the same (Boyer & Moore 1981), else one of theirs; and by how many votes it leads.
+    most: Option<(f64, u64)>,
     /// The first of its costs that is none, and where.
     refused: Option<(Spot, String)>,
 }
@@ -138,7 +138,7 @@ impl Draft {
             let detail = format!("over {} actions, which is the most that a model has", Action::MAX_ACTIONS);
             return Err(ImportError::at(spot, detail));
         }
-        self.actions.push(DraftAction { name, most: (0.0, 0), refused: None });
+        self.actions.push(DraftAction { name, most: None, refused: None });
         #[expect(clippy::cast_possible_truncation, reason = "at most MAX_ACTIONS")]
         let index = index as ActionIdx;
         Ok(index)
@@ -198,7 +198,7 @@ impl Draft {
             // What has no effect is never paid.
             let cost = way.cost.filter(|_| !(is_certain && from == to));
             if let Some(cost) = cost {
-                let (most, lead) = &mut self.actions[usize::from(action)].most;
+                let (most, lead) = self.actions[usize::from(action)].most.get_or_insert((cost, 0));
                 match *lead {
                     0 => (*most, *lead) = (cost, 1),
                     _ if *most == cost => *lead += 1,
@@ -301,7 +301,7 @@ impl Draft {
     fn actions(&self, edits: &Edits) -> Result<Vec<Option<(Action, bool)>>, ImportError> {
         let kept = self.actions.iter().filter(|action| !edits.lacks(&action.name));
         check_names("action", kept.map(|action| edits.renamed(&action.name)), Action::MAX_NAME_CHARS)?;
-        let read = self.actions.iter().map(|DraftAction { name, most: (most, lead), refused }| {
+        let read = self.actions.iter().map(|DraftAction { name, most, refused }| {
             if edits.lacks(name) {
                 return Ok(None);
             }
@@ -310,7 +310,7 @@ impl Draft {
                 let say = format!("say what the action costs: {}", Quoted(&format!("{name}=1")));
                 return Err(ImportError::at(*spot, format!("{detail}; {say}, or \"*=1\" for all")));
             }
-            let cost = fixed.unwrap_or(if *lead > 0 { *most } else { DEFAULT_COST });
+            let cost = fixed.or(most.map(|(cost, _)| cost)).unwrap_or(DEFAULT_COST);
             Ok(Some((Action { name: normal(edits.renamed(name)).into(), cost }, fixed.is_some())))
         });
         read.collect()

@@ -24,11 +24,11 @@ impl<R: BufRead> Lines<R> {
     /// The next line, without its end; `None` after the last.
     pub(super) fn next(&mut self) -> Result<Option<&str>, ImportError> {
         self.buffer.clear();
-        self.number += 1;
         let n_read = self.inner.by_ref().take(MAX_LINE_BYTES as u64).read_until(b'\n', &mut self.buffer)?;
         if n_read == 0 {
             return Ok(None);
         }
+        self.number += 1;
         if n_read == MAX_LINE_BYTES {
             return Err(self.wrong(format!("the line has over {MAX_LINE_BYTES} bytes")));
         }

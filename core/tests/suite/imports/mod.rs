@@ -1,7 +1,9 @@
 //! Files of other tools, against readers of these tests, which share no code with the library, and against the independent solver.
 
 mod gymnasium;
+mod mangled;
 mod sas;
+mod verification;
 
 use std::collections::BTreeMap;
 use std::io::Cursor;
