@@ -10,6 +10,7 @@
 //! comes meanwhile waits for a slice, not for the batch.
 
 mod answer;
+mod item;
 
 use std::fmt;
 use std::iter::Enumerate;
@@ -23,6 +24,7 @@ use serde_json::value::RawValue;
 use tokio_util::bytes::Bytes;
 
 use answer::Answer;
+use item::{Item, ReadItem};
 
 use super::learners::LearnerState;
 use super::requests::{Named, Names, SentRequest, base_weights, most_demonstration_bytes, n_observations};
@@ -31,9 +33,9 @@ use super::{Caller, Etude, MadePolicy, ServiceError};
 use crate::clock::{Clock, Ids};
 use crate::memory::{Held, Memory};
 use etude_core::attribute::Weights;
-use etude_core::document::{self, Faults, Members, Object, Path, Place};
+use etude_core::document::{self, Faults, Object, Path, Place};
 use etude_core::interrupt::{Cancelled, Interrupt};
-use etude_core::mapping::{Demonstration, Mapper, Options, Policy, Request, RequestKind, Stamp, WellFormed};
+use etude_core::mapping::{Demonstration, Mapper, Options, Policy, Request, RequestKind, Stamp};
 use etude_core::model::Model;
 
 /// Most items of a batch: as large a data set as most, while an answer full of short policies stays at some ten megabytes.
@@ -122,54 +124,6 @@ impl Etude {
     }
 }
 
-/// An item that waits.
-#[derive(Debug)]
-struct Item {
-    /// Its options; all of it, if its demonstration is still to be read.
-    document: Value,
-    read: Option<ReadItem>,
-}
-
-/// An item whose demonstration was read.
-#[derive(Debug)]
-struct ReadItem {
-    demonstration: Demonstration,
-    /// Its text.
-    observed: Bytes,
-}
-
-impl Item {
-    /// Reads the item in `text`, of about `n_values` and no more than `max_len` observations. Nothing if it cannot even be read as a document.
-    fn read(sent: &SentRequest, text: &str, model: &Model, max_len: usize, n_values: usize) -> Option<Self> {
-        let members = Members::split(text, RequestKind::Item.fields());
-        let read = members.and_then(|mut members| {
-            let observed = members.take("demonstration")?;
-            let well_formed = WellFormed { schema: model.schema(), n_values, max_len };
-            let read =
-                ReadItem { demonstration: well_formed.read(observed).ok()?, observed: sent.observed_part(observed) };
-            Some(Self { document: members.parse()?, read: Some(read) })
-        });
-        read.or_else(|| Self::parse(text))
-    }
-
-    /// The item in `text` as a document.
-    fn parse(text: &str) -> Option<Self> {
-        Some(Self { document: document::parse(text.as_bytes()).ok()?, read: None })
-    }
-
-    fn n_observations(&self) -> usize {
-        match &self.read {
-            Some(read) => read.demonstration.len(),
-            None => n_observations(&self.document),
-        }
-    }
-
-    fn size_bytes(&self) -> usize {
-        let demonstration_bytes = self.read.as_ref().map_or(0, |read| read.demonstration.size_bytes());
-        document::size_bytes(&self.document) + 2 * size_of_val(self) + demonstration_bytes
-    }
-}
-
 /// The texts of the items of a batch, of which there must not be too many.
 fn item_texts(items: &str) -> Option<Vec<&str>> {
     struct Texts;
@@ -245,9 +199,15 @@ impl Batch {
         let (mut n_left, mut n_values) = (Policy::max_observations(model), 0);
         for text in texts {
             let item = if have_room {
-                Item::read(sent, text, model, n_left.min(Demonstration::MAX_OBSERVATIONS), n_values)
+                Item::read(
+                    sent,
+                    text,
+                    (model, &shared, items.len()),
+                    n_left.min(Demonstration::MAX_OBSERVATIONS),
+                    n_values,
+                )
             } else {
-                Item::parse(text)
+                Item::parse(text, &shared, items.len())
             };
             let Some(item) = item else { return Ok(None) };
             // What is told of too many observations is told of the batch.
@@ -314,8 +274,8 @@ impl Batch {
         let items = Path::Member(&Path::Root, "items");
         let path = Path::Item(&items, n);
         let demonstration_path = Path::Member(&path, "demonstration");
-        let mut faults = Faults::default();
-        let Item { document, read } = item;
+        let Item { document, read, mut faults } = item;
+        let is_observed = faults.is_empty();
         let (model, place) = (self.mapper.model(), Place { value: &document, path });
         let Some(object) = place.object(RequestKind::Item.fields(), &mut faults) else { return Ok(Err(faults.into())) };
         let weights = |_: &mut Faults| Some(self.weights.clone());
@@ -326,7 +286,8 @@ impl Batch {
                 Ok(held) => held,
                 Err(no_room) => return Ok(Err(no_room.into())),
             };
-            (Request::read_demonstration(model, &object, &mut faults), None, held)
+            let demonstration = is_observed.then(|| Request::read_demonstration(model, &object, &mut faults));
+            (demonstration.flatten(), None, held)
         };
         let request = Request::of(demonstration, model, &object, &self.shared, weights, &mut faults);
         let request = match faults.check(request) {

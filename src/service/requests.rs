@@ -22,7 +22,9 @@ use crate::memory::{Held, Memory};
 use etude_core::attribute::Weights;
 use etude_core::document::{self, Faults, Members, Object, Path, Place};
 use etude_core::interrupt::{Interrupt, time_until_finish};
-use etude_core::mapping::{Demonstration, Mapper, Options, Policy, Request, RequestKind, Stamp, WellFormed};
+use etude_core::mapping::{
+    Demonstration, Mapper, Options, Perception, Policy, Request, RequestKind, Stamp, WellFormed,
+};
 use etude_core::model::Model;
 
 /// Where a request has its demonstration.
@@ -51,10 +53,23 @@ impl SentRequest {
         let members = std::str::from_utf8(body).ok().and_then(|text| Members::split(text, kind.fields()));
         let Some(mut members) = members else { return Ok(None) };
         let Some(observed) = kind.observed().and_then(|name| members.take(name)) else { return Ok(None) };
+        // The items of a batch have it each.
+        let observe = Some("observe").filter(|name| kind != RequestKind::Batch && kind.fields().contains(name));
+        let observe = observe.and_then(|name| members.take(name)).filter(|text| *text != "null");
         let is_counted = members.n_bytes() > MAX_UNCOUNTED_TEXT_BYTES;
         let held = is_counted.then(|| memory.try_take(members.parsed_bytes() as u64)).transpose()?;
+        let observed = match observe {
+            None => body.slice_ref(observed.as_bytes()),
+            Some(observe) => {
+                let parsed = document::parsed_bytes(observed.as_bytes()) as u64;
+                // While it is read, it is there twice.
+                let _held = memory.try_take(2 * parsed)?;
+                let Some(text) = perceived(observe, observed) else { return Ok(None) };
+                text.into()
+            }
+        };
         let Some(rest) = members.parse() else { return Ok(None) };
-        Ok(Some(Self { rest, observed: body.slice_ref(observed.as_bytes()), _held: held }))
+        Ok(Some(Self { rest, observed, _held: held }))
     }
 
     /// The text of what is observed.
@@ -103,6 +118,16 @@ impl SentRequest {
         let request = Request::of(Some(demonstration), model, &object, &Options::default(), weights, &mut faults);
         request.filter(|_| faults.is_empty())
     }
+}
+
+/// What is observed of a demonstration, by the expressions in the text `observe`, as text. Nothing if something is wrong with either.
+fn perceived(observe: &str, demonstration: &str) -> Option<String> {
+    let (observe, demonstration) =
+        (document::parse(observe.as_bytes()).ok()?, document::parse(demonstration.as_bytes()).ok()?);
+    let mut faults = Faults::default();
+    let perception = Perception::read(&Place::root(&observe), &mut faults)?;
+    let observed = perception.observe_all(&Place::root(&demonstration), &Path::Root, &mut faults)?;
+    Some(observed.to_string())
 }
 
 /// Most bytes that the demonstrations in `text` take while they are read. Each observation begins with a bracket.

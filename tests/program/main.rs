@@ -13,6 +13,7 @@ mod inputs;
 mod inspect;
 mod kill_rewards;
 mod kill_streams;
+mod observe;
 mod readme;
 mod signals;
 mod terminal;

@@ -26,6 +26,7 @@ mod imports;
 mod inputs;
 mod learning;
 mod limits;
+mod observe;
 mod protocol;
 mod replacement;
 mod reports;

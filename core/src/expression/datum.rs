@@ -72,14 +72,14 @@ impl Datum<'static> {
     pub(crate) fn text(text: &str) -> Self {
         Self::Text(Text::Owned(text.into()))
     }
+}
 
+impl<'a> Datum<'a> {
     /// A list of its own.
     pub(crate) fn list(items: Vec<Self>) -> Self {
         Self::List(List::Owned(items.into()))
     }
-}
 
-impl<'a> Datum<'a> {
     /// The same value, borrowed.
     #[inline]
     pub(crate) fn borrowed<'b>(&'b self) -> Datum<'b>

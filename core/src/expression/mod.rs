@@ -42,6 +42,11 @@ pub(crate) struct Expression {
 }
 
 impl Expression {
+    /// As it was written.
+    pub(crate) fn text(&self) -> &str {
+        &self.text
+    }
+
     /// The type of its values.
     pub(crate) fn result(&self) -> &Type {
         &self.result

@@ -44,7 +44,6 @@ impl Scope {
     }
 
     /// Any variables, of any type.
-    #[cfg(test)]
     pub(crate) fn open() -> Self {
         Self { variables: None, constants: HashMap::new() }
     }

@@ -65,6 +65,8 @@ mod mapper;
 mod online;
 mod open_list;
 mod options;
+#[cfg(feature = "rules")]
+mod perception;
 mod policy;
 mod problem;
 mod recurrence;
@@ -86,6 +88,8 @@ pub use mapper::{Mapper, Mapping, Settings, Status};
 pub(crate) use online::longest_lookahead;
 pub use online::{CommittedMove, CommittedStep, OnlineMapping, PassedStates, Root, Stopped};
 pub use options::{Options, RequestKind};
+#[cfg(feature = "rules")]
+pub use perception::Perception;
 pub use policy::{Coverage, Policy, PolicySummary, SearchReport, Stamp, Step, TooManySteps};
 pub use problem::Problem;
 pub(crate) use problem::Starts;

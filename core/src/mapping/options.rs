@@ -5,8 +5,12 @@
 //! may have which. A new option needs a line in each.
 
 use std::num::NonZeroU32;
+#[cfg(feature = "rules")]
+use std::sync::Arc;
 use std::time::Duration;
 
+#[cfg(feature = "rules")]
+use super::Perception;
 use super::{Budget, Conditions, Demonstration, HeuristicName, Settings, longest_lookahead};
 use crate::attribute::{Kind, Weights};
 use crate::document::{Faults, Object, Path, Place, Range};
@@ -60,6 +64,7 @@ impl RequestKind {
                     "max_expansions",
                     "deadline_ms",
                     "collapse",
+                    "observe",
                     "store"
                 )
             }
@@ -72,11 +77,14 @@ impl RequestKind {
                     "max_expansions",
                     "deadline_ms",
                     "collapse",
+                    "observe",
                     "store"
                 )
             }
-            Self::Item => following!("demonstration", "heuristic", "max_expansions", "collapse"),
-            Self::Trial => following!("model", "demonstration", "heuristic", "max_expansions", "deadline_ms"),
+            Self::Item => following!("demonstration", "heuristic", "max_expansions", "collapse", "observe"),
+            Self::Trial => {
+                following!("model", "demonstration", "heuristic", "max_expansions", "deadline_ms", "observe")
+            }
             Self::Session => following!("type", "model", "learner", "explore", "lookahead_ms"),
             Self::Report => &["demonstration", "weights", "start", "observation_weights", "without", "deadline_ms"],
         }
@@ -137,6 +145,13 @@ pub struct Options {
     // By the attributes' positions.
     #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, f64>>, example = json!({"x": 0.5})))]
     pub collapse: Option<Vec<(usize, f64)>>,
+    /// For a demonstrator whose states are told in another vocabulary: by name of the imitator's attributes, expressions of CEL over the
+    /// attributes of the `demonstration`, which are then the demonstrator's own. What is not named is not observed. All its numbers are
+    /// doubles, and an integer in an expression is read as one beside them; what is missing or `null` is null, and what needs it is not
+    /// observed. A name with a point is that of a member of a member.
+    #[cfg(feature = "rules")]
+    #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, String>>, example = json!({"x": "east_m / 0.25", "door": "opening > 0.5 ? 'open' : 'shut'"})))]
+    pub observe: Option<Arc<Perception>>,
     /// What an unsafe outcome of an action costs; only for stochastic models. `null`: actions with unsafe outcomes are not taken.
     pub unsafe_cost: Option<f64>,
     /// What guides the search.
@@ -215,6 +230,10 @@ impl Options {
         }
         if let Some(place) = object.optional("lookahead") {
             options.lookahead = read_lookahead(&place, faults);
+        }
+        #[cfg(feature = "rules")]
+        if let Some(place) = object.optional("observe") {
+            options.observe = Perception::read(&place, faults).map(Arc::new);
         }
         if let Some(place) = object.optional("max_expansions") {
             options.max_expansions = place.integer(0, u64::MAX, faults);

@@ -9,7 +9,7 @@ use super::{
     Budget, Demonstration, Mapper, Mapping, OnlineMapping, Options, Policy, Problem, RequestKind, Settings, StoppedBy,
 };
 use crate::attribute::Weights;
-use crate::document::{Faults, Object};
+use crate::document::{Faults, Object, Place};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
 use crate::model::Model;
 
@@ -36,14 +36,25 @@ impl<'m> Request<'m> {
         Self::of(demonstration, model, object, &Options::default(), |_| Some(model.schema().weights()), faults)
     }
 
-    /// Reads the demonstration of a request.
+    /// Reads the demonstration of a request; if it says how to `observe`, what is observed of it. What is wrong with that itself, the
+    /// options tell.
     pub fn read_demonstration(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Demonstration> {
         let place = object.required("demonstration", faults)?;
+        #[cfg(feature = "rules")]
+        if let Some(observe) = object.optional("observe") {
+            let perception = super::Perception::read(&observe, &mut Faults::default())?;
+            let observed = perception.observe_all(&place, &observe.path, faults)?;
+            return Self::read_observed(model, &Place { value: &observed, path: place.path }, faults);
+        }
+        Self::read_observed(model, &place, faults)
+    }
+
+    fn read_observed(model: &Model, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Demonstration> {
         // Before it is read: small observations make as large steps as others.
         let n_observations = place.value.as_array().map_or(0, Vec::len);
         let is_answerable = n_observations > Demonstration::MAX_OBSERVATIONS
-            || Policy::check_size(model, n_observations, &place, faults);
-        is_answerable.then(|| Demonstration::read(model.schema(), &place, faults)).flatten()
+            || Policy::check_size(model, n_observations, place, faults);
+        is_answerable.then(|| Demonstration::read(model.schema(), place, faults)).flatten()
     }
 
     /// The request to follow `demonstration` with the options of `object`, and those of `shared` for what it does not say. `None` for a

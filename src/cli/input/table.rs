@@ -10,7 +10,7 @@ use crate::cli::{CliError, note};
 use etude_core::attribute::{AttributeDocument, Cycle, Kind, KindName, Value as Known};
 use etude_core::model::Model;
 
-/// How the cells of a table become values, by attribute of a model.
+/// How the cells of a table become values, by attribute of a model; without any, each column is what it looks like.
 #[derive(Clone, Debug)]
 pub(in crate::cli) struct Cells(Vec<(String, Cell)>);
 
@@ -19,6 +19,8 @@ pub(in crate::cli) struct Cells(Vec<(String, Cell)>);
 enum Cell {
     Number,
     Label,
+    /// A cell that looks like a number or a boolean is one.
+    Any,
     /// A cell that looks like a boolean or an integer is one, unless it is one of these strings, which are values of the model.
     Category(HashSet<Box<str>>),
 }
@@ -51,6 +53,11 @@ impl Cells {
         Self(attributes.iter().map(|attribute| (attribute.name.clone(), cell(attribute))).collect())
     }
 
+    /// Those of a demonstrator with attributes of its own.
+    pub(in crate::cli) fn any() -> Self {
+        Self(Vec::new())
+    }
+
     fn names(&self) -> String {
         self.0.iter().map(|(name, _)| format!("{name:?}")).collect::<Vec<_>>().join(", ")
     }
@@ -66,6 +73,7 @@ impl Cell {
         match self {
             Self::Number => number(text).unwrap_or_else(|| text.into()),
             Self::Label => text.into(),
+            Self::Any => number(text).unwrap_or_else(|| plain(text)),
             Self::Category(texts) if texts.contains(text) => text.into(),
             Self::Category(_) => plain(text),
         }
@@ -174,8 +182,28 @@ impl Table {
     }
 }
 
+/// All columns that have a name.
+fn all(name: &str, header: &StringRecord, columns: &[Column]) -> Result<Vec<Taken>, CliError> {
+    if let Some(column) = columns.first() {
+        let detail = "expressions of --observe say what columns are called and in which units they are";
+        return Err(CliError::Faulty(format!("--column {column}: {detail}")));
+    }
+    let mut taken: Vec<Taken> = Vec::new();
+    for (index, header) in header.iter().enumerate().filter(|(_, header)| !header.is_empty()) {
+        if taken.iter().any(|taken| taken.header == header) {
+            return Err(CliError::Faulty(format!("{name} has two columns {header:?}")));
+        }
+        let (header, attribute) = (header.to_owned(), header.to_owned());
+        taken.push(Taken { index, header, attribute, cell: Cell::Any, column: None });
+    }
+    Ok(taken)
+}
+
 /// The columns to read. Tells whoever watches which are left.
 fn taken(name: &str, header: &StringRecord, columns: &[Column], cells: &Cells) -> Result<Vec<Taken>, CliError> {
+    if cells.0.is_empty() {
+        return all(name, header, columns);
+    }
     let named = || header.iter().map(|column| format!("{column:?}")).collect::<Vec<_>>().join(", ");
     let mut taken: Vec<Taken> = Vec::new();
     for (attribute, cell) in &cells.0 {
