@@ -84,3 +84,43 @@ fn read(model: &Model, request: &Value, is_asked: bool, mut faults: Faults) -> R
     });
     faults.check(query)
 }
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+    use tokio_util::sync::CancellationToken;
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::clock::Clock;
+    use crate::service::{Client, ModelText, Settings};
+    use etude_core::model::Format;
+
+    fn caller() -> Caller {
+        Caller { client: Client::LOCAL, arrived: Clock::system().instant(), now: Timestamp::UNIX_EPOCH }
+    }
+
+    #[tokio::test]
+    async fn a_report_for_which_there_is_no_memory_is_refused_and_one_that_is_made_gives_it_back() {
+        let directory = tempfile::tempdir().unwrap();
+        let settings = Settings::of_test(directory.path());
+        let etude = Etude::open(&settings, &TaskTracker::new(), CancellationToken::new()).await.unwrap();
+        let name = Name::new("m").unwrap();
+        let states: Vec<_> = (0..1000).map(|x| json!([x])).collect();
+        let model = json!({
+            "attributes": [{"name": "x", "kind": "number"}], "actions": [{"name": "on"}],
+            "dynamics": {"kind": "table", "states": states, "transitions": [[0, "on", 1]]},
+        });
+        let text = ModelText::Whole(model.to_string().into_bytes());
+        etude.put_model(&name, text, Format::Json, caller()).await.unwrap();
+        let large = etude.memory.try_take(etude.memory.free_for_large()).unwrap();
+        let small: Vec<_> = std::iter::from_fn(|| etude.memory.try_take(1 << 16).ok()).collect();
+        let refused = etude.report(&name, None, caller()).await;
+        assert!(matches!(refused, Err(ServiceError::NoRoom(_))), "{refused:?}");
+        drop((large, small));
+        let free = etude.memory.free();
+        let report: Value = serde_json::from_str(&etude.report(&name, None, caller()).await.unwrap()).unwrap();
+        assert_eq!(report["reach"]["states"], 1000);
+        assert_eq!(etude.memory.free(), free);
+    }
+}
