@@ -42,8 +42,8 @@ async fn a_model_is_reported_on_with_what_its_body_comes_to_and_what_it_cannot_u
     ]});
     assert_eq!(report["parts"], expected);
     let expected = json!([
-        {"name": "x", "kind": "number", "weight": 1.0, "distinct": 5, "span": {"least": 0.0, "greatest": 9.0}, "values": null, "changed_by": 5},
-        {"name": "lamp", "kind": "category", "weight": 1.0, "distinct": 1, "span": null, "values": ["off"], "changed_by": 0},
+        {"name": "x", "kind": "number", "weight": 1.0, "hidden": false, "distinct": 5, "span": {"least": 0.0, "greatest": 9.0}, "values": null, "changed_by": 5},
+        {"name": "lamp", "kind": "category", "weight": 1.0, "hidden": false, "distinct": 1, "span": null, "values": ["off"], "changed_by": 0},
     ]);
     assert_eq!(report["attributes"], expected);
     let expected = json!([

@@ -13,6 +13,7 @@
 //! | `reached` | the states that the body comes to, and the ways between them |
 //! | `classes` | states that look alike |
 //! | `parts` | strongly connected components |
+//! | `one_way` | attributes that change one way only, where states are not listed |
 //! | `undoing` | how many actions it takes until all looks as before one |
 //! | `values`, `unmet` | which values states have; what was observed that none has |
 //! | `report` | what was found |
@@ -21,6 +22,7 @@
 //! stated sample, and some are not found; these are `null`, and [`Report::unknown`] says why.
 
 mod classes;
+mod one_way;
 mod parts;
 mod query;
 mod reached;
@@ -40,6 +42,7 @@ use crate::interrupt::{Cancelled, Interrupt, Interrupted, Meter};
 use crate::mapping::{Demonstration, Starts};
 use crate::model::Model;
 use classes::Classes;
+use one_way::OneWay;
 use parts::Parts;
 use reached::{Effects, Extent, Reached};
 use undoing::Undoing;
@@ -125,7 +128,7 @@ pub fn inspect(model: &Model, query: &Query, interrupt: &mut dyn Interrupt) -> R
         unknown.push(Unknown::out_of_time("/parts"));
     }
     let undoing = match &reached {
-        Some(reached) => in_time(Undoing::of(model, reached, of_states.as_ref(), &query.weights, &mut meter))?,
+        Some(reached) => in_time(Undoing::of(model, reached, of_states.as_ref(), query, &mut meter))?,
         None => None,
     };
     match &undoing {
@@ -171,6 +174,7 @@ fn attributes(model: &Model, query: &Query, effects: Option<&Effects>, values: &
         name: attribute.name.clone(),
         kind: AttributeDocument::from(attribute).kind,
         weight: *weight,
+        hidden: attribute.is_hidden,
         distinct: values.n_values(position),
         span: values.span(position),
         values: values.list(position),

@@ -140,6 +140,8 @@ pub struct AttributeReport {
     pub kind: KindName,
     /// Its weight.
     pub weight: f64,
+    /// Whether it is never observed nor compared.
+    pub hidden: bool,
     /// How many different values the states have to which the body comes; if these are not known, that states may have.
     pub distinct: u64,
     /// From where to where its values go; `null` if they are no numbers.

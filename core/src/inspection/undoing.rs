@@ -3,8 +3,7 @@
 use std::borrow::Cow;
 
 use super::report::{Steps, UndoReport, Unknown};
-use super::{Classes, Extent, Parts, Reached};
-use crate::attribute::Weights;
+use super::{Classes, Extent, OneWay, Parts, Query, Reached};
 use crate::interrupt::{Interrupted, Meter};
 use crate::mapping::Demonstration;
 use crate::model::{ActionIdx, Model, Rows};
@@ -57,10 +56,10 @@ impl Undoing {
         model: &Model,
         reached: &Reached<'_>,
         parts: Option<&Parts>,
-        weights: &Weights,
+        query: &Query,
         meter: &mut Meter<'_>,
     ) -> Result<Self, Interrupted> {
-        let weighed = weights.as_slice().iter().enumerate().filter(|(_, weight)| **weight > 0.0);
+        let weighed = query.weights.as_slice().iter().enumerate().filter(|(_, weight)| **weight > 0.0);
         let classes = Classes::of(reached, weighed.map(|(position, _)| position).collect(), meter)?;
         let of_classes = match parts {
             Some(_) if classes.len() < reached.n_states() => Some(parts_of_classes(reached, &classes, meter)?),
@@ -83,7 +82,8 @@ impl Undoing {
         };
         let seen = vec![0; reached.n_states()];
         let (classes, parts) = (&*classes.of, parts.as_deref());
-        let mut search = Search { reached, classes, parts, seen, n_searches: 0, queue: Vec::new() };
+        let one_way = OneWay::of(model, query, meter)?;
+        let mut search = Search { reached, classes, parts, one_way, seen, n_searches: 0, queue: Vec::new() };
         let mut work = 0;
         for from in evenly(n_from) {
             for way in reached.ways.of(from as usize) {
@@ -202,6 +202,7 @@ struct Search<'r> {
     classes: &'r [u32],
     /// By state, its class's part in the graph of classes, if that is known whole.
     parts: Option<&'r [u32]>,
+    one_way: OneWay,
     /// By state, the last search that has seen it.
     seen: Vec<u32>,
     n_searches: u32,
@@ -219,7 +220,7 @@ impl Search<'_> {
         let part_of = |state: u32| self.parts.map(|parts| parts[state as usize]);
         let part = part_of(to);
         // A way back stays within the part.
-        if part_of(from) != part {
+        if part_of(from) != part || self.one_way.bars(self.reached.row(from), self.reached.row(to)) {
             return Ok(Back::Never);
         }
         self.n_searches += 1;

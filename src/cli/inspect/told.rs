@@ -175,11 +175,13 @@ fn attributes(attributes: &[AttributeReport], width: usize) -> String {
         KindName::Category => "category",
     };
     let values = |attribute: &AttributeReport| match (&attribute.values, attribute.span) {
-        (Some(values), _) => values.iter().map(Scalar::to_string).collect::<Vec<_>>().join(" "),
+        (Some(values), _) => values.iter().map(Scalar::to_string).collect::<Vec<_>>().join(", "),
         (None, Some(span)) if span.least == span.greatest => span.least.to_string(),
         (None, Some(span)) => format!("{} from {} to {}", attribute.distinct, span.least, span.greatest),
         (None, None) => format!("{} different ones", attribute.distinct),
     };
+    let weight =
+        |attribute: &AttributeReport| if attribute.hidden { "hidden".to_owned() } else { decimal(attribute.weight) };
     let changes = |attribute: &AttributeReport| match attribute.changed_by {
         Some(0) => "nothing".to_owned(),
         Some(n) => n.to_string(),
@@ -188,7 +190,7 @@ fn attributes(attributes: &[AttributeReport], width: usize) -> String {
     let mut columns = vec![
         Column::new("attribute", Left, attributes.iter().map(|attribute| attribute.name.clone())),
         Column::new("kind", Left, attributes.iter().map(|attribute| kind(attribute).to_owned())),
-        Column::new("weight", Right, attributes.iter().map(|attribute| decimal(attribute.weight))),
+        Column::new("weight", Right, attributes.iter().map(weight)),
         Column::new("changed by", Right, attributes.iter().map(changes)),
         Column::new("values", Left, attributes.iter().map(values)),
     ];

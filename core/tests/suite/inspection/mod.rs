@@ -270,6 +270,21 @@ fn of_a_large_world_that_is_searched_lazily_what_is_known_is_told_and_what_is_no
     assert_eq!(pointers, ["/reach", "/demonstration/distance"]);
 }
 
+/// To prove that gold cannot be laid back, and arrows do not come back, by walking would take longer than there is time for.
+#[test]
+fn what_changes_one_way_only_is_never_undone_however_many_states_there_are() {
+    let mut model = empty_cave(60, 60, &["turn_left", "turn_right", "grab", "shoot"]);
+    model["dynamics"]["gold"] = json!([[1, 0], [3, 2], [50, 50], [9, 40]]);
+    let report = inspected(&mapper_within(LAZY, &model), &json!({}));
+    let action = |name: &str| report.actions.iter().find(|action| action.name == name).unwrap();
+    for name in ["grab", "shoot"] {
+        let found = action(name);
+        assert!(found.undone_in.is_none() && found.never_undone.unwrap() > 0, "{found:?}");
+    }
+    let undo = report.undo.as_ref().unwrap();
+    assert_eq!((report.reach.is_none(), undo.not_found, action("forward").undone_in), (true, 0, Some(5)));
+}
+
 #[test]
 fn a_body_that_turns_right_alone_follows_well_with_the_lookahead_that_a_report_says_and_badly_with_little() {
     let model = empty_cave(5, 5, &["turn_right"]);
