@@ -1,10 +1,10 @@
-//! Streaming: the core per observation, round trips beside a bare echo and what the disk can do, and memory.
+//! Streaming: round trips beside a bare echo and what the disk can do, and memory. What the core takes is measured by `lookahead`.
 //!
-//! `cargo bench --bench stream` runs all of it, `cargo bench --bench stream -- core round-trips memory` the parts named.
+//! `cargo bench --bench stream` runs all of it, `cargo bench --bench stream -- round-trips memory` the parts named.
 //! Rounds of what is compared are interleaved, so that a machine that slows down slows all of them down. Client and
 //! service share the machine. Figures are medians, and in brackets the least and the most.
 //!
-//! This file is longer than 400 lines because its three parts share what they measure.
+//! This file is longer than 400 lines because its parts share what they measure.
 
 #![expect(clippy::disallowed_methods, reason = "a benchmark measures by the system's clock")]
 #![expect(clippy::print_stdout, reason = "this is where a benchmark's results go")]
@@ -41,9 +41,6 @@ const ROUND: Duration = Duration::from_millis(500);
 fn main() -> Result<(), Failure> {
     let parts: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
     let is_wanted = |name: &str| parts.is_empty() || parts.iter().any(|part| part == name);
-    if is_wanted("core") {
-        core()?;
-    }
     tokio::runtime::Runtime::new()?.block_on(async {
         if parts == [SERVE_ECHO] {
             return serve_echo().await;
@@ -64,57 +61,11 @@ fn main() -> Result<(), Failure> {
     })
 }
 
-fn core() -> Result<(), Failure> {
-    println!("microseconds per observation");
-    println!("{:<28} {:>9} {:>24} {:>24} {:>24}", "", "lookahead", "at 10", "at 100", "at 10,000");
-    for world in [worlds::example("figure-4"), worlds::cave(20, 5, 50, 1)] {
-        for lookahead in [NonZeroU32::new(8), None] {
-            observe(&world, lookahead)?;
-        }
-    }
-    Ok(())
-}
-
 fn mapper(world: &World) -> Result<Arc<Mapper>, Failure> {
     let definition =
         Definition::read(&world.model, Limits::DEFAULT, &mut Uninterrupted).map_err(|error| error.to_string())?;
     let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).map_err(|_| "too large")?;
     Ok(Arc::new(Mapper::new(model, &mut Uninterrupted).map_err(|_| "interrupted")?))
-}
-
-/// Feeds a demonstration that goes on for 10,000 observations, and looks at windows of it.
-fn observe(world: &World, lookahead: Option<NonZeroU32>) -> Result<(), Failure> {
-    let mapper = mapper(world)?;
-    let schema = mapper.model().schema();
-    let states = world.demonstration.as_array().ok_or("a demonstration is an array")?;
-    let read = |state| schema.read_observation(&Place::root(state), &mut Faults::default()).ok_or("faults");
-    let there = states.iter().map(read).collect::<Result<Vec<_>, _>>()?;
-    // Back and forth, so that it never jumps.
-    let period: Vec<_> = there.iter().chain(there.iter().rev()).collect();
-    let mut online = OnlineMapping::new(&mapper, schema.weights(), Conditions::default(), lookahead);
-    let marks = [10, 100, 10_000];
-    let half = 9;
-    let mut windows: [Vec<Duration>; 3] = Default::default();
-    for (n, observation) in period.iter().cycle().take(marks[2] + half).enumerate() {
-        let started = Instant::now();
-        std::hint::black_box(online.observe(observation, None, &mut Uninterrupted).map_err(|_| "nothing interrupts")?);
-        let taken = started.elapsed();
-        for (mark, window) in marks.iter().zip(&mut windows) {
-            if n.abs_diff(*mark) <= half {
-                window.push(taken);
-            }
-        }
-    }
-    let shown = windows.map(|mut times| {
-        times.sort_unstable();
-        let micros = |time: &Duration| time.as_secs_f64() * 1e6;
-        let (least, median, most) =
-            (micros(&times[0]), micros(&times[times.len() / 2]), micros(&times[times.len() - 1]));
-        format!("{median:.0} [{least:.0} .. {most:.0}]")
-    });
-    let lookahead = lookahead.map_or("null".to_owned(), |lookahead| lookahead.to_string());
-    println!("{:<28} {lookahead:>9} {:>24} {:>24} {:>24}", world.name, shown[0], shown[1], shown[2]);
-    Ok(())
 }
 
 /// A service in a process of its own; it is killed in the end.

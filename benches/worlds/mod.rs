@@ -61,6 +61,41 @@ pub(crate) fn cave(side: i64, n_gold: usize, n_observations: usize, seed: u64) -
     }
 }
 
+/// The same, for a demonstrator who goes from place to place without an end, and takes the gold that it comes upon; none was moved.
+pub(crate) fn wandered(side: i64, n_gold: usize, n_observations: usize, seed: u64) -> World {
+    let mut random = SplitMix(seed);
+    let mut cell = || (random.below(side), random.below(side));
+    let mut gold: Vec<(i64, i64)> = (0..n_gold).map(|_| cell()).collect();
+    gold.sort_unstable();
+    gold.dedup();
+    let wumpi: Vec<(i64, i64)> =
+        (0..2).map(|_| cell()).filter(|cell| *cell != (0, 0) && !gold.contains(cell)).collect();
+    let mut left = gold.clone();
+    let (mut state, mut goal) = (State { x: 0, y: 0, heading: 0, n_gold: 0, n_arrows: 1 }, cell());
+    let mut seen = Vec::with_capacity(n_observations);
+    while seen.len() < n_observations {
+        seen.push(state.clone());
+        if let Some(taken) = left.iter().position(|cell| *cell == (state.x, state.y)) {
+            left.swap_remove(taken);
+            state.n_gold += 1;
+        } else if state.turn_or_go_towards(goal).is_none() {
+            goal = cell();
+        }
+    }
+    let cells = |cells: &[(i64, i64)]| cells.iter().map(|(x, y)| json!([x, y])).collect::<Value>();
+    let actions = ["forward", "turn_left", "turn_right", "grab", "climb"];
+    World {
+        name: format!("{side}x{side} cave, {n_gold} gold"),
+        model: json!({
+            "actions": actions.map(|name| json!({"name": name, "cost": 0.3})),
+            "dynamics": {
+                "kind": "wumpus", "width": side, "height": side, "wumpi": cells(&wumpi), "gold": cells(&gold),
+            },
+        }),
+        demonstration: seen.iter().map(State::observed).collect(),
+    }
+}
+
 #[derive(Clone)]
 struct State {
     x: i64,
@@ -77,6 +112,25 @@ impl State {
     }
 }
 
+impl State {
+    /// Turns towards a cell, or goes on, along x first. `None` if it is there.
+    fn turn_or_go_towards(&mut self, goal: (i64, i64)) -> Option<()> {
+        let ahead = match (goal.0 - self.x, goal.1 - self.y) {
+            (0, 0) => return None,
+            (dx, _) if dx != 0 => usize::from(dx < 0) * 2,
+            (_, dy) => 1 + usize::from(dy < 0) * 2,
+        };
+        if self.heading == ahead {
+            let (dx, dy) = [(1, 0), (0, 1), (-1, 0), (0, -1)][ahead];
+            (self.x, self.y) = (self.x + dx, self.y + dy);
+        } else {
+            let is_left = (ahead + 4 - self.heading) % 4 != 3;
+            self.heading = (self.heading + if is_left { 1 } else { 3 }) % 4;
+        }
+        Some(())
+    }
+}
+
 /// Walks to the nearest piece of gold, along x and then along y, and takes it; and so on, until enough was seen.
 fn demonstrate(gold: &[(i64, i64)], n_observations: usize) -> Vec<State> {
     let mut left = gold.to_vec();
@@ -88,23 +142,12 @@ fn demonstrate(gold: &[(i64, i64)], n_observations: usize) -> Vec<State> {
         let distance = |(x, y): &(i64, i64)| (x - state.x).abs() + (y - state.y).abs();
         // With all the gold in hand, it goes home.
         let goal = left.iter().copied().min_by_key(distance).unwrap_or((0, 0));
-        let ahead = match (goal.0 - state.x, goal.1 - state.y) {
-            (0, 0) if left.is_empty() => break,
-            (0, 0) => {
-                left.retain(|cell| *cell != goal);
-                state.n_gold += 1;
-                seen.push(state.clone());
-                continue;
+        if state.turn_or_go_towards(goal).is_none() {
+            if left.is_empty() {
+                break;
             }
-            (dx, _) if dx != 0 => usize::from(dx < 0) * 2,
-            (_, dy) => 1 + usize::from(dy < 0) * 2,
-        };
-        if state.heading == ahead {
-            let (dx, dy) = [(1, 0), (0, 1), (-1, 0), (0, -1)][ahead];
-            (state.x, state.y) = (state.x + dx, state.y + dy);
-        } else {
-            let is_left = (ahead + 4 - state.heading) % 4 != 3;
-            state.heading = (state.heading + if is_left { 1 } else { 3 }) % 4;
+            left.retain(|cell| *cell != goal);
+            state.n_gold += 1;
         }
         seen.push(state.clone());
     }
