@@ -7,7 +7,7 @@ use crate::model::Space;
 /// What a search may spend. Its time is bounded by its caller's [`Interrupt`](crate::interrupt::Interrupt).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Budget {
-    /// Most nodes expanded.
+    /// Most nodes expanded; without what is looked at to make estimates.
     pub max_expansions: u64,
     /// About the most memory that it takes, in bytes: for the nodes and states that it finds, for tables of estimates, which take
     /// half of it at most, for ways and for the mapping. What does not fit is

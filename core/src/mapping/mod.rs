@@ -39,7 +39,9 @@
 //! | `completion` | a budget ran out before the last observation | there is always an answer |
 //!
 //! Best first begins with those tables of estimates alone that are small, and makes the others once it has expanded a sixteenth of
-//! their entries, as large tables may take longer than the search (`mapper::by_default`). What moves cost is said in `recurrence`,
+//! their entries, as large tables may take longer than the search (`mapper::by_default`). If extra actions pay less than a quarter of the
+//! distance, estimates are raised after 2,048 expansions, or one for 1,024 nodes if that is more, by a group of attributes that are projected
+//! together (`heuristic::abstraction`). What moves cost is said in `recurrence`,
 //! for all of them.
 //!
 //! **Ties.** Answers are deterministic. The first path found to a node wins ties: it is replaced only by a cheaper one, by the sums of

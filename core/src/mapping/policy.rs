@@ -167,7 +167,7 @@ pub struct Coverage {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 pub struct SearchReport {
-    /// Nodes expanded.
+    /// Nodes expanded; without what is looked at to make estimates.
     pub expanded: u64,
     /// Successors looked at.
     pub generated: u64,

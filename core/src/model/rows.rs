@@ -137,6 +137,12 @@ impl<T> Rows<T> {
         &self.items[self.range(row)]
     }
 
+    /// All items, row by row.
+    #[inline]
+    pub(crate) fn items(&self) -> &[T] {
+        &self.items
+    }
+
     /// The items of a row.
     pub(crate) fn of_mut(&mut self, row: usize) -> &mut [T] {
         let range = self.range(row);

@@ -1,5 +1,6 @@
 //! What a request may say of starts, of what counts, and of the body: small tasks that need it, and caves on which it must not cost much.
 
+use crate::oracle;
 use crate::problems::{close, example, mapper, mapper_within, solve};
 use etude_core::mapping::{Policy, Status};
 use etude_core::model::Limits;
@@ -183,4 +184,82 @@ fn a_world_that_is_searched_lazily_knows_all_of_it() {
             );
         }
     }
+}
+#[test]
+fn long_searches_where_extra_actions_pay_little_find_what_the_definition_says() {
+    let worlds::World { mut model, demonstration, .. } = worlds::cave(7, 3, 20, 2);
+    model["dynamics"]["pits"] = json!([]);
+    model["dynamics"]["start"] = json!({"x": 0, "y": 0, "heading": "east"});
+    model["dynamics"]["arrows"] = json!(1);
+    let table = oracle::wumpus::as_table(&model);
+    let mapper = mapper(&model);
+    let counts: Vec<f64> =
+        (0..demonstration.as_array().unwrap().len()).map(|i| f64::from(u8::try_from(i % 3).unwrap())).collect();
+    let at = |x: u32, y: u32| {
+        json!({"x": x, "y": y, "heading": "north", "arrows": 1, "outside": false,
+        "wumpus_1": true, "wumpus_2": true, "gold_1": true, "gold_2": true, "gold_3": true, "gold": 0})
+    };
+    let mut n_long = 0;
+    for conditions in [
+        json!({"extra_weight": 0}),
+        json!({"extra_weight": 0, "end_weight": 10}),
+        json!({"extra_weight": 0.2, "end_weight": 3, "observation_weights": counts}),
+        json!({"extra_weight": 0.1, "weights": {"gold": 4, "heading": 0}, "without": ["climb"]}),
+        json!({"extra_weight": 0, "without": ["turn_left"], "action_costs": {"grab": 1.5, "forward": 0.1}}),
+        json!({"extra_weight": 0, "end_weight": 10, "start": [at(0, 0), at(6, 6), at(3, 6)]}),
+    ] {
+        let mut request = conditions.clone();
+        request["model"] = json!("m");
+        request["demonstration"] = demonstration.clone();
+        let policy = solve(&mapper, &request);
+        if let Some(starts) = request["start"].as_array_mut() {
+            for start in starts {
+                *start = json!(index_of(&table, start));
+            }
+        }
+        let optimum = oracle::optimal_cost(&table, &request);
+        assert!(close(policy.cost.total, optimum), "{conditions}: {}, not {optimum}", policy.cost.total);
+        assert_eq!((policy.status, policy.lower_bound), (Status::Optimal, Some(policy.cost.total)));
+        n_long += u32::from(policy.search.expanded > 2_048);
+    }
+    assert!(n_long >= 4, "{n_long}");
+}
+
+/// The number of the state with these values.
+fn index_of(table: &Value, values: &Value) -> usize {
+    let names = table["attributes"].as_array().unwrap().iter().map(|attribute| attribute["name"].as_str().unwrap());
+    let row: Value = names.map(|name| values[name].clone()).collect();
+    table["dynamics"]["states"].as_array().unwrap().iter().position(|state| *state == row).unwrap()
+}
+
+#[test]
+fn way_points_and_an_end_that_matters_take_no_more_than_three_times_the_expansions() {
+    let caves = (1..=3).map(|seed| worlds::cave(20, 5, 50, seed));
+    let figure = worlds::World {
+        name: "figure 4".to_owned(),
+        model: example("figure-4/model.json"),
+        demonstration: example("figure-4/demonstration.json"),
+    };
+    let mut n_default = Vec::new();
+    for worlds::World { name, model, demonstration } in [figure].into_iter().chain(caves) {
+        let mapper = mapper(&model);
+        let expanded = |conditions: Value| {
+            let mut request = conditions;
+            request["model"] = json!("m");
+            request["demonstration"] = demonstration.clone();
+            let policy = solve(&mapper, &request);
+            assert_eq!(policy.status, Status::Optimal);
+            policy.search.expanded
+        };
+        let by_default = expanded(json!({}));
+        n_default.push(by_default);
+        for conditions in
+            [json!({"extra_weight": 0}), json!({"end_weight": 10}), json!({"extra_weight": 0, "end_weight": 10})]
+        {
+            let n_expanded = expanded(conditions.clone());
+            assert!(n_expanded <= 3 * by_default, "{name}, {conditions}: {n_expanded}, and {by_default} by default");
+        }
+    }
+    // As before there was anything but the default.
+    assert_eq!(n_default[..2], [685, 5347]);
 }

@@ -2,16 +2,20 @@
 //!
 //! | name | admissible | consistent | made of |
 //! |---|---|---|---|
-//! | `default` | yes | yes | exact costs of the problem projected on each attribute ([`projection`]) |
+//! | `default` | yes | yes | exact costs of the problem projected on each attribute ([`projection`]); in long searches, on a group of them ([`abstraction`]) |
 //! | `none` | yes | yes | nothing: A* becomes Dijkstra's algorithm |
 //! | `paper` | no | no | differences and least action cost ([`paper`]) |
 
+pub(super) mod abstraction;
 pub(super) mod paper;
 pub(super) mod projected;
 pub(super) mod projection;
 mod shares;
 
 use serde::{Deserialize, Serialize};
+
+use abstraction::Abstracted;
+use projected::Projected;
 
 /// An estimate of the cost from a node to the end of the demonstration.
 ///
@@ -25,6 +29,19 @@ pub(super) trait Heuristic {
     /// How much work an estimate for a node at `observation` is, in looks at a distance. At least 1.
     fn work(&self, _observation: usize) -> u64 {
         1
+    }
+}
+
+/// What guides a best-first search: estimates, raised as it goes on if there is an abstraction.
+#[derive(Debug)]
+pub(super) struct Guide<'g, 'p> {
+    pub(super) projected: &'g Projected<'p>,
+    pub(super) abstracted: Option<&'g mut Abstracted<'p>>,
+}
+
+impl<'g, 'p> From<&'g Projected<'p>> for Guide<'g, 'p> {
+    fn from(projected: &'g Projected<'p>) -> Self {
+        Self { projected, abstracted: None }
     }
 }
 

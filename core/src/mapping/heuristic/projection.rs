@@ -19,7 +19,8 @@
 //! on cost partitioning).
 //!
 //! Attributes could be projected together, for higher estimates. That was measured on caves, random tables, a planner's model of
-//! two-valued attributes and a large grid, and shortened no search: making the tables took as long as what they saved.
+//! two-valued attributes and a large grid, and shortened no search: making the tables took as long as what they saved. Where it does
+//! shorten searches, an [abstraction](super::abstraction) does it without tables.
 
 use rustc_hash::{FxHashMap, FxHashSet};
 
@@ -249,8 +250,8 @@ impl EdgeSets {
 
 /// Distinct sets of projections, numbered as they are found.
 #[derive(Default)]
-struct ChangeSets {
-    sets: Vec<Vec<u16>>,
+pub(super) struct ChangeSets {
+    pub(super) sets: Vec<Vec<u16>>,
     numbers: FxHashMap<Vec<u16>, u32>,
     n_entries: usize,
     /// The set in hand.
@@ -258,7 +259,7 @@ struct ChangeSets {
 }
 
 impl ChangeSets {
-    fn number_of(&mut self, set: impl Iterator<Item = u16>) -> u32 {
+    pub(super) fn number_of(&mut self, set: impl Iterator<Item = u16>) -> u32 {
         self.set.clear();
         self.set.extend(set);
         self.numbers.get(&self.set).copied().unwrap_or_else(|| {

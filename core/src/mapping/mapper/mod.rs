@@ -14,10 +14,11 @@ use serde::{Deserialize, Serialize};
 
 use super::completion::{Allowance, Extras, complete};
 use super::cost::{Cost, ROUNDING, SLACK, action_costs, cost_of};
+use super::heuristic::abstraction::Abstractions;
 use super::heuristic::paper::Paper;
 use super::heuristic::projected::{Projected, TableRoom};
 use super::heuristic::projection::Projections;
-use super::heuristic::{Heuristic, HeuristicName};
+use super::heuristic::{Guide, Heuristic, HeuristicName};
 use super::search::{Found, Move, astar, layered};
 use super::{Budget, PolicyEnd, Problem, StoppedBy};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
@@ -82,7 +83,7 @@ pub struct Mapping {
     pub lower_bound: Option<f64>,
     /// What the search ran out of, if that is why it is not optimal, or why the end of what a lookahead decided was followed greedily.
     pub stopped_by: Option<StoppedBy>,
-    /// Nodes expanded.
+    /// Nodes expanded; without what is looked at to make estimates.
     pub n_expanded: u64,
     /// Successors looked at.
     pub n_generated: u64,
@@ -96,6 +97,7 @@ pub struct Mapping {
 pub struct Mapper {
     model: Arc<Model>,
     projections: Projections,
+    abstractions: Abstractions,
     buffers: BufferPool,
     patience: Patience,
     /// See [`Self::keeping`].
@@ -122,8 +124,8 @@ impl Mapper {
     pub fn within(model: Model, max_bytes: usize, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
         let left = max_bytes.saturating_sub(model.size_bytes());
         let projections = Projections::new(&model, left, interrupt)?;
-        let (model, buffers) = (Arc::new(model), BufferPool::default());
-        Ok(Self { model, projections, buffers, patience: Patience::DEFAULT, kept: None })
+        let (model, abstractions, buffers) = (Arc::new(model), Abstractions::default(), BufferPool::default());
+        Ok(Self { model, projections, abstractions, buffers, patience: Patience::DEFAULT, kept: None })
     }
 
     /// The same mapper, which keeps `token` for as long as it lives: what its memory is counted by, for whoever counts that.
@@ -146,12 +148,14 @@ impl Mapper {
     /// searches as ran at the same time, up to 16 MB each are kept.
     #[must_use]
     pub fn size_bytes(&self) -> usize {
-        self.model.size_bytes() + self.projections.size_bytes() + self.buffers.size_bytes()
+        let made = self.projections.size_bytes() + self.abstractions.size_bytes();
+        self.model.size_bytes() + made + self.buffers.size_bytes()
     }
 
     /// Gives back what was kept of searches. The next ones take longer, and find the same.
     pub fn release(&self) {
         self.buffers.release();
+        self.abstractions.release();
     }
 
     /// A lower bound of the cost from each node, an observation and a state, of `problem` to the end: what guides the
@@ -215,7 +219,7 @@ impl Mapper {
             },
             HeuristicName::None => {
                 let blind = Projected::blind(problem);
-                let found = self.search(space, problem, &blind, budget, most_f, interrupt)?;
+                let found = self.search(space, problem, Guide::from(&blind), budget, most_f, interrupt)?;
                 conclude(problem, space, &blind, within(most_f, found, problem), interrupt)
             }
             HeuristicName::Paper => {

@@ -2,6 +2,7 @@
 
 use super::{HeuristicName, Mapper, Settings, way_bytes};
 use crate::mapping::Problem;
+use crate::mapping::heuristic::abstraction::Abstracted;
 use crate::mapping::heuristic::projected::{self, TableRoom};
 use crate::mapping::search::{astar, best_first, layered, sweep};
 
@@ -33,7 +34,13 @@ impl Mapper {
             HeuristicName::Default => {
                 let search =
                     best_first::most_bytes(model, n_observations).max(sweep::most_bytes(model, n_observations));
-                search.saturating_add(2 * tables)
+                let abstracted = if self.may_abstract(problem) {
+                    // It has half of what the tables leave.
+                    2 * Abstracted::most_bytes(self.max_classes(), problem)
+                } else {
+                    0
+                };
+                search.saturating_add(2 * tables).saturating_add(abstracted)
             }
             HeuristicName::None => best_first::most_bytes(model, n_observations),
             HeuristicName::Paper => astar::most_bytes(n_nodes).max(4 * tables),

@@ -23,8 +23,10 @@ use super::buckets::Buckets;
 use super::nodes::{Arrival, BlockIdx, NO_NODE, NodeId, Nodes, Position, Reached};
 use super::seen::{Estimates, Seen, SeenIdx, SeenWay};
 use super::{End, Found, MoveKind, NO_ACTION, POLL_EVERY};
-use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
+use crate::interrupt::{Cancelled, Interrupt, Interrupted, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
+use crate::mapping::heuristic::Guide;
+use crate::mapping::heuristic::abstraction::Abstracted;
 use crate::mapping::heuristic::projected::Projected;
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::recurrence::Recurrence;
@@ -91,12 +93,13 @@ impl Open {
 pub(in crate::mapping) fn search<S: Space, const ALIKE: bool>(
     problem: &Problem<'_>,
     space: &mut S,
-    projected: &Projected<'_>,
+    guide: Guide<'_, '_>,
     budget: Budget,
     most: f64,
     buffers: &mut SearchBuffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
+    let Guide { projected, abstracted } = guide;
     let SearchBuffers { seen, nodes, open } = buffers;
     seen.prepare(space, &problem.body, projected);
     nodes.clear(problem.demonstration.len(), problem.recurrence());
@@ -105,6 +108,7 @@ pub(in crate::mapping) fn search<S: Space, const ALIKE: bool>(
         problem,
         space,
         projected,
+        abstracted,
         budget,
         seen,
         nodes,
@@ -138,6 +142,7 @@ struct Search<'s, 'p, S, const ALIKE: bool> {
     problem: &'s Problem<'s>,
     space: &'s mut S,
     projected: &'s Projected<'p>,
+    abstracted: Option<&'s mut Abstracted<'p>>,
     budget: Budget,
     seen: &'s mut Seen,
     nodes: &'s mut Nodes,
@@ -238,6 +243,17 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
                 continue;
             }
             let step = self.nodes.step(id);
+            if self.abstracted.is_some() {
+                match self.raise(id, f, step) {
+                    Ok(None) => {}
+                    Ok(Some(raised)) => {
+                        open.buckets.push(raised);
+                        continue;
+                    }
+                    Err(Interrupted::OutOfTime) => return Ok(OUT_OF_TIME),
+                    Err(Interrupted::Cancelled(cancelled)) => return Err(cancelled),
+                }
+            }
             let ways = match self.spend(step.state, &mut open.buckets)? {
                 Ok(ways) => ways,
                 Err(stopped_by) => return Ok(End::CutShort(stopped_by)),
@@ -261,6 +277,17 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
             }
         }
         Ok(End::Done)
+    }
+
+    /// Raises the estimate of a node that is about to be expanded as far as the abstraction tells. Gives the node if its `f` has grown.
+    fn raise(&mut self, id: NodeId, f: f64, step: Position) -> Result<Option<Reached>, Interrupted> {
+        let Self { nodes, seen, projected, abstracted, space, meter, .. } = self;
+        let Some(abstracted) = abstracted else { return Ok(None) };
+        abstracted.settle(seen.state(step.state), step.observation as usize, f, meter)?;
+        let estimates = Estimates { seen, projected, abstracted: Some(abstracted), space: &**space };
+        nodes.estimate_anew(id, estimates.of(step.state, step.observation));
+        let raised = nodes.get::<ALIKE>(id);
+        Ok((raised.f > f).then_some(raised))
     }
 
     /// Puts all open nodes into the buckets, and gives the limit that these are for; `None` if there is no time for it.
@@ -329,7 +356,8 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
     /// How much memory this takes, in bytes, without the states that were found.
     fn size_bytes(&self, buckets: &Buckets) -> usize {
         let nodes = self.nodes.size_bytes(self.seen.n_states());
-        nodes + self.seen.size_bytes() + buckets.size_bytes()
+        let abstracted = self.abstracted.as_ref().map_or(0, |abstracted| abstracted.size_bytes());
+        nodes + self.seen.size_bytes() + buckets.size_bytes() + abstracted
     }
 
     /// Follows the moves out of a node. Calls `found` with each node that is to be expanded to which that gives a cheaper way.
@@ -417,8 +445,13 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
     #[inline(always)]
     fn take(&mut self, block: &mut BlockIdx, arrival: Arrival) -> Option<Reached> {
         let observation = arrival.observation;
-        let Self { nodes, seen, projected, space, .. } = self;
-        let node = nodes.take::<ALIKE>(block, arrival, &Estimates { seen, projected, space: &**space }, self.limit)?;
+        let Self { nodes, seen, projected, abstracted, space, .. } = self;
+        let node = nodes.take::<ALIKE>(
+            block,
+            arrival,
+            &Estimates { seen, projected, abstracted: abstracted.as_deref(), space: &**space },
+            self.limit,
+        )?;
         if observation == self.last && !self.end_at(node.id, node.g, arrival.state) {
             return None;
         }

@@ -172,6 +172,12 @@ impl Nodes {
         Reached { id, g, f: g + estimate.cost_to_go }
     }
 
+    /// Replaces the estimate of a node.
+    pub(super) fn estimate_anew(&mut self, id: NodeId, estimate: Estimate) {
+        let (block, in_block) = split(id);
+        self.estimates[block][in_block] = estimate;
+    }
+
     /// Where a node is, and how the way to it ends.
     #[inline]
     pub(super) fn step(&self, id: NodeId) -> Position {

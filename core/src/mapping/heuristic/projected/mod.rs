@@ -11,7 +11,8 @@ pub(in crate::mapping) use room::MAX_ENTRIES;
 pub(in crate::mapping) use room::{TableRoom, most_bytes};
 pub(in crate::mapping) use solving::TableBuffers;
 pub(in crate::mapping) use table::CHUNK_LEN;
-use table::{Table, stride_for};
+pub(super) use table::Table;
+use table::stride_for;
 
 use super::Heuristic;
 use super::projection::{Projection, ValueIdx};
@@ -41,9 +42,9 @@ impl AddAssign for Estimate {
 #[derive(Debug)]
 pub(crate) struct Projected<'p> {
     problem: &'p Problem<'p>,
-    columns: Vec<Column<'p>>,
+    pub(super) columns: Vec<Column<'p>>,
     /// By class, one attribute after the other.
-    table: Table<Estimate>,
+    pub(super) table: Table<Estimate>,
     /// Sums, per observation, of the columns that no action changes. Shape `[n_observations]`, padded to whole chunks.
     unchanged: Vec<Estimate>,
     /// The columns that actions change, in order.
@@ -53,17 +54,17 @@ pub(crate) struct Projected<'p> {
     /// Entries of tables that were left out.
     n_left_out: u64,
     /// The least distance at each observation, of whatever state: the sum of the least terms. Shape `[n_observations]`.
-    least_distances: Vec<f64>,
+    pub(super) least_distances: Vec<f64>,
     /// The least term of each column. Shape `[n_observations, n_columns]`.
-    least_terms: Vec<f64>,
+    pub(super) least_terms: Vec<f64>,
 }
 
 /// An attribute with a table.
 #[derive(Clone, Copy, Debug)]
-struct Column<'p> {
-    projection: &'p Projection,
+pub(super) struct Column<'p> {
+    pub(super) projection: &'p Projection,
     /// Where its values begin in the table.
-    offset: usize,
+    pub(super) offset: usize,
     /// The value that all states have that a search may come to, if no action of the body changes it.
     fixed: Option<ValueIdx>,
 }

@@ -3,7 +3,7 @@
 /// What each class costs at each observation. Those of a class are one after the other, so that what a state costs at neighbouring
 /// observations is read together.
 #[derive(Debug, Default)]
-pub(super) struct Table<T> {
+pub(in crate::mapping::heuristic) struct Table<T> {
     /// Shape `[n_classes, stride]`.
     entries: Vec<T>,
     /// The observations, with room for whole chunks of [`CHUNK_LEN`].
@@ -24,20 +24,25 @@ pub(super) fn stride_for(n_observations: usize) -> usize {
 
 impl<T: Copy> Table<T> {
     /// The same entry everywhere.
-    pub(super) fn filled_with(entry: T, n_classes: usize, n_observations: usize) -> Self {
+    pub(in crate::mapping::heuristic) fn filled_with(entry: T, n_classes: usize, n_observations: usize) -> Self {
         Self {
             entries: vec![entry; Self::n_entries_for(n_classes, n_observations)],
             stride: stride_for(n_observations),
         }
     }
 
+    /// How many entries there are for each class.
+    pub(in crate::mapping::heuristic) fn stride(&self) -> usize {
+        self.stride
+    }
+
     /// How many entries a table has, with the room.
-    pub(super) fn n_entries_for(n_classes: usize, n_observations: usize) -> usize {
+    pub(in crate::mapping::heuristic) fn n_entries_for(n_classes: usize, n_observations: usize) -> usize {
         n_classes.saturating_mul(stride_for(n_observations))
     }
 
     /// Size in memory, in bytes.
-    pub(super) fn size_bytes(&self) -> usize {
+    pub(in crate::mapping::heuristic) fn size_bytes(&self) -> usize {
         size_of_val(self.entries.as_slice())
     }
 
@@ -49,12 +54,12 @@ impl<T: Copy> Table<T> {
 
     /// What a class costs at an observation.
     #[inline]
-    pub(super) fn at(&self, class: usize, observation: usize) -> T {
+    pub(in crate::mapping::heuristic) fn at(&self, class: usize, observation: usize) -> T {
         self.entries[class * self.stride + observation]
     }
 
     #[inline]
-    pub(super) fn at_mut(&mut self, class: usize, observation: usize) -> &mut T {
+    pub(in crate::mapping::heuristic) fn at_mut(&mut self, class: usize, observation: usize) -> &mut T {
         &mut self.entries[class * self.stride + observation]
     }
 

@@ -3,8 +3,9 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::interrupt::{Signal, Uninterrupted};
-use crate::mapping::by_definition::{fitted, prepared, problem};
+use crate::mapping::by_definition::{any_conditions, fitted, least_costs, optimum, prepared, problem, with_conditions};
 use crate::mapping::heuristic::HeuristicName;
+use crate::mapping::heuristic::abstraction::Abstractions;
 use crate::mapping::heuristic::projected::MAX_ENTRIES;
 use crate::mapping::mapper::Status;
 
@@ -62,6 +63,10 @@ const IMPATIENT: Patience = Patience {
     few_entries: 0,
     few_entries_per_observation: 8,
     entries_per_expansion: 16,
+    abstract_below_extra_weight: f64::INFINITY,
+    min_expansions_before_abstraction: 10,
+    nodes_per_expansion_before_abstraction: u64::MAX,
+    states_per_class: 1,
     min_expansions_before_sweep: 40,
     nodes_per_expansion: u64::MAX,
 };
@@ -78,13 +83,15 @@ proptest! {
             Just(IMPATIENT),
             Just(Patience { min_expansions_before_sweep: u64::MAX, ..IMPATIENT }),
         ],
+        conditions in any_conditions(),
         few in 0..300_u64,
         looseness in prop_oneof![Just(None), Just(Some(1.0)), Just(Some(1.3))],
     ) {
-        let mapper = Mapper { patience: helps, ..prepared(&model) };
-        let request = problem(mapper.model(), &request);
-        let without = Settings { heuristic: HeuristicName::None, ..Settings::default() };
-        let optimum = mapper.map(&request, without, &mut Uninterrupted).unwrap().cost.total;
+        // Any attributes are taken together.
+        let abstractions = Abstractions::coupling(vec![(0, 1), (1, 2)]);
+        let mapper = Mapper { patience: helps, abstractions, ..prepared(&model) };
+        let request = problem(mapper.model(), &with_conditions(request, &model, &conditions));
+        let optimum = optimum(&request, &least_costs(&request)[0]);
         let close = |cost: f64| (cost - optimum).abs() <= 1e-9 * optimum;
         let settings = Settings { upper_bound: looseness.map(|factor| optimum * factor), ..Settings::default() };
         let map = |budget, interrupt: &mut dyn Interrupt| {
