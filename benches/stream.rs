@@ -125,6 +125,8 @@ type Socket = WebSocketStream<MaybeTlsStream<TcpStream>>;
 struct Stream {
     socket: Socket,
     n_sent: usize,
+    /// How many messages have come.
+    n_messages: usize,
     states: Arc<Vec<Value>>,
 }
 
@@ -135,7 +137,7 @@ impl Stream {
         for _ in ["hello", "opened"] {
             socket.next().await.ok_or("closed")??;
         }
-        Ok(Self { socket, n_sent: 0, states: Arc::clone(states) })
+        Ok(Self { socket, n_sent: 0, n_messages: 0, states: Arc::clone(states) })
     }
 
     /// Sends the next observation, and waits until it was received; steps that were committed come before or after.
@@ -146,6 +148,7 @@ impl Stream {
         self.n_sent += 1;
         loop {
             let message = self.socket.next().await.ok_or("closed")??;
+            self.n_messages += 1;
             if message.to_text()?.starts_with(r#"{"type":"received""#) {
                 return Ok(());
             }
@@ -153,14 +156,43 @@ impl Stream {
     }
 }
 
+/// Sends each message back as often as its first digit says, in one write.
 async fn echo(upgrade: WebSocketUpgrade) -> axum::response::Response {
     upgrade.on_upgrade(async |mut socket| {
         while let Some(Ok(message)) = socket.recv().await {
-            if socket.send(message).await.is_err() {
+            let digit = message.to_text().ok().and_then(|text| text.chars().next()?.to_digit(10));
+            for _ in 0..digit.unwrap_or(1) {
+                if socket.feed(message.clone()).await.is_err() {
+                    return;
+                }
+            }
+            if socket.flush().await.is_err() {
                 return;
             }
         }
     })
+}
+
+/// A client of the echo, to which as many messages come as to one of the service.
+struct Echoed {
+    socket: Socket,
+    /// Messages for each that is sent, as the service has sent for an observation.
+    n_messages: f64,
+    /// What is left of the part of a message.
+    rest: f64,
+}
+
+impl Echoed {
+    async fn round_trip(&mut self) -> Result<(), Failure> {
+        self.rest += self.n_messages;
+        let n_back = (1..9_u32).take_while(|n| f64::from(*n) <= self.rest).count().max(1);
+        self.rest -= f64::from(u32::try_from(n_back)?);
+        self.socket.send(Message::text(format!("{n_back}{}", "e".repeat(127)))).await?;
+        for _ in 0..n_back {
+            self.socket.next().await.ok_or("closed")??;
+        }
+        Ok(())
+    }
 }
 
 /// What this program does when it is started by [`Echo::start`].
@@ -227,11 +259,12 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
     let mut echoes = Vec::new();
     for _ in 0..n_connections {
         streams.push(Stream::open(&service.address, &states).await?);
-        echoes.push(tokio_tungstenite::connect_async(format!("ws://{}/", echo.address)).await?.0);
+        let socket = tokio_tungstenite::connect_async(format!("ws://{}/", echo.address)).await?.0;
+        echoes.push(Echoed { socket, n_messages: 1.0, rest: 0.0 });
     }
     // By what is measured; the service comes first.
     let mut rates: [Vec<f64>; 5] = Default::default();
-    let mut cpu_us = Vec::new();
+    let (mut cpu_us, mut n_for_each) = (Vec::new(), Vec::new());
     for _ in 0..N_ROUNDS {
         let cpu_before_s = service.cpu_s()?;
         let round = async |mut stream: Stream| -> Result<_, Failure> {
@@ -241,11 +274,16 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
         let (rate, back) = per_second(streams, round).await?;
         streams = back;
         rates[0].push(rate);
+        let (n_messages, n_sent) = streams
+            .iter()
+            .fold((0, 0), |(messages, sent), stream| (messages + stream.n_messages, sent + stream.n_sent));
+        let for_each = f64::from(u32::try_from(n_messages)?) / f64::from(u32::try_from(n_sent)?);
+        echoes.iter_mut().for_each(|echoed| echoed.n_messages = for_each);
+        n_for_each.push(for_each);
         cpu_us.push((service.cpu_s()? - cpu_before_s) / ROUND.as_secs_f64() / rate * 1e6);
-        let round = async |mut socket: Socket| -> Result<_, Failure> {
-            socket.send(Message::text("e".repeat(128))).await?;
-            socket.next().await.ok_or("closed")??;
-            Ok(socket)
+        let round = async |mut echoed: Echoed| -> Result<_, Failure> {
+            echoed.round_trip().await?;
+            Ok(echoed)
         };
         let (rate, back) = per_second(echoes, round).await?;
         echoes = back;
@@ -269,7 +307,7 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
     };
     row("round trips of the service", &rates[0], &[]);
     let names = [
-        "round trips of an echo of 128 bytes".to_owned(),
+        "round trips of an echo, as many messages".to_owned(),
         format!("rows into SQLite, {n_connections} a commit"),
         format!("lines into a file, {n_connections} a sync"),
         "observations mapped, on one core".to_owned(),
@@ -278,6 +316,7 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
         let ratios: Vec<f64> = rates[0].iter().zip(others).map(|(rate, other)| rate / other).collect();
         row(name, others, &ratios);
     }
+    println!("{:<44} {:>32}", "messages of the service a round trip", spread(&n_for_each, 2));
     println!("{:<44} {:>32}", "microseconds of the service's CPU a round trip", spread(&cpu_us, 1));
     Ok(())
 }

@@ -111,7 +111,7 @@ pub(super) async fn read(mut body: Peekable<BodyDataStream>, frame_bytes: usize,
     }
 }
 
-/// A line on its way to the client, with its memory.
+/// Lines on their way to the client, with their memory.
 struct Line {
     text: String,
     _memory: Option<Taken>,
@@ -123,19 +123,34 @@ impl AsRef<[u8]> for Line {
     }
 }
 
-async fn write(lines: &Lines, mut goes: Receiver<Outgoing>, room: &Room) {
-    while let Some(outgoing) = goes.recv().await {
-        match outgoing.item {
-            Outgoing::Frame(mut text) => {
-                text.push('\n');
-                let Ok(memory) = room.take_to_write(text.len()).await else { return };
-                let is_small = memory.is_none();
-                let line = if is_small { text.into() } else { Bytes::from_owner(Line { text, _memory: memory }) };
-                if lines.send(Ok(line)).await.is_err() {
-                    return;
+pub(super) async fn write(lines: &Lines, mut goes: Receiver<Outgoing>, room: &Room) {
+    let mut next = goes.recv().await;
+    while let Some(outgoing) = next.take() {
+        let Outgoing::Frame(mut text) = outgoing.item else { return };
+        text.push('\n');
+        // What waits together is written together.
+        while text.len() <= SMALL_FRAME_BYTES
+            && let Some(after) = goes.try_recv()
+        {
+            match after.item {
+                Outgoing::Frame(more) if text.len() + more.len() < SMALL_FRAME_BYTES => {
+                    text.push_str(&more);
+                    text.push('\n');
+                }
+                _ => {
+                    next = Some(after);
+                    break;
                 }
             }
-            Outgoing::Close(_) => return,
+        }
+        let Ok(memory) = room.take_to_write(text.len()).await else { return };
+        let is_small = memory.is_none();
+        let line = if is_small { text.into() } else { Bytes::from_owner(Line { text, _memory: memory }) };
+        if lines.send(Ok(line)).await.is_err() {
+            return;
+        }
+        if next.is_none() {
+            next = goes.recv().await;
         }
     }
 }

@@ -408,3 +408,120 @@ async fn a_line_without_an_end_takes_its_memory_before_it_is_complete_and_no_mor
     };
     tokio::join!(reading, sending);
 }
+
+/// Frames that wait together, as what an observation commits does.
+async fn waiting_frames(texts: &[String]) -> crate::stream::Receiver<crate::stream::Outgoing> {
+    let (outgoing, goes) = crate::stream::queue(1 << 20);
+    for text in texts {
+        outgoing.send(crate::stream::Outgoing::Frame(text.clone())).await.unwrap();
+    }
+    goes
+}
+
+#[tokio::test]
+async fn lines_that_wait_together_are_written_together_as_long_as_they_are_small() {
+    let memory = crate::memory::Memory::with_room(8 << 20);
+    let limits = Flags::parse_from(["etude"]).config.stream_limits();
+    let room = Rooms::new(&memory, limits).admit(Client::LOCAL).unwrap();
+    let small: Vec<String> = (0..5).map(|n| format!("{{\"step\":{n}}}")).collect();
+    let large = "x".repeat(20_000);
+    let texts = [&small[..], &[large.clone()], &small].concat();
+    let (lines, mut answer) = mpsc::channel(16);
+    ndjson::write(&lines, waiting_frames(&texts).await, &room).await;
+    drop(lines);
+    let together = small.join("\n") + "\n";
+    for expected in [&together, &(large + "\n"), &together] {
+        let chunk = answer.recv().await.unwrap().unwrap();
+        assert!(chunk == *expected, "{} bytes, not {}", chunk.len(), expected.len());
+    }
+    assert!(answer.recv().await.is_none());
+}
+
+/// A socket whose writes are counted.
+struct Counted {
+    socket: DuplexStream,
+    n_writes: std::sync::Arc<std::sync::atomic::AtomicUsize>,
+}
+
+impl tokio::io::AsyncRead for Counted {
+    fn poll_read(
+        mut self: std::pin::Pin<&mut Self>,
+        cx: &mut std::task::Context<'_>,
+        to: &mut tokio::io::ReadBuf<'_>,
+    ) -> std::task::Poll<std::io::Result<()>> {
+        std::pin::Pin::new(&mut self.socket).poll_read(cx, to)
+    }
+}
+
+impl tokio::io::AsyncWrite for Counted {
+    fn poll_write(
+        mut self: std::pin::Pin<&mut Self>,
+        cx: &mut std::task::Context<'_>,
+        bytes: &[u8],
+    ) -> std::task::Poll<std::io::Result<usize>> {
+        self.n_writes.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+        std::pin::Pin::new(&mut self.socket).poll_write(cx, bytes)
+    }
+
+    fn poll_flush(
+        mut self: std::pin::Pin<&mut Self>,
+        cx: &mut std::task::Context<'_>,
+    ) -> std::task::Poll<std::io::Result<()>> {
+        std::pin::Pin::new(&mut self.socket).poll_flush(cx)
+    }
+
+    fn poll_shutdown(
+        mut self: std::pin::Pin<&mut Self>,
+        cx: &mut std::task::Context<'_>,
+    ) -> std::task::Poll<std::io::Result<()>> {
+        std::pin::Pin::new(&mut self.socket).poll_shutdown(cx)
+    }
+}
+
+#[tokio::test]
+async fn what_an_observation_is_answered_by_is_one_write_of_a_websocket() {
+    let (etude, limits, _directory) = application(&[]).await;
+    let model = include_str!("../../../examples/figure-4/model.json");
+    let caller = Caller { client: Client::LOCAL, arrived: Clock::system().instant(), now: Clock::system().now() };
+    let text = ModelText::Whole(model.as_bytes().to_vec());
+    etude.put_model(&Name::new("m").unwrap(), text, Format::Json, caller).await.unwrap();
+    let seen: Vec<Value> = serde_json::from_str(include_str!("../../../examples/figure-4/demonstration.json")).unwrap();
+    let (ours, theirs) = tokio::io::duplex(1 << 20);
+    let n_writes = std::sync::Arc::default();
+    let socket = Counted { socket: theirs, n_writes: std::sync::Arc::clone(&n_writes) };
+    let room = Rooms::new(etude.memory(), limits).admit(Client::LOCAL).unwrap();
+    let stopping = CancellationToken::new();
+    let serving = Box::pin(websocket::serve(&etude, Client::LOCAL, limits, socket, &room, &stopping));
+    let speaking = async {
+        let mut client = client_end(ours).await;
+        let open = json!({"type": "open", "model": "m", "lookahead": 1});
+        futures_util::SinkExt::send(&mut client, Message::text(open.to_string())).await.unwrap();
+        let mut n_frames = 0;
+        let mut next = async |client: &mut WebSocketStream<DuplexStream>| {
+            n_frames += 1;
+            let message = client.next().await.unwrap().unwrap();
+            (n_frames, serde_json::from_str::<Value>(message.to_text().unwrap()).unwrap())
+        };
+        while next(&mut client).await.1["type"] != "opened" {}
+        let before = n_writes.load(std::sync::atomic::Ordering::Relaxed);
+        let mut n_all = 0;
+        for (seq, state) in seen.iter().enumerate() {
+            let observe = json!({"type": "observe", "seq": seq, "states": [state]});
+            futures_util::SinkExt::send(&mut client, Message::text(observe.to_string())).await.unwrap();
+            loop {
+                let (n_frames, frame) = next(&mut client).await;
+                n_all = n_frames - 2;
+                // The lookahead of one is used up by each.
+                if frame["type"] == "step" && frame["observation"] == seq && frame["move"] != "extra" {
+                    break;
+                }
+            }
+        }
+        let n_written = n_writes.load(std::sync::atomic::Ordering::Relaxed) - before;
+        assert_eq!(n_written, seen.len(), "{n_all} frames");
+        assert!(n_all > 2 * seen.len() - 2, "{n_all}");
+        futures_util::SinkExt::close(&mut client).await.unwrap();
+    };
+    tokio::time::timeout(TIMEOUT, async { tokio::join!(serving, speaking) }).await.unwrap();
+    etude.close().await;
+}
