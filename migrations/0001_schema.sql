@@ -93,6 +93,7 @@ CREATE TABLE sessions (
     weights         TEXT    NOT NULL, -- JSON: by attribute
     lookahead       INTEGER,          -- NULL: only proven steps are committed before the end
     lookahead_ms    INTEGER,          -- how long a step may wait after its observation came; NULL: as long as the lookahead lets it
+    observe         TEXT,             -- JSON: how observations follow from states in another vocabulary; NULL: they are the states
     conditions      TEXT    NOT NULL, -- JSON: start states, weights of observations and of the end, what the body lacks; defaults are left out
     learner         TEXT,             -- whose weights are used, if any
     weights_version INTEGER,          -- of that learner

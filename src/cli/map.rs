@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 
 use super::drawing::PictureFlags;
 use super::input::{Cells, Observations, Spot};
-use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags, parse_observed, parse_within};
+use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags, parse_within};
 use super::{CliError, render};
 use crate::clock::Clock;
 use crate::config::parse_whole;
@@ -41,10 +41,6 @@ pub(super) struct Map {
     /// Drop observations that stay within this of the last one kept in an attribute, and are equal to it in all others; may be given for several.
     #[arg(long, value_name = "ATTRIBUTE=WITHIN", value_parser = parse_within)]
     collapse: Vec<(String, f64)>,
-    /// What is observed as an attribute, of a demonstrator with attributes of its own: an expression of CEL over these, such as `x=east_m/0.25`; may
-    /// be given for several.
-    #[arg(long, value_name = "ATTRIBUTE=EXPRESSION", value_parser = parse_observed)]
-    observe: Vec<(String, String)>,
     /// What guides the search.
     #[arg(long, value_enum)]
     heuristic: Option<HeuristicArg>,
@@ -76,7 +72,7 @@ impl Map {
         }
         let (definition, model) = read_model(&self.model)?;
         let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
-        let cells = if self.observe.is_empty() { Cells::of(mapper.model()) } else { Cells::any() };
+        let cells = self.options.cells(|| Cells::of(mapper.model()));
         let mut observations = Observations::open(&self.demonstration, &self.reading.columns, &cells)?;
         let (request, spots) = self.request(&mut observations)?;
 
@@ -141,9 +137,6 @@ impl Map {
             request.insert("model", stem.unwrap_or_default().into());
         }
         self.options.add_to(&mut request)?;
-        for (attribute, expression) in &self.observe {
-            request.set(&format!("--observe {attribute}={expression}"), &["observe", attribute], json!(expression))?;
-        }
         for (attribute, within) in &self.collapse {
             request.set(&format!("--collapse {attribute}={within}"), &["collapse", attribute], json!(within))?;
         }

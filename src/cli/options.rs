@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::{Map as Members, Value, json};
 
 use super::CliError;
-use super::input::{Column, Source, Spot, parse_json};
+use super::input::{Cells, Column, Source, Spot, parse_json};
 use etude_core::document::{Fault, Faults};
 use etude_core::mapping::Demonstration;
 
@@ -36,6 +36,10 @@ pub(super) struct OptionFlags {
     /// What an action costs instead of what the model says; may be given for several.
     #[arg(long = "action-cost", value_name = "ACTION=COST", value_parser = parse_action_cost)]
     action_costs: Vec<(String, f64)>,
+    /// What is observed as an attribute, of a demonstrator with attributes of its own: an expression of CEL over these, such as `x=east_m/0.25`; may
+    /// be given for several.
+    #[arg(long, value_name = "ATTRIBUTE=EXPRESSION", value_parser = parse_observed)]
+    observe: Vec<(String, String)>,
 }
 
 impl OptionFlags {
@@ -52,7 +56,15 @@ impl OptionFlags {
         for (action, cost) in &self.action_costs {
             request.set(&format!("--action-cost {action}={cost}"), &["action_costs", action], json!(cost))?;
         }
+        for (attribute, expression) in &self.observe {
+            request.set(&format!("--observe {attribute}={expression}"), &["observe", attribute], json!(expression))?;
+        }
         Ok(())
+    }
+
+    /// How cells of a table become values: those `of_model`, unless they are a demonstrator's own.
+    pub(super) fn cells(&self, of_model: impl FnOnce() -> Cells) -> Cells {
+        if self.observe.is_empty() { of_model() } else { Cells::any() }
     }
 }
 
@@ -220,7 +232,7 @@ pub(super) fn parse_within(text: &str) -> Result<(String, f64), String> {
     parse_named_number(text, "expected ATTRIBUTE=WITHIN, such as x=0.5")
 }
 
-pub(super) fn parse_observed(text: &str) -> Result<(String, String), String> {
+fn parse_observed(text: &str) -> Result<(String, String), String> {
     let (name, expression) = text.split_once('=').ok_or("expected ATTRIBUTE=EXPRESSION, such as x=east_m/0.25")?;
     Ok((name.trim().to_owned(), expression.trim().to_owned()))
 }

@@ -1,12 +1,13 @@
 //! Requests to open a session, as they are read: first what is named, then, with the model, the rest.
 
 use std::num::{NonZeroU32, NonZeroU64};
+use std::sync::Arc;
 
 use super::learners::LearnerState;
 use super::requests::{Names, base_weights};
 use etude_core::attribute::Weights;
 use etude_core::document::{Faults, Object};
-use etude_core::mapping::{Conditions, Demonstration, Mapper, Options};
+use etude_core::mapping::{Conditions, Demonstration, Mapper, Options, Perception};
 
 /// Lookahead of a session that names none.
 const DEFAULT_LOOKAHEAD: u32 = 8;
@@ -55,6 +56,7 @@ pub(super) struct SessionOptions {
     pub(super) weights: Weights,
     pub(super) conditions: Conditions,
     pub(super) lookahead: Option<NonZeroU32>,
+    pub(super) perception: Option<Arc<Perception>>,
     /// In milliseconds.
     pub(super) lookahead_ms: Option<NonZeroU64>,
 }
@@ -83,6 +85,7 @@ pub(super) fn read(
         weights: options.weights_over(weights?),
         conditions: options.conditions(),
         lookahead: options.lookahead,
+        perception: options.observe.clone(),
         lookahead_ms,
     })
 }

@@ -38,6 +38,22 @@ fn a_file_in_another_vocabulary_is_observed_as_flags_say() {
 }
 
 #[test]
+fn a_stream_observes_as_a_whole_file_does() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("seen.csv");
+    std::fs::write(&path, CSV).unwrap();
+    let flags = ["--observe", "floor=height_m / 3", "--observe", "rider=passenger == 'in' ? 'inside' : 'waiting'"];
+    let mut arguments =
+        vec!["stream", "--model", MODEL, "--demonstration", path.to_str().unwrap(), "--json", "--lookahead", "none"];
+    arguments.extend(flags);
+    let output = etude(&arguments).output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let text = String::from_utf8(output.stdout).unwrap();
+    let done: serde_json::Value = serde_json::from_str(text.lines().last().unwrap()).unwrap();
+    assert_eq!(done["cost"]["total"].as_f64(), Some(cost(&mapped("seen.csv", CSV, &flags))), "{done}");
+}
+
+#[test]
 fn what_cannot_be_observed_is_told_with_the_flag_or_the_row_and_the_column() {
     let told = |flags: &[&str]| {
         let output = mapped("seen.csv", CSV, flags);

@@ -3,6 +3,12 @@
 use serde_json::{Value, json};
 
 use crate::harness::service::Service;
+use crate::stream::client::Client;
+
+/// The next frame of this kind.
+async fn last(client: &mut Client, kind: &str) -> Value {
+    client.receive_until(kind).await.pop().unwrap()
+}
 
 /// A corridor with a door.
 fn corridor() -> Value {
@@ -138,4 +144,32 @@ async fn faults_of_what_is_observed_are_told_with_row_and_column() {
     );
     let told = faults(json!("x"), json!([{"east": 1}])).await;
     assert_eq!(told[0].0, "/observe");
+}
+
+#[tokio::test]
+async fn a_stream_observes_in_its_own_way_also_after_a_restart() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/m", &corridor()).await;
+    let (own, imitators) = seen();
+    let own = own.as_array().unwrap();
+    let (_, expected) = service.post("/v1/policies", &json!({"model": "m", "demonstration": imitators})).await;
+
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "open", "model": "m", "lookahead": null, "observe": {"x": "east_m *"}})).await;
+    let problem = client.receive_until_error().await;
+    assert_eq!(problem["problem"]["errors"][0]["pointer"], "/observe/x", "{problem}");
+
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "open", "model": "m", "lookahead": null, "observe": observe()})).await;
+    let opened = last(&mut client, "opened").await;
+    client.send(json!({"type": "observe", "seq": 0, "states": own[..2]})).await;
+    last(&mut client, "received").await;
+    let service = Service::start_in(service.stop().await, &[]).await;
+    let mut client = Client::connect(&service).await;
+    client.send(json!({"type": "resume", "session": opened["session"], "step": 0})).await;
+    assert_eq!(last(&mut client, "opened").await["received"], 2);
+    client.send(json!({"type": "observe", "seq": 2, "states": own[2..]})).await;
+    client.send(json!({"type": "end", "seq": own.len()})).await;
+    let done = last(&mut client, "done").await;
+    assert_eq!((&done["cost"], &done["status"]), (&expected["cost"], &json!("optimal")), "{done}");
 }

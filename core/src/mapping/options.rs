@@ -85,7 +85,7 @@ impl RequestKind {
             Self::Trial => {
                 following!("model", "demonstration", "heuristic", "max_expansions", "deadline_ms", "observe")
             }
-            Self::Session => following!("type", "model", "learner", "explore", "lookahead_ms"),
+            Self::Session => following!("type", "model", "learner", "explore", "lookahead_ms", "observe"),
             Self::Report => &["demonstration", "weights", "start", "observation_weights", "without", "deadline_ms"],
         }
     }
@@ -146,7 +146,7 @@ pub struct Options {
     #[cfg_attr(feature = "openapi", schema(value_type = Option<BTreeMap<String, f64>>, example = json!({"x": 0.5})))]
     pub collapse: Option<Vec<(usize, f64)>>,
     /// For a demonstrator whose states are told in another vocabulary: by name of the imitator's attributes, expressions of CEL over the
-    /// attributes of the `demonstration`, which are then the demonstrator's own. What is not named is not observed. All its numbers are
+    /// attributes of the `demonstration`, or of the states of a stream, which are then the demonstrator's own. What is not named is not observed. All its numbers are
     /// doubles, and an integer in an expression is read as one beside them; what is missing or `null` is null, and what needs it is not
     /// observed. A name with a point is that of a member of a member.
     #[cfg(feature = "rules")]

@@ -69,16 +69,34 @@ impl Perception {
                 faults.note_at(&path, format!("no state of the demonstration has {}", Quoted(name)));
             }
         }
+        let observations = self.observe_each(items.iter().enumerate().map(|(n, item)| states.item(n, item)), faults);
+        let observations = observations.filter(|_| faults.count() == n_before)?;
+        Some(Value::Array(observations))
+    }
+
+    /// As [`Self::observe_all`], of some of the states, which need not have all names.
+    pub fn observe_each<'v, 'p>(
+        &self,
+        states: impl ExactSizeIterator<Item = Place<'v, 'p>>,
+        faults: &mut Faults,
+    ) -> Option<Vec<Value>> {
+        let n_before = faults.count();
         let mut repeated = Repeated::default();
-        let mut observations = Vec::with_capacity(items.len());
-        for (n, item) in items.iter().enumerate() {
-            let place = states.item(n, item);
+        let mut observations = Vec::with_capacity(states.len());
+        for place in states {
             let mut own = Faults::default();
             observations.push(self.observe(&place, &mut own).unwrap_or_default());
             repeated.take_in(own, &place.path);
         }
         repeated.tell("states", faults);
-        (faults.count() == n_before).then_some(Value::Array(observations))
+        (faults.count() == n_before).then_some(observations)
+    }
+
+    /// As it is written in JSON: the expressions by name of the attribute.
+    #[must_use]
+    pub fn document(&self) -> Value {
+        let texts = self.attributes.iter().map(|(name, expression)| (name.clone(), expression.text().into()));
+        Value::Object(texts.collect())
     }
 
     /// What is observed of a demonstrator in this state: an object by the imitator's attributes.

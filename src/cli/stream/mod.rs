@@ -101,8 +101,11 @@ impl Stream {
         let (_, model) = read_model(&self.model)?;
         let mapper = Arc::new(Mapper::new(model, &mut Uninterrupted)?);
         let schema = mapper.model().schema();
-        let mut observations =
-            Observations::open(&self.demonstration, &self.reading.columns, &Cells::of(mapper.model()))?;
+        let mut observations = Observations::open(
+            &self.demonstration,
+            &self.reading.columns,
+            &self.options.cells(|| Cells::of(mapper.model())),
+        )?;
         let request = self.request(&mut observations)?;
         let document = request.document();
         let mut faults = Faults::default();
@@ -156,7 +159,11 @@ impl Stream {
                 return Err(CliError::Faulty(spot.tell("", &detail)));
             }
             let mut faults = Faults::default();
-            let read = schema.read_observation(&Place::root(&state), &mut faults);
+            let state = match &options.observe {
+                None => Some(state),
+                Some(perception) => perception.observe(&Place::root(&state), &mut faults),
+            };
+            let read = state.and_then(|state| schema.read_observation(&Place::root(&state), &mut faults));
             let told = |faults: Faults| {
                 let told = faults.listed().iter().map(|fault| spot.tell(&fault.pointer, &fault.detail));
                 faulty(told.collect(), faults.count() - faults.listed().len())
@@ -207,7 +214,7 @@ impl Stream {
             let url = url(&name);
             (name, http::answer::<Registered>(&url, client.get(&url)).await?)
         };
-        Ok((name, Cells::told(&registered.attributes)))
+        Ok((name, self.options.cells(|| Cells::told(&registered.attributes))))
     }
 
     /// What the file and the flags say of the stream, as in an `open` frame.

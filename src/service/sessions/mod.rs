@@ -66,7 +66,7 @@ impl Etude {
         let read = object
             .as_ref()
             .and_then(|object| opening::read(&mapper, learner.as_ref(), general, object, max_bytes, &mut faults));
-        let SessionOptions { mut weights, conditions, lookahead, lookahead_ms } = faults.check(read)?;
+        let SessionOptions { mut weights, conditions, lookahead, perception, lookahead_ms } = faults.check(read)?;
         let model = names.model;
 
         let id = self.ids.next().to_string();
@@ -78,6 +78,7 @@ impl Etude {
             weights: mapper.model().schema().by_attribute(weights.as_slice().iter().copied()),
             lookahead: lookahead.map(NonZeroU32::get),
             lookahead_ms: lookahead_ms.map(NonZeroU64::get),
+            observe: perception.as_ref().map(|perception| perception.document().to_string()),
             conditions: conditions.clone(),
             learner: learner.as_ref().map(|ready| ready.name.clone()),
             weights_version: learner.as_ref().map(|ready| ready.weights.version),
@@ -119,6 +120,7 @@ impl Etude {
             model_hash,
             mapper,
             lookahead,
+            perception,
             conditions,
             source,
             n_received: 0,

@@ -16,8 +16,9 @@ use crate::service::owners::Ownership;
 use crate::service::{Caller, Client, Etude, Kind, ServiceError};
 use crate::store::{SessionRecord, SessionStatus, StoredObservations, Taken};
 use etude_core::attribute::{ByAttribute, Schema, Weights};
+use etude_core::document::{self, Faults, Place};
 use etude_core::interrupt::{Interrupt, time_until_finish};
-use etude_core::mapping::{Demonstration, OnlineMapping, Warning, Watch};
+use etude_core::mapping::{Demonstration, OnlineMapping, Perception, Warning, Watch};
 use etude_core::model::Model;
 
 /// A session that was resumed.
@@ -100,13 +101,15 @@ impl Etude {
         let weights = weights_in_order(&row.weights, mapper.model().schema(), &row.id)?;
         let lookahead = row.lookahead.and_then(NonZeroU32::new);
         let waits = Waits::of(row.lookahead_ms.and_then(NonZeroU64::new)).filter(|_| row.status == SessionStatus::Open);
+        let id = row.id.clone();
         let mut session = Session {
             leaving: self.left.leaving(&row.id),
-            id: row.id,
+            id: id.clone(),
             model: row.model,
             model_hash: row.model_hash,
             weights: weights.clone(),
             lookahead,
+            perception: row.observe.as_deref().map(|text| read_perception(text, &id)).transpose()?,
             conditions: row.conditions.clone(),
             source: Source { learner: row.learner, weights_version: row.weights_version, trial_id: row.trial_id },
             n_received: row.n_observations,
@@ -241,6 +244,16 @@ fn weights_in_order(weights: &ByAttribute<f64>, schema: &Schema, id: &str) -> Re
     let names = schema.attributes().iter().map(|attribute| &attribute.name);
     let weights = names.map(|name| weights.get(name).copied().ok_or_else(|| missing(name)));
     Ok(Weights::of(weights.collect::<Result<Vec<_>, _>>()?))
+}
+
+/// How the session `id` observes, as it is stored.
+fn read_perception(text: &str, id: &str) -> Result<Arc<Perception>, SessionError> {
+    let read = || {
+        let document = document::parse(text.as_bytes()).ok()?;
+        Perception::read(&Place::root(&document), &mut Faults::default())
+    };
+    let unreadable = || ServiceError::unreadable("sessions", "observe", id, "these are no expressions".to_owned());
+    Ok(Arc::new(read().ok_or_else(unreadable)?))
 }
 
 /// Observations of up to so many values are read where they are needed, which takes less than a millisecond.

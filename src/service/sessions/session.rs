@@ -22,7 +22,9 @@ use crate::store::{AcceptedReward, NewObservations, Owner, SessionEnd, StoredObs
 use etude_core::attribute::{ByAttribute, Weights};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Interrupt;
-use etude_core::mapping::{Conditions, Demonstration, Mapper, OnlineMapping, Options, Policy, Stamp, Warning, Watch};
+use etude_core::mapping::{
+    Conditions, Demonstration, Mapper, OnlineMapping, Options, Perception, Policy, Stamp, Warning, Watch,
+};
 
 /// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
 /// in the pool.
@@ -37,6 +39,8 @@ pub struct Session {
     pub(super) mapper: Arc<Mapper>,
     pub(super) weights: Weights,
     pub(super) lookahead: Option<NonZeroU32>,
+    /// How observations follow from states in another vocabulary; `None`: they are the states.
+    pub(super) perception: Option<Arc<Perception>>,
     pub(super) conditions: Conditions,
     pub(super) source: Source,
     pub(super) n_received: u32,
@@ -219,6 +223,16 @@ impl Session {
             return Err(faults.into());
         }
         let schema = self.mapper.model().schema();
+        let observed = match &self.perception {
+            None => None,
+            Some(perception) => {
+                let states = new.iter().enumerate().map(|(n, state)| states.item(n_known + n, state));
+                let observed = perception.observe_each(states, &mut faults);
+                Some(faults.clone().check(observed)?)
+            }
+        };
+        let new = observed.as_deref().unwrap_or(new);
+        let states = *states;
         let places = new.iter().enumerate().map(|(n, state)| states.item(n_known + n, state));
         let read = Demonstration::read_observations(schema, places, &mut faults);
         let weights = match observation_weights {

@@ -98,6 +98,8 @@ pub struct SessionRecord {
     pub lookahead: Option<u32>,
     /// How long a step may wait after its observation came, in milliseconds; `None`: as long as the lookahead lets it.
     pub lookahead_ms: Option<u64>,
+    /// How observations follow from states in another vocabulary (JSON); `None`: they are the states.
+    pub observe: Option<String>,
     /// What it may start from, what counts, and what the body lacks.
     pub conditions: Conditions,
     /// The learner whose weights are used, if any.
@@ -135,6 +137,8 @@ pub struct NewSession {
     pub lookahead: Option<u32>,
     /// How long a step may wait after its observation came, in milliseconds; `None`: as long as the lookahead lets it.
     pub lookahead_ms: Option<u64>,
+    /// How observations follow from states in another vocabulary (JSON); `None`: they are the states.
+    pub observe: Option<String>,
     /// What it may start from, what counts, and what the body lacks.
     pub conditions: Conditions,
     /// The learner whose weights are used, if any.
@@ -158,6 +162,7 @@ impl NewSession {
             weights: [("x".into(), 1.0)].into_iter().collect(),
             lookahead: None,
             lookahead_ms: None,
+            observe: None,
             conditions: Conditions::default(),
             learner: None,
             weights_version: None,
@@ -365,6 +370,7 @@ fn read_session(row: &SqliteRow) -> Result<SessionRecord, StoreError> {
         weights: serde_json::from_str(row.try_get("weights")?).map_err(corrupt(TABLE, "weights"))?,
         lookahead: count("lookahead")?,
         lookahead_ms: milliseconds.map(u64::try_from).transpose().map_err(corrupt(TABLE, "lookahead_ms"))?,
+        observe: row.try_get("observe")?,
         conditions: serde_json::from_str(row.try_get("conditions")?).map_err(corrupt(TABLE, "conditions"))?,
         learner: row.try_get("learner")?,
         weights_version: count("weights_version")?.map(u64::from),

@@ -161,8 +161,8 @@ async fn insert(connection: &mut SqliteConnection, session: &NewSession) -> Resu
     sqlx::query(
         "INSERT INTO sessions
              (id, model, model_hash, weights, lookahead, conditions, learner, weights_version, trial_id,
-              status, owner, n_observations, created_at_ms, active_at_ms, lookahead_ms)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', $11, 0, $10, $10, $12)",
+              status, owner, n_observations, created_at_ms, active_at_ms, lookahead_ms, observe)
+         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', $11, 0, $10, $10, $12, $13)",
     )
     .bind(&session.id)
     .bind(&session.model)
@@ -176,6 +176,7 @@ async fn insert(connection: &mut SqliteConnection, session: &NewSession) -> Resu
     .bind(created_at_ms)
     .bind(Owner::FIRST.0)
     .bind(session.lookahead_ms.map(as_integer))
+    .bind(&session.observe)
     .execute(connection)
     .await?;
     Ok(())
