@@ -142,6 +142,7 @@ struct Search<'s, 'p, S, const ALIKE: bool> {
     problem: &'s Problem<'s>,
     space: &'s mut S,
     projected: &'s Projected<'p>,
+    /// `None` if moves of all kinds pay alike.
     abstracted: Option<&'s mut Abstracted<'p>>,
     budget: Budget,
     seen: &'s mut Seen,
@@ -243,7 +244,7 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
                 continue;
             }
             let step = self.nodes.step(id);
-            if self.abstracted.is_some() {
+            if !ALIKE && self.abstracted.is_some() {
                 match self.raise(id, f, step) {
                     Ok(None) => {}
                     Ok(Some(raised)) => {
@@ -446,12 +447,10 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
     fn take(&mut self, block: &mut BlockIdx, arrival: Arrival) -> Option<Reached> {
         let observation = arrival.observation;
         let Self { nodes, seen, projected, abstracted, space, .. } = self;
-        let node = nodes.take::<ALIKE>(
-            block,
-            arrival,
-            &Estimates { seen, projected, abstracted: abstracted.as_deref(), space: &**space },
-            self.limit,
-        )?;
+        // Told to the compiler, so that nothing is asked where there is none.
+        let abstracted = if ALIKE { None } else { abstracted.as_deref() };
+        let estimates = Estimates { seen, projected, abstracted, space: &**space };
+        let node = nodes.take::<ALIKE>(block, arrival, &estimates, self.limit)?;
         if observation == self.last && !self.end_at(node.id, node.g, arrival.state) {
             return None;
         }

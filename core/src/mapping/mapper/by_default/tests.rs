@@ -63,7 +63,7 @@ const IMPATIENT: Patience = Patience {
     few_entries: 0,
     few_entries_per_observation: 8,
     entries_per_expansion: 16,
-    abstract_below_extra_weight: f64::INFINITY,
+    abstract_below_extra_weight: 1.0,
     min_expansions_before_abstraction: 10,
     nodes_per_expansion_before_abstraction: u64::MAX,
     states_per_class: 1,
