@@ -190,6 +190,10 @@ proptest! {
         let moves_before = moves.iter().take(moves.len().saturating_sub(1)).cloned();
         prop_assert_eq!(new().resumed(&root, moves_before).is_some(), moves.is_empty());
         let mut resumed = new().resumed(&root, moves).unwrap();
+        if case.lazy.is_some() || (searches && lookahead.is_some()) {
+            // Among mappings of equal cost, memory does not decide.
+            resumed = resumed.within(1);
+        }
         prop_assert_eq!(resumed.root(), root);
         prop_assert_eq!(resumed.n_observed(), root.first_observation());
         for observation in &observations[root.first_observation() as usize..kept] {

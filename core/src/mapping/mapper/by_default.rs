@@ -1,6 +1,6 @@
 //! The search of large problems, which gets larger tables, and at last a sweep, the longer it takes.
 
-use super::{Budget, Buffers, Mapper, Mapping, Settings, conclude, least_start, within};
+use super::{Budget, Buffers, Choices, Mapper, Mapping, Settings, conclude, least_start, within};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Meter};
 use crate::mapping::cost::SLACK;
 use crate::mapping::heuristic::projected::{Projected, TableRoom};
@@ -17,6 +17,7 @@ impl Mapper {
     pub(super) fn best_first<S: Space>(
         &self,
         space: &mut S,
+        choices: Choices,
         problem: &Problem<'_>,
         settings: Settings,
         most_f: f64,
@@ -31,7 +32,7 @@ impl Mapper {
         let is_small_budget = budget.max_expansions < n_observations as u64;
         let patience = self.patience;
         let few_entries = patience.few_entries.max(n_observations * patience.few_entries_per_observation);
-        let room = TableRoom::within(budget.max_bytes);
+        let room = TableRoom::within(choices.max_bytes);
         let mut before: Option<(Projected<'_>, Found)> = None;
         for room in [if is_small_budget { room } else { room.at_first(few_entries) }, room] {
             let solved = self.solve(problem, room, interrupt)?;
@@ -66,7 +67,7 @@ impl Mapper {
                 is_enough = !more.is_complete && enough < max_expansions && more.n_expanded >= enough;
                 found = joined(found, more);
             }
-            let is_out_of_memory = found.stopped_by == Some(StoppedBy::Memory);
+            let is_out_of_memory = choices.may_turn && found.stopped_by == Some(StoppedBy::Memory);
             if let Some(before) = found_before {
                 found = joined(before, found);
             }

@@ -191,11 +191,23 @@ impl Mapper {
         settings: Settings,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
+        let choices = Choices { max_bytes: settings.budget.max_bytes, may_turn: true };
+        self.map_by(choices, problem, settings, interrupt)
+    }
+
+    /// The same, where the way to search is chosen by `choices`.
+    fn map_by(
+        &self,
+        choices: Choices,
+        problem: &Problem<'_>,
+        settings: Settings,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Mapping, Cancelled> {
         self.check(problem);
         let Some(mut explored) = self.model.explore_from(problem.starts.rows()) else {
-            return self.map_in(&mut self.model.whole(), problem, settings, interrupt);
+            return self.map_in(&mut self.model.whole(), choices, problem, settings, interrupt);
         };
-        let mut mapping = self.map_in(&mut explored, problem, settings, interrupt)?;
+        let mut mapping = self.map_in(&mut explored, choices, problem, settings, interrupt)?;
         mapping.states = Some(explored.keep(&renumber(&mut mapping.moves)));
         Ok(mapping)
     }
@@ -203,6 +215,7 @@ impl Mapper {
     fn map_in<S: Space>(
         &self,
         space: &mut S,
+        choices: Choices,
         problem: &Problem<'_>,
         settings: Settings,
         interrupt: &mut dyn Interrupt,
@@ -213,9 +226,9 @@ impl Mapper {
         // Sums in another order may be a little larger; a little room costs nothing.
         let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
         match settings.heuristic {
-            HeuristicName::Default => match self.layered(space, problem, settings, most_f, interrupt)? {
+            HeuristicName::Default => match self.layered(space, choices, problem, settings, most_f, interrupt)? {
                 Some(mapping) => Ok(mapping),
-                None => self.best_first(space, problem, settings, most_f, interrupt),
+                None => self.best_first(space, choices, problem, settings, most_f, interrupt),
             },
             HeuristicName::None => {
                 let blind = Projected::blind(problem);
@@ -243,6 +256,7 @@ impl Mapper {
     fn layered<S: Space>(
         &self,
         space: &mut S,
+        choices: Choices,
         problem: &Problem<'_>,
         settings: Settings,
         most_f: f64,
@@ -251,10 +265,11 @@ impl Mapper {
         let budget = settings.budget;
         let n_nodes =
             space.n_states().map_or(usize::MAX, |n_states| n_states.saturating_mul(problem.demonstration.len()));
-        if n_nodes > self.patience.max_layered_nodes || !layered::is_within(budget, problem, n_nodes) {
+        let chosen_by = Budget { max_bytes: choices.max_bytes, ..budget };
+        if n_nodes > self.patience.max_layered_nodes || !layered::is_within(chosen_by, problem, n_nodes) {
             return Ok(None);
         }
-        let solved = self.solve(problem, TableRoom::within(budget.max_bytes), interrupt)?;
+        let solved = self.solve(problem, TableRoom::within(choices.max_bytes), interrupt)?;
         let Some(projected) = solved.filter(Projected::are_all_in_columns) else { return Ok(None) };
         let found = self.buffers.lend(budget.max_bytes, |Buffers { layered, .. }| {
             layered::search(problem, &projected, budget, most_f, layered, interrupt)
@@ -277,6 +292,15 @@ impl Mapper {
     fn check(&self, problem: &Problem<'_>) {
         assert!(std::ptr::eq(problem.model, &raw const *self.model), "the problem must be of this mapper's model");
     }
+}
+
+/// By what it is chosen how a problem is searched: of mappings of equal cost, another way may find another.
+#[derive(Clone, Copy, Debug)]
+struct Choices {
+    /// As if a search might take so much memory, in bytes.
+    max_bytes: usize,
+    /// Whether a search that has used up its memory gives way to one that takes less.
+    may_turn: bool,
 }
 
 /// What a mapping costs at least, whichever start it has.

@@ -1,6 +1,6 @@
 //! What a lookahead asks of a mapper: the search of a window, and what is done when the budget of all of them runs out.
 
-use super::{Mapper, Mapping, Settings, Status, conclude, renumber};
+use super::{Choices, Mapper, Mapping, Settings, Status, conclude, renumber};
 use crate::interrupt::{Cancelled, Interrupt};
 use crate::mapping::heuristic::projected::Projected;
 use crate::mapping::search::Found;
@@ -8,7 +8,8 @@ use crate::mapping::{Budget, Move, MoveKind, Problem, StoppedBy};
 use crate::model::{Space, States};
 
 impl Mapper {
-    /// The cheapest mapping of a window.
+    /// The cheapest mapping of a window. Of those that cost the same, which is found does not depend on the budget, unless that runs out:
+    /// whoever follows the same demonstration again, with more memory or less, comes to the same.
     ///
     /// # Errors
     ///
@@ -19,9 +20,15 @@ impl Mapper {
         budget: Budget,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
-        let max_bytes = budget.max_bytes.min(Budget::DEFAULT.max_bytes);
+        /// What a window may take whatever is left, as most do; two searches at a time have it in what is kept for what is not counted.
+        const ALWAYS_LEFT: usize = 8 << 20;
+        /// As if there was so much for each observation.
+        const CHOICE_BYTES: usize = 1 << 18;
+        let max_bytes = budget.max_bytes.clamp(ALWAYS_LEFT, Budget::DEFAULT.max_bytes);
+        let as_if = ALWAYS_LEFT.max(problem.demonstration.len().saturating_mul(CHOICE_BYTES));
+        let choices = Choices { max_bytes: as_if.min(Budget::DEFAULT.max_bytes), may_turn: false };
         let budget = Budget { max_bytes, ..budget };
-        self.map(problem, Settings { budget, ..Settings::default() }, interrupt)
+        self.map_by(choices, problem, Settings { budget, ..Settings::default() }, interrupt)
     }
 
     /// A mapping of `problem` that begins with `moves`, if there are any, and goes on greedily, as `stopped_by` ran out. Their states are
