@@ -1,6 +1,7 @@
-//! Streaming: round trips beside a bare echo and what the disk can do, and memory. What the core takes is measured by `lookahead`.
+//! Streaming: round trips beside a bare echo and what the disk can do, memory, and recovery. What the core takes is measured by
+//! `lookahead`.
 //!
-//! `cargo bench --bench stream` runs all of it, `cargo bench --bench stream -- round-trips memory` the parts named.
+//! `cargo bench --bench stream` runs all of it, `cargo bench --bench stream -- round-trips memory many recovery` the parts named.
 //! Rounds of what is compared are interleaved, so that a machine that slows down slows all of them down. Client and
 //! service share the machine. Figures are medians, and in brackets the least and the most.
 //!
@@ -57,6 +58,14 @@ fn main() -> Result<(), Failure> {
             memory(200, 20, Load::Idle).await?;
             memory(200, 20, Load::Busy).await?;
         }
+        if is_wanted("many") {
+            many(4096, 200).await?;
+        }
+        if is_wanted("recovery") {
+            for world in [worlds::example("figure-4"), worlds::cave(20, 5, 50, 1)] {
+                recovery(&world, 100_000).await?;
+            }
+        }
         Ok(())
     })
 }
@@ -72,12 +81,19 @@ fn mapper(world: &World) -> Result<Arc<Mapper>, Failure> {
 struct Service {
     child: Child,
     address: String,
-    _directory: tempfile::TempDir,
+    directory: Arc<tempfile::TempDir>,
 }
 
 impl Service {
     async fn start(world: &World) -> Result<Self, Failure> {
-        let directory = tempfile::tempdir()?;
+        let service = Self::start_in(Arc::new(tempfile::tempdir()?))?;
+        let client = reqwest::Client::builder().no_proxy().build()?;
+        let url = format!("http://{}/v1/models/m", service.address);
+        client.put(url).json(&world.model).send().await?.error_for_status()?;
+        Ok(service)
+    }
+
+    fn start_in(directory: Arc<tempfile::TempDir>) -> Result<Self, Failure> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
         command.args(["serve", "--listen", "127.0.0.1:0", "--log-format", "text", "--database"]);
         command.arg(directory.path().join("bench.db")).stderr(Stdio::piped());
@@ -87,9 +103,7 @@ impl Service {
         let address = listening.split("http://").nth(1).unwrap_or_default();
         let address = address.split(['"', ' ']).next().unwrap_or_default().to_owned();
         std::thread::spawn(move || lines.for_each(drop));
-        let client = reqwest::Client::builder().no_proxy().build()?;
-        client.put(format!("http://{address}/v1/models/m")).json(&world.model).send().await?.error_for_status()?;
-        Ok(Self { child, address, _directory: directory })
+        Ok(Self { child, address, directory })
     }
 
     /// User and system time it has taken so far, in seconds.
@@ -278,7 +292,9 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
             .iter()
             .fold((0, 0), |(messages, sent), stream| (messages + stream.n_messages, sent + stream.n_sent));
         let for_each = f64::from(u32::try_from(n_messages)?) / f64::from(u32::try_from(n_sent)?);
-        echoes.iter_mut().for_each(|echoed| echoed.n_messages = for_each);
+        for echoed in &mut echoes {
+            echoed.n_messages = for_each;
+        }
         n_for_each.push(for_each);
         cpu_us.push((service.cpu_s()? - cpu_before_s) / ROUND.as_secs_f64() / rate * 1e6);
         let round = async |mut echoed: Echoed| -> Result<_, Failure> {
@@ -470,6 +486,105 @@ async fn memory(n_sessions: u32, n_observations: usize, load: Load) -> Result<()
     println!(
         "memory of {n_sessions} {what} sessions that had each seen {n_observations} observations: at most {most} KiB \
          resident, {before} KiB before them, {each:.1} KiB each"
+    );
+    Ok(())
+}
+
+/// Memory of many sessions that are open at once, each of which has seen some observations, and how long an observation takes until it is
+/// received while some of them are busy.
+async fn many(n_sessions: usize, n_busy: usize) -> Result<(), Failure> {
+    const N_SEEN: usize = 20;
+    let world = worlds::cave(20, 5, 50, 1);
+    let service = Service::start(&world).await?;
+    let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
+    let before = service.resident_kib()?;
+    let mut streams = Vec::new();
+    for _ in 0..n_sessions {
+        let mut stream = Stream::open(&service.address, &states).await?;
+        for _ in 0..N_SEEN {
+            stream.round_trip().await?;
+        }
+        streams.push(stream);
+    }
+    let idle = service.resident_kib()?;
+    let busy = streams.split_off(n_sessions - n_busy);
+    let started = Instant::now();
+    let tasks = busy.into_iter().map(|mut stream| {
+        tokio::spawn(async move {
+            let mut took_us = Vec::new();
+            while started.elapsed() < 10 * ROUND {
+                let sent = Instant::now();
+                stream.round_trip().await?;
+                took_us.push(sent.elapsed().as_micros());
+            }
+            Ok::<_, Failure>(took_us)
+        })
+    });
+    let mut took_us = Vec::new();
+    for task in tasks.collect::<Vec<_>>() {
+        took_us.extend(task.await??);
+    }
+    took_us.sort_unstable();
+    let at = |percent: usize| took_us[(took_us.len() - 1) * percent / 100];
+    #[expect(clippy::cast_precision_loss, reason = "far below 2^52")]
+    let each = |kib: u64| kib.saturating_sub(before) as f64 / n_sessions as f64;
+    println!(
+        "\n{n_sessions} sessions on {}, each of which has seen {N_SEEN} observations: {:.1} KiB each, {:.1} KiB while {n_busy} of them are \
+         busy, {} observations in {:?}: received after {} us (median), {} us (p99), {} us (most)",
+        world.name,
+        each(idle),
+        each(service.resident_kib()?),
+        took_us.len(),
+        started.elapsed(),
+        at(50),
+        at(99),
+        at(100)
+    );
+    Ok(())
+}
+
+/// How long it takes to resume a session of many observations, in a service that was killed and has just been started.
+async fn recovery(world: &World, n_observations: usize) -> Result<(), Failure> {
+    /// Of a frame.
+    const N_AT_ONCE: usize = 100;
+    let service = Service::start(world).await?;
+    let states = world.demonstration.as_array().cloned().unwrap_or_default();
+    let (mut socket, _) = tokio_tungstenite::connect_async(format!("ws://{}/v1/stream", service.address)).await?;
+    let receive = async |socket: &mut Socket, kind: &str| -> Result<Value, Failure> {
+        loop {
+            let frame: Value = serde_json::from_str(socket.next().await.ok_or("closed")??.to_text()?)?;
+            if frame["type"] == kind {
+                return Ok(frame);
+            }
+        }
+    };
+    socket.send(Message::text(json!({"type": "open", "model": "m"}).to_string())).await?;
+    let session = receive(&mut socket, "opened").await?["session"].take();
+    let streaming = Instant::now();
+    for seq in (0..n_observations).step_by(N_AT_ONCE) {
+        let seen: Vec<&Value> = (seq..seq + N_AT_ONCE).map(|index| &states[index % states.len()]).collect();
+        socket.send(Message::text(json!({"type": "observe", "seq": seq, "states": seen}).to_string())).await?;
+        receive(&mut socket, "received").await?;
+    }
+    let streamed = streaming.elapsed();
+    let directory = Arc::clone(&service.directory);
+    drop(service);
+    let mut took_ms = Vec::new();
+    for _ in 0..N_ROUNDS {
+        let service = Service::start_in(Arc::clone(&directory))?;
+        let (mut socket, _) = tokio_tungstenite::connect_async(format!("ws://{}/v1/stream", service.address)).await?;
+        receive(&mut socket, "hello").await?;
+        let started = Instant::now();
+        let resume = json!({"type": "resume", "session": session, "step": n_observations});
+        socket.send(Message::text(resume.to_string())).await?;
+        let opened = receive(&mut socket, "opened").await?;
+        took_ms.push(started.elapsed().as_secs_f64() * 1e3);
+        assert_eq!(opened["received"], n_observations);
+    }
+    println!(
+        "\n{}: a session of {n_observations} observations, streamed in {streamed:.1?}, is resumed in a service just started in ms: {}",
+        world.name,
+        spread(&took_ms, 0)
     );
     Ok(())
 }

@@ -99,12 +99,21 @@ impl SplitMix {
 
 #[tokio::test]
 async fn a_service_killed_a_hundred_times_loses_and_doubles_nothing() {
+    killed_again_and_again(&["--listen", "127.0.0.1:0"]).await;
+}
+
+#[tokio::test]
+async fn nor_does_one_whose_worlds_are_searched_lazily() {
+    killed_again_and_again(&["--listen", "127.0.0.1:0", "--max-states", "10"]).await;
+}
+
+async fn killed_again_and_again(flags: &[&str]) {
     let there: Vec<Value> = serde_json::from_str(include_str!("../../examples/figure-4/demonstration.json")).unwrap();
     let observations: Vec<Value> =
         there.iter().chain(there.iter().rev()).cycle().take(N_OBSERVATIONS).cloned().collect();
     let directory = tempfile::tempdir().unwrap();
     let database = directory.path().join("etude.db");
-    let mut process = Process::start(&database);
+    let mut process = Process::start_with(flags, &database);
     let model: Value = serde_json::from_str(include_str!("../../examples/figure-4/model.json")).unwrap();
     let client = crate::harness::client::Client::new();
     let registered = client.put(format!("http://{}/v1/models/figure-4", process.address)).json(&model).send().await;
@@ -133,7 +142,7 @@ async fn a_service_killed_a_hundred_times_loses_and_doubles_nothing() {
             process.kill();
             n_kills += 1;
             n_resumed_midway += usize::from(was.1 > 0);
-            process = Process::start(&database);
+            process = Process::start_with(flags, &database);
         }
         assert_eq!(watcher.steps, undisturbed.steps);
         let done = watcher.done.unwrap();
@@ -332,7 +341,8 @@ fn a_service_that_stays_away_is_given_up() {
     let server = format!("http://{}", process.address);
     let flags = ["--model", "examples/figure-4/model.json", "--server", &server, "--retries", "2"];
     let mut program = Program::start(&flags);
-    program.write(&[json!({"x": 0})]);
+    // As many as the lookahead needs to decide the start.
+    program.write(&vec![json!({"x": 0}); 4]);
     let mut first = String::new();
     BufReader::new(program.child.stdout.take().unwrap()).read_line(&mut first).unwrap();
     assert!(first.contains(r#""step":0"#), "{first}");

@@ -16,7 +16,7 @@ use crate::clock::Clock;
 use crate::service::{Caller, Client, Etude, ModelText, Name, Settings};
 use etude_core::document::Place;
 use etude_core::mapping::{CommittedStep, PassedStates};
-use etude_core::model::Format;
+use etude_core::model::{Format, Limits};
 
 /// How long steps wait in these sessions.
 const LIMIT: Duration = Duration::from_secs(1);
@@ -31,8 +31,13 @@ struct Service {
 
 impl Service {
     async fn start(directory: &Path, clock: &Clock) -> Self {
+        Self::start_within(directory, clock, Limits::DEFAULT).await
+    }
+
+    /// Where models may not be larger.
+    async fn start_within(directory: &Path, clock: &Clock, limits: Limits) -> Self {
         let tasks = TaskTracker::new();
-        let settings = Settings { clock: clock.clone(), ..Settings::of_test(directory) };
+        let settings = Settings { clock: clock.clone(), limits, ..Settings::of_test(directory) };
         let etude = Arc::new(Etude::open(&settings, &tasks, CancellationToken::new()).await.unwrap());
         etude.begin(clock.now()).await.unwrap();
         let stopping = CancellationToken::new();
@@ -316,17 +321,21 @@ proptest! {
         lookahead_ms in prop_oneof![Just(json!(null)), Just(json!(1000))],
         end_weight in 0..3_u32,
         extra_weight in prop_oneof![Just(1.0), Just(0.0), Just(0.5)],
+        is_lazy in any::<bool>(),
     ) {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
             let (directories, clock) = ([(); 2].map(|()| tempfile::tempdir().unwrap()), clock());
             let seen = demonstration();
             let seen: Vec<_> = seen.iter().chain(seen.iter().rev()).cycle().take(5000).cloned().collect();
+            let limits = if is_lazy { Limits { max_states: 0, ..Limits::DEFAULT } } else { Limits::DEFAULT };
+            // Without one, only small models are proven.
+            let lookahead = if is_lazy && lookahead.is_null() { json!(5) } else { lookahead };
             let open = json!({
                 "lookahead": lookahead, "lookahead_ms": lookahead_ms, "end_weight": end_weight, "extra_weight": extra_weight,
             });
-            let unbroken = Service::start(directories[0].path(), &clock).await;
-            let mut service = Service::start(directories[1].path(), &clock).await;
+            let unbroken = Service::start_within(directories[0].path(), &clock, limits).await;
+            let mut service = Service::start_within(directories[1].path(), &clock, limits).await;
             let mut expected_session = unbroken.open(open.clone()).await;
             let mut session = service.open(open).await;
             let id = session.id().to_owned();
@@ -353,7 +362,7 @@ proptest! {
                     Event::Restart => {
                         drop(session);
                         service.stop().await;
-                        service = Service::start(directories[1].path(), &clock).await;
+                        service = Service::start_within(directories[1].path(), &clock, limits).await;
                         (session, steps) = service.resume(&id).await;
                     }
                 }
