@@ -45,6 +45,9 @@ struct Import {
     /// given for several.
     #[arg(long, value_name = "ACTION=COST|REWARD")]
     cost: Vec<String>,
+    /// States that must never be entered: an expression of CEL over the attributes of the model; may be given for several.
+    #[arg(long = "unsafe", value_name = "EXPRESSION")]
+    unsafe_if: Vec<String>,
     /// Where to write the model; standard output if left out.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
@@ -82,7 +85,7 @@ impl Import {
     }
 
     fn edits(&self) -> Result<Edits, CliError> {
-        let mut edits = Edits { without: self.without.clone(), ..Edits::default() };
+        let mut edits = Edits { without: self.without.clone(), unsafe_if: self.unsafe_if.clone(), ..Edits::default() };
         let told = |flag: &str, value: &str, detail: String| CliError::Faulty(format!("{flag} {value}: {detail}"));
         for value in &self.rename {
             edits.add_rename(value).map_err(|detail| told("--rename", value, detail))?;

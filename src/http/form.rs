@@ -45,8 +45,14 @@ pub(super) fn form_of(request: &Request) -> Option<Result<ModelForm, Faults>> {
             }
             ("rename", Some(_)) => edits.add_rename(&value),
             ("cost", Some(_)) => edits.add_cost(&value),
-            (_, Some(_)) => Err("unknown query parameter; known here: without, rename, cost".to_owned()),
-            ("without" | "rename" | "cost", None) => Err("is for what is imported from other formats".to_owned()),
+            ("unsafe", Some(_)) => {
+                edits.unsafe_if.push(value);
+                Ok(())
+            }
+            (_, Some(_)) => Err("unknown query parameter; known here: without, rename, cost, unsafe".to_owned()),
+            ("without" | "rename" | "cost" | "unsafe", None) => {
+                Err("is for what is imported from other formats".to_owned())
+            }
             (_, None) => Ok(()),
         };
         if let Err(detail) = added {

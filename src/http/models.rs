@@ -112,7 +112,8 @@ struct WholeModelBody {
 /// A file of another tool is imported, by its content type: `application/vnd.gymnasium+json` is the table `P` of a Gymnasium environment, as
 /// `examples/gymnasium/export.py` writes it; `application/vnd.fast-downward.sas` is a SAS+ task, as Fast Downward translates it from PDDL; `application/vnd.umb`, `application/vnd.storm.drn` and
 /// `application/vnd.prism+tar` (the explicit files in a tar archive) are models of verification tools. Then the query may say `without` (actions that the body lacks, by name; `*` stands for any text), `cost` (`ACTION=COST`,
-/// in place of what the file says; or the name of the reward that is the cost) and `rename` (`OLD=NEW`), each any number of times.
+/// in place of what the file says; or the name of the reward that is the cost), `rename` (`OLD=NEW`) and `unsafe` (an expression of CEL over the
+/// attributes: states in which it holds must never be entered), each any number of times.
 ///
 /// With `If-Match`, the model takes the place of the one that has this hash, at once: requests from then on use it. Policies keep the hash of
 /// the model that they were made with, and sessions that run go on with it; it is gone for sessions that are resumed and policies that are to
@@ -125,6 +126,7 @@ struct WholeModelBody {
         ("without" = Option<Vec<String>>, Query, description = "Of what is imported: actions that the body lacks, by name; `*` stands for any text", style = Form, explode),
         ("cost" = Option<Vec<String>>, Query, description = "Of what is imported: `ACTION=COST`, or the name of the reward that is the cost", style = Form, explode),
         ("rename" = Option<Vec<String>>, Query, description = "Of what is imported: `OLD=NEW`", style = Form, explode),
+        ("unsafe" = Option<Vec<String>>, Query, description = "Of what is imported: expressions of CEL over the model's attributes, which hold in states that must never be entered", style = Form, explode),
         ("if-match" = Option<String>, Header, description = "The hash of the model that is to be replaced, in quotes as in `ETag`; `*`: whichever there is"),
     ),
     request_body(content(

@@ -1,5 +1,6 @@
 //! A table in the making: what all files that list states and transitions are read into.
 
+use super::deadly::unsafe_states;
 use super::words::{as_whole, check_names, domain};
 use super::{Edits, ImportError, Spot};
 use crate::attribute::{Attribute, MAX_COST, Schema};
@@ -272,7 +273,8 @@ impl Draft {
             all if all.len() as u64 == n_states => Start::Any,
             _ => Start::Candidates(self.start),
         };
-        Ok(Definition::of(Table::new(schema, actions, states, self.edges, start, Vec::new())))
+        let unsafe_states = unsafe_states(edits, &schema, &states, &start, meter)?;
+        Ok(Definition::of(Table::new(schema, actions, states, self.edges, start, unsafe_states)))
     }
 
     fn schema(&self, edits: &Edits) -> Result<Schema, ImportError> {

@@ -16,6 +16,8 @@ pub struct Edits {
     pub costs: Vec<(String, f64)>,
     /// Which reward of the file is the cost, where there are several.
     pub cost_reward: Option<String>,
+    /// States that must never be entered: expressions of CEL over the attributes of the model, one of which holds there.
+    pub unsafe_if: Vec<String>,
 }
 
 impl Edits {

@@ -12,6 +12,7 @@
 //! | `umb` | Storm, PRISM, Modest | a tar archive |
 
 mod choices;
+mod deadly;
 mod draft;
 mod drn;
 mod edits;

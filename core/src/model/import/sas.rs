@@ -8,18 +8,22 @@ use std::collections::{BTreeSet, HashMap};
 use std::io::BufRead;
 use std::sync::Arc;
 
+use super::deadly::unsafe_states;
 use super::lines::{Lines, number};
 use super::words::check_names;
 use super::{Edits, ImportError};
 use crate::attribute::{Attribute, Schema, Value};
 use crate::document::{Quoted, normal};
-use crate::interrupt::Interrupt;
+use crate::interrupt::{Interrupt, Meter};
 use crate::model::planning::{Planning, Rule, Values};
 use crate::model::table::{Edges, Table};
 use crate::model::{Action, ActionIdx, Definition, Limits, Model, Outcome};
 
 /// The version of the format that is read here.
 const VERSION: u32 = 3;
+
+/// How many values are looked at between two looks at the interrupt: less than a millisecond.
+const POLL_EVERY: u64 = 1 << 12;
 
 /// Most states of a table that is made of a task.
 const MAX_TABLE_STATES: usize = 10_000;
@@ -50,7 +54,7 @@ pub(super) fn read(
     let operators = file.read_operators(has_costs)?;
     file.read_axioms()?;
     let task = task(file.variables, start, operators, edits)?;
-    as_table_if_small(task, interrupt)
+    as_table_if_small(task, edits, interrupt)
 }
 
 /// A file as it is read.
@@ -351,16 +355,23 @@ fn numbered(operators: &[SasOperator]) -> Vec<String> {
 }
 
 /// A table of what the body reaches, if that is little.
-fn as_table_if_small(task: Planning, interrupt: &mut dyn Interrupt) -> Result<Definition, ImportError> {
+fn as_table_if_small(task: Planning, edits: &Edits, interrupt: &mut dyn Interrupt) -> Result<Definition, ImportError> {
     let (schema, actions, task) = (task.schema().clone(), task.actions().to_vec(), Arc::new(task));
     let limits = Limits { max_states: MAX_TABLE_STATES, ..Limits::DEFAULT };
     let model = Model::explore(schema, actions, Arc::clone(&task), limits, interrupt)?;
     if model.is_lazy() {
+        if !edits.unsafe_if.is_empty() {
+            let detail =
+                format!("unsafe: can be said of tasks of up to {MAX_TABLE_STATES} states that the body reaches");
+            return Err(ImportError::Unfit(detail));
+        }
         return Ok(Definition::of_shared(task));
     }
     let mut edges = Edges::default();
     for (from, way) in model.graph().iter() {
         edges.push(from, way.action, Outcome::certain(way.to));
     }
-    Ok(Definition::of(Table::of_model(&model, edges)))
+    let mut meter = Meter::new(interrupt, POLL_EVERY);
+    let unsafe_states = unsafe_states(edits, model.schema(), model.states(), model.start(), &mut meter)?;
+    Ok(Definition::of(Table::of_model(&model, edges, unsafe_states)))
 }

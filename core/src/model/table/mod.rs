@@ -47,15 +47,15 @@ impl Table {
 }
 
 impl Table {
-    /// The table of a model that lists its states, none of which is unsafe. `edges` are its transitions.
-    pub(super) fn of_model(model: &Model, edges: Edges) -> Self {
+    /// The table of a model that lists its states. `edges` are its transitions, `unsafe_states` ascending, and all different.
+    pub(super) fn of_model(model: &Model, edges: Edges, unsafe_states: Vec<StateIdx>) -> Self {
         Self {
             schema: model.schema.clone(),
             actions: model.actions.clone(),
             states: Arc::clone(&model.states),
             edges,
             start: model.start.clone(),
-            unsafe_states: Vec::new(),
+            unsafe_states,
         }
     }
 

@@ -171,3 +171,29 @@ fn faults_of_files_become_faults_of_requests_with_their_places() {
     assert_eq!(faults("\n\n[3]").line, Some(3));
     assert_eq!(faults("[[[[1, 7, 0, false]]]]").pointer, "/P/0/0");
 }
+
+#[cfg(feature = "rules")]
+#[test]
+fn states_in_which_an_expression_holds_must_never_be_entered() {
+    let path = "gymnasium/cliff-walking.json";
+    let with = |texts: &[&str]| {
+        let unsafe_if = texts.iter().map(ToString::to_string).collect();
+        let edits = Edits { unsafe_if, rename: vec![("col".into(), "x".into())], ..Edits::default() };
+        let definition = imported(ImportFormat::Gymnasium, &example_bytes(path), &edits);
+        definition
+            .map(|definition| serde_json::from_str::<Value>(&definition.text()).unwrap())
+            .map_err(|error| error.to_string())
+    };
+    let model = with(&["row == 3 && x > 0 && x < 11", "x == 11 && row == 0"]).unwrap();
+    assert_eq!(model["dynamics"]["unsafe"], json!([11, 37, 38, 39, 40, 41, 42, 43, 44, 45, 46]));
+    for (text, expected) in [
+        ("row = 3", "unsafe \"row = 3\": column"),
+        ("col == 3", "unsafe \"col == 3\": column 1: unknown name"),
+        ("row + 1", "unsafe \"row + 1\": expected bool, found int"),
+        ("row == 3", "unsafe: state 36 is, where the body starts"),
+        ("1 / row > 0", "unsafe \"1 / row > 0\": in state 0: "),
+    ] {
+        let told = with(&[text]).unwrap_err();
+        assert!(told.starts_with(expected), "{text}: {told}");
+    }
+}
