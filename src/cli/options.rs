@@ -232,7 +232,7 @@ pub(super) fn parse_within(text: &str) -> Result<(String, f64), String> {
     parse_named_number(text, "expected ATTRIBUTE=WITHIN, such as x=0.5")
 }
 
-fn parse_observed(text: &str) -> Result<(String, String), String> {
+pub(super) fn parse_observed(text: &str) -> Result<(String, String), String> {
     let (name, expression) = text.split_once('=').ok_or("expected ATTRIBUTE=EXPRESSION, such as x=east_m/0.25")?;
     Ok((name.trim().to_owned(), expression.trim().to_owned()))
 }

@@ -94,7 +94,7 @@ struct OpenMembers {
 /// A request for a report.
 #[derive(Serialize, ToSchema)]
 struct ReportMembers {
-    /// The observed states, in order: 1 to 100,000. Attributes may be missing or null: not observed.
+    /// The observed states, as in a request for a policy.
     demonstration: Vec<ObservationDocument>,
     /// The weight of each observation, at least 0 (`null`: 1), as many as there are observations; all 1 if left out.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -36,6 +36,12 @@ fn a_report_is_told_in_lines_and_tables() {
     assert!(told.lines().all(|line| line.chars().count() <= 100), "{told}");
     let met = inspected(&["examples/taxi/model.json", "--demonstration", "examples/taxi/demonstration.json"]);
     assert!(met.contains("each of which some state of the body meets\ndistance    0.0 at least"), "{met}");
+    let directory = tempfile::tempdir().unwrap();
+    let own = directory.path().join("own.csv");
+    std::fs::write(&own, "east_m,look\n0.5,u\n4,d\n").unwrap();
+    let flags = ["--observe", "x=east_m*2.0", "--observe", "heading=look == 'u' ? 'north' : 'south'"];
+    let own = inspected(&[&[MODEL, "--demonstration", own.to_str().unwrap()][..], &flags].concat());
+    assert!(own.contains("x                 2        1                4.0  8 (closest: 6)\n"), "{own}");
     let lacking =
         inspected(&["examples/taxi/model.json", "--without", "north", "--without", "west", "--weight", "passenger=0"]);
     assert!(!lacking.contains("north") && lacking.contains("passenger    category     0.0"), "{lacking}");

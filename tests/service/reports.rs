@@ -84,6 +84,10 @@ async fn a_demonstration_is_reported_on_with_what_no_state_meets_and_what_that_c
     policy["model"] = json!("ring");
     let (_, policy) = service.post("/v1/policies", &policy).await;
     assert!(policy["cost"]["distance"].as_f64().unwrap() >= 14.0, "{policy}");
+    // Of a demonstrator with attributes of its own.
+    let own = json!({"demonstration": [{"cm": 100}, {"cm": 500}], "observe": {"x": "cm / 100.0"}});
+    let (_, report) = service.post("/v1/models/ring/report", &own).await;
+    assert_eq!(report["demonstration"]["attributes"][0]["values"][0]["value"], 5, "{report}");
     // From a start that the model does not say, with another body.
     let other = json!({"demonstration": [{"x": 5}], "start": 5, "without": ["on"]});
     let (_, report) = service.post("/v1/models/ring/report", &other).await;

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::attribute::Weights;
 use crate::document::{Faults, Object};
-use crate::mapping::{Conditions, Demonstration, Options, RequestKind};
+use crate::mapping::{Conditions, Demonstration, Options, Request, RequestKind};
 use crate::model::Model;
 
 /// What an inspection is asked.
@@ -35,8 +35,8 @@ impl Query {
     pub fn read(model: &Model, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
         let n_before = faults.count();
         let options = Options::read(object, model, &Options::default(), faults);
-        let demonstration = object.optional("demonstration");
-        let demonstration = demonstration.and_then(|place| Demonstration::read(model.schema(), &place, faults));
+        let has_seen = object.optional("demonstration").is_some();
+        let demonstration = has_seen.then(|| Request::read_demonstration(model, object, faults)).flatten();
         if let Some(seen) = &demonstration {
             Options::default().check_observation_weights(seen.len(), object, faults);
         }

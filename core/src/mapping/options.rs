@@ -86,7 +86,9 @@ impl RequestKind {
                 following!("model", "demonstration", "heuristic", "max_expansions", "deadline_ms", "observe")
             }
             Self::Session => following!("type", "model", "learner", "explore", "lookahead_ms", "observe"),
-            Self::Report => &["demonstration", "weights", "start", "observation_weights", "without", "deadline_ms"],
+            Self::Report => {
+                &["demonstration", "weights", "start", "observation_weights", "without", "deadline_ms", "observe"]
+            }
         }
     }
 

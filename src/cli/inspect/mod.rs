@@ -13,7 +13,7 @@ use serde_json::{Map, Value, json};
 use super::client::{Client, ServerUrl};
 use super::input::{Cells, Observations, Source, Spot, parse_json};
 use super::map::read_model;
-use super::options::{FlaggedRequest, ReadingFlags, parse_start, parse_weight};
+use super::options::{FlaggedRequest, ReadingFlags, parse_observed, parse_start, parse_weight};
 use super::{CliError, render, runtime};
 use crate::service::hash_of;
 use etude_core::attribute::AttributeDocument;
@@ -49,6 +49,9 @@ pub(super) struct Inspect {
     /// The weight of each observation, in order: a JSON array of numbers; 1 where it is null.
     #[arg(long, value_name = "WEIGHTS", value_parser = parse_json)]
     observation_weights: Option<Value>,
+    /// What is observed as an attribute, of a demonstrator with attributes of its own, as for etude map.
+    #[arg(long, value_name = "ATTRIBUTE=EXPRESSION", value_parser = parse_observed)]
+    observe: Vec<(String, String)>,
     /// An action that the body lacks; may be given for several.
     #[arg(long, value_name = "ACTION")]
     without: Vec<String>,
@@ -125,8 +128,10 @@ impl Inspect {
     /// The request that the files and flags amount to. Of a whole request for a policy, what does not count here is left out.
     fn asked(&self, cells: &Cells) -> Result<Asked, CliError> {
         let mut asked = Asked { request: FlaggedRequest::new(Map::new()), source: Arc::default(), spots: Vec::new() };
+        let any = Cells::any();
         if let Some(path) = &self.demonstration {
-            let mut observations = Observations::open(path, &self.reading.columns, cells)?;
+            let mut observations =
+                Observations::open(path, &self.reading.columns, if self.observe.is_empty() { cells } else { &any })?;
             let mut members = observations.take_request();
             members.retain(|name, _| Query::FIELDS.contains(&name.as_str()));
             asked.request = FlaggedRequest::new(members);
@@ -143,6 +148,10 @@ impl Inspect {
         }
         for (attribute, weight) in &self.weights {
             asked.request.set(&format!("--weight {attribute}={weight}"), &["weights", attribute], json!(weight))?;
+        }
+        for (attribute, expression) in &self.observe {
+            let flag = format!("--observe {attribute}={expression}");
+            asked.request.set(&flag, &["observe", attribute], json!(expression))?;
         }
         asked.request.set_some("--start", "start", self.start.clone())?;
         asked.request.set_some("--observation-weights", "observation_weights", self.observation_weights.clone())?;
