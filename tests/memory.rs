@@ -113,14 +113,11 @@ const CASES: &[Named] = &[
     (
         "lookahead",
         || {
-            let (model, mut demonstration) = belt(300, 200);
-            // Nothing tells the ways apart.
-            demonstration.as_array_mut().unwrap().fill(json!({}));
-            let mut case = case((model, demonstration));
-            case.request["lookahead"] = 150.into();
+            let mut case = Case { max_expansions: 10_000_000, ..case(belt(700, 3000)) };
+            case.request["lookahead"] = 2500.into();
             case
         },
-        &[(2, MEMORY), (16, None)],
+        &[(8, MEMORY), (20, MEMORY)],
     ),
 ];
 
@@ -180,8 +177,9 @@ fn a_search_takes_no_more_memory_than_its_budget() {
             let n_bytes: usize = n_bytes.parse().unwrap();
             println!("{name}: {} of {} kB, stopped by {stopped_by}", n_bytes >> 10, max_bytes >> 10);
             assert_eq!(stopped_by, expected.map_or("nothing", StoppedBy::name), "{name}, {n_mb} MB");
-            // Stacks and pages of the allocator.
-            assert!(n_bytes < max_bytes / 5 * 6 + (2 << 20), "{name}: {n_bytes} of {max_bytes}");
+            // Stacks and pages of the allocator; and what the search of a window may always take.
+            let beside = if *name == "lookahead" { 10 << 20 } else { 2 << 20 };
+            assert!(n_bytes < max_bytes / 5 * 6 + beside, "{name}: {n_bytes} of {max_bytes}");
             assert!(*expected != MEMORY || n_bytes > max_bytes / 2, "{name}: only {n_bytes} of {max_bytes}");
         }
     }

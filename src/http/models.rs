@@ -131,7 +131,7 @@ struct WholeModelBody {
     ),
     request_body(content(
         (DefinitionDocument = "application/json"),
-        (serde_json::Value = "application/vnd.gymnasium+json"),
+        (std::collections::HashMap<String, serde_json::Value> = "application/vnd.gymnasium+json"),
         (String = "application/vnd.fast-downward.sas"),
         (Vec<u8> = "application/vnd.umb"),
         (String = "application/vnd.storm.drn"),

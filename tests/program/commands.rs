@@ -43,7 +43,7 @@ fn the_demo_shows_the_cave_the_steps_and_the_totals() {
         "cost      48.2 = actions 7.2 + distance 41.0",
         "status    optimal, lower bound 48.2",
         "\n   8 heading=north       1 extra  0 turn_left  lookahead heading=north\n",
-        "\n  10 x=4                 5 match  3 forward    proven    x=2\n",
+        "\n  10 x=4                 5 match  3 forward    lookahead x=2\n",
         "Weights after 31 trials, all 1 at first; their means give a policy with reward 974:",
         "  gold      6.05  ████",
     ] {

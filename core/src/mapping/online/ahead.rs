@@ -71,7 +71,7 @@ impl Ahead {
     pub(super) fn shared(&mut self) -> Option<Decided> {
         match self {
             Self::Layers(layers) => layers.shared(),
-            Self::Windows(_) => None,
+            Self::Windows(windows) => windows.sole_start(),
         }
     }
 

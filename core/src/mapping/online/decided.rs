@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::interrupt::Cancelled;
 use crate::mapping::{Move, PolicyEnd, StoppedBy};
-use crate::model::{OriginRow, StateIdx};
+use crate::model::{Origin, OriginRow, StateIdx};
 
 /// A step that is to be committed.
 #[derive(Debug)]
@@ -17,6 +17,13 @@ pub(super) struct Decided {
     pub(super) terms: Vec<(usize, f64)>,
     /// Its state's row, if the model is searched lazily.
     pub(super) row: Option<OriginRow>,
+}
+
+impl Decided {
+    /// The state that it leads to.
+    pub(super) fn origin(&self) -> Origin {
+        self.row.clone().map_or(Origin::State(self.step.state), Origin::Row)
+    }
 }
 
 /// The cheapest way from the root to the end.

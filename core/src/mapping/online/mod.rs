@@ -15,7 +15,7 @@
 //! | ahead | is | is chosen |
 //! |---|---|---|
 //! | [`layers`] | the cheapest ways to all states, extended with each observation, and found anew after a decision: it is known which steps are proven | without a lookahead, and where a window has [few nodes](ahead::keeps_layers) |
-//! | [`windows`] | a search from the root for each decision, which looks at a small part of the nodes; only the end is proven | else, and always if the model is searched lazily |
+//! | [`windows`] | a search from the root for each decision, which looks at a small part of the nodes; only a single start and the end are proven | else, and always if the model is searched lazily |
 //!
 //! All that is still to be committed follows from the root and the observations from its own on, so a mapping can go on from there
 //! after a restart ([`OnlineMapping::resume`]), with the same steps to the bit.
@@ -74,7 +74,7 @@ impl OnlineMapping {
         Self::looking_ahead(mapper, weights, conditions, lookahead, keeps_layers)
     }
 
-    /// The same, which searches for ways when it needs them, however small the model is, and so proves nothing before the end.
+    /// The same, which searches for ways when it needs them, however small the model is, and so proves nothing between a single start and the end.
     #[must_use]
     pub fn searching(mapper: &Arc<Mapper>, weights: Weights, conditions: Conditions, lookahead: NonZeroU32) -> Self {
         Self::looking_ahead(mapper, weights, conditions, Some(lookahead), false)

@@ -2,9 +2,9 @@
 //!
 //! A window is a problem of its own: it starts in the root, or in one of the start states, and ends wherever is cheapest at the newest
 //! observation; what ending costs counts only when the demonstration has ended. So it costs what a search of so few observations costs,
-//! whatever the model and whatever came before, and models are searched that do not list their states. What is proven is what the last
-//! window decides, of which the end is known: whether others would go on alike however the demonstration does is not asked, as that would
-//! take the ways to all states.
+//! whatever the model and whatever came before, and models are searched that do not list their states. What is proven is a start that is the
+//! only one, and what the last window decides, of which the end is known: whether others would go on alike however the demonstration does is not
+//! asked, as that would take the ways to all states.
 
 use std::collections::VecDeque;
 use std::num::NonZeroU32;
@@ -54,6 +54,26 @@ impl Windows {
         self.observations.push_back((observation.to_vec(), observation_weight));
     }
 
+    /// The start, if there is a single one, when the first observation has come: whatever else does, a mapping begins there.
+    pub(super) fn sole_start(&mut self) -> Option<Decided> {
+        if self.root.is_some() || self.observations.len() != 1 {
+            return None;
+        }
+        let start = {
+            let problem = self.problem(false)?;
+            let mut starts = problem.starts.iter(problem.model);
+            let (state, row) = starts.next().filter(|_| starts.next().is_none())?;
+            Decided {
+                step: Move { kind: MoveKind::Start, action: None, observation: self.first, state },
+                action_cost: 0.0,
+                terms: problem.distances.terms(0, row).collect(),
+                row: problem.model.is_lazy().then(|| OriginRow(row.to_vec())),
+            }
+        };
+        self.root = Some(start.origin());
+        Some(start)
+    }
+
     /// The first steps of the cheapest way to the newest observation.
     pub(super) fn decide(&mut self, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Vec<Decided>, Halt> {
         match interrupt.poll() {
@@ -76,8 +96,7 @@ impl Windows {
         drop(problem);
         steps.truncate(n_decided);
         if let Some(last) = steps.last() {
-            let state = last.row.clone().map_or(Origin::State(last.step.state), Origin::Row);
-            self.root = Some(state);
+            self.root = Some(last.origin());
             while self.first < last.step.observation {
                 self.observations.pop_front();
                 self.first += 1;

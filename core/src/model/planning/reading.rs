@@ -172,7 +172,8 @@ pub struct PlanningDocument {
     #[cfg_attr(feature = "openapi", schema(example = json!([["here", "there"], ["open", "shut"]])))]
     pub values: Vec<Vec<Scalar>>,
     /// The values of the state in which the imitator starts: of all attributes.
-    #[cfg_attr(feature = "openapi", schema(value_type = std::collections::BTreeMap<String, Scalar>, example = json!({"place": "here", "door": "shut"})))]
+    // Of scalars; a client that is generated from a map of those takes a number for one.
+    #[cfg_attr(feature = "openapi", schema(value_type = std::collections::BTreeMap<String, serde_json::Value>, example = json!({"place": "here", "door": "shut"})))]
     pub start: ByAttribute<Scalar>,
     /// What actions need and change: at most one for each.
     pub operators: Vec<OperatorDocument>,

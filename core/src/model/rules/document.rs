@@ -25,7 +25,7 @@ pub struct RulesDocument {
     #[serde(default, skip_serializing_if = "serde_json::Map::is_empty")]
     #[cfg_attr(feature = "openapi", schema(value_type = std::collections::HashMap<String, serde_json::Value>, example = json!({"walls": [3, 7]})))]
     pub constants: serde_json::Map<String, serde_json::Value>,
-    /// Where the imitator starts: a state, or several, of which the one closest to the first observation is taken.
+    /// Where the imitator starts: a state, or several, of which the one is taken that begins the cheapest mapping.
     pub start: StatesDocument,
     /// What the actions do: 1 to 10,000. Of the rules of an action the first whose `when` holds applies. An action does nothing where none
     /// applies.
