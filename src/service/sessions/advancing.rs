@@ -11,7 +11,7 @@ use crate::service::search::take_beyond_small;
 use crate::service::{Etude, PoolError, ServiceError};
 use crate::store::NewObservations;
 use etude_core::interrupt::{Interrupt, Uninterrupted};
-use etude_core::mapping::{OnlineMapping, Stopped};
+use etude_core::mapping::{Mapper, OnlineMapping, Stopped};
 
 impl Session {
     /// The mapping as it was after the last step that is `kept`, if any is, of which the session takes note.
@@ -69,7 +69,11 @@ impl Session {
         let is_inline = self.is_inline(observations.len().max(1));
         let held_bytes = self.held.n_bytes();
         let (mapper, memory) = (Arc::clone(&self.mapper), etude.memory.clone());
+        // Any number of sessions may be searched in turn, each with its memory.
+        let n_bytes = (Mapper::WINDOW_BYTES as u64).min(memory.room() / 4);
+        let window = if is_inline { None } else { Some(memory.take(n_bytes).await.map_err(ServiceError::from)?) };
         let job = move |interrupt: &mut dyn Interrupt| {
+            let _window = window;
             // Others find something too. What it really took is kept afterwards.
             let wanted = if is_inline { 0 } else { u64::MAX };
             let spare = take_beyond_small(wanted, &memory);

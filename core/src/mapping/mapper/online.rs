@@ -8,6 +8,9 @@ use crate::mapping::{Budget, Move, MoveKind, Problem, StoppedBy};
 use crate::model::{Space, States};
 
 impl Mapper {
+    /// What the search of a window may always take, in bytes; nearly all do with it.
+    pub const WINDOW_BYTES: usize = 8 << 20;
+
     /// The cheapest mapping of a window. Of those that cost the same, which is found does not depend on the budget, unless that runs out:
     /// whoever follows the same demonstration again, with more memory or less, comes to the same.
     ///
@@ -20,12 +23,10 @@ impl Mapper {
         budget: Budget,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Mapping, Cancelled> {
-        /// What a window may take whatever is left, as most do; two searches at a time have it in what is kept for what is not counted.
-        const ALWAYS_LEFT: usize = 8 << 20;
         /// As if there was so much for each observation.
         const CHOICE_BYTES: usize = 1 << 18;
-        let max_bytes = budget.max_bytes.clamp(ALWAYS_LEFT, Budget::DEFAULT.max_bytes);
-        let as_if = ALWAYS_LEFT.max(problem.demonstration.len().saturating_mul(CHOICE_BYTES));
+        let max_bytes = budget.max_bytes.clamp(Self::WINDOW_BYTES, Budget::DEFAULT.max_bytes);
+        let as_if = Self::WINDOW_BYTES.max(problem.demonstration.len().saturating_mul(CHOICE_BYTES));
         let choices = Choices { max_bytes: as_if.min(Budget::DEFAULT.max_bytes), may_turn: false };
         let budget = Budget { max_bytes, ..budget };
         self.map_by(choices, problem, Settings { budget, ..Settings::default() }, interrupt)

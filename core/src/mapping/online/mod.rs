@@ -100,7 +100,8 @@ impl OnlineMapping {
         }
     }
 
-    /// The same, in about `max_bytes` at most: an observation that would take more is not taken. The search of a window counts, beyond 8 MB.
+    /// The same, in about `max_bytes` at most: an observation that would take more is not taken. The search of a window counts, beyond
+    /// [`Mapper::WINDOW_BYTES`].
     #[must_use]
     pub fn within(self, max_bytes: usize) -> Self {
         self.spending(Budget { max_bytes, ..Budget::DEFAULT })
