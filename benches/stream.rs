@@ -444,20 +444,31 @@ enum Load {
     Busy,
 }
 
-/// Memory of sessions, each of which has seen `n_observations` before.
-async fn memory(n_sessions: u32, n_observations: usize, load: Load) -> Result<(), Failure> {
-    let world = worlds::example("figure-4");
-    let service = Service::start(&world).await?;
-    let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
-    let before = service.resident_kib()?;
-    let mut streams = Vec::new();
+/// Opens sessions, each of which then sees so many observations.
+async fn open_all(
+    service: &Service,
+    states: &Arc<Vec<Value>>,
+    n_sessions: usize,
+    n_observations: usize,
+) -> Result<Vec<Stream>, Failure> {
+    let mut streams = Vec::with_capacity(n_sessions);
     for _ in 0..n_sessions {
-        let mut stream = Stream::open(&service.address, &states).await?;
+        let mut stream = Stream::open(&service.address, states).await?;
         for _ in 0..n_observations {
             stream.round_trip().await?;
         }
         streams.push(stream);
     }
+    Ok(streams)
+}
+
+/// Memory of sessions, each of which has seen `n_observations` before.
+async fn memory(n_sessions: usize, n_observations: usize, load: Load) -> Result<(), Failure> {
+    let world = worlds::example("figure-4");
+    let service = Service::start(&world).await?;
+    let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
+    let before = service.resident_kib()?;
+    let mut streams = open_all(&service, &states, n_sessions, n_observations).await?;
     let (mut most, what) = (service.resident_kib()?, if load == Load::Busy { "busy" } else { "idle" });
     if load == Load::Busy {
         let round = async |mut stream: Stream| -> Result<_, Failure> {
@@ -482,7 +493,8 @@ async fn memory(n_sessions: u32, n_observations: usize, load: Load) -> Result<()
         let (n_rounds, _streams) = busy.await??;
         println!("\n{n_rounds:.0} observations by {n_sessions} sessions while memory was read {n_reads} times");
     }
-    let each = f64::from(u32::try_from(most.saturating_sub(before))?) / f64::from(n_sessions);
+    #[expect(clippy::cast_precision_loss, reason = "far below 2^52")]
+    let each = most.saturating_sub(before) as f64 / n_sessions as f64;
     println!(
         "memory of {n_sessions} {what} sessions that had each seen {n_observations} observations: at most {most} KiB \
          resident, {before} KiB before them, {each:.1} KiB each"
@@ -498,14 +510,7 @@ async fn many(n_sessions: usize, n_busy: usize) -> Result<(), Failure> {
     let service = Service::start(&world).await?;
     let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
     let before = service.resident_kib()?;
-    let mut streams = Vec::new();
-    for _ in 0..n_sessions {
-        let mut stream = Stream::open(&service.address, &states).await?;
-        for _ in 0..N_SEEN {
-            stream.round_trip().await?;
-        }
-        streams.push(stream);
-    }
+    let mut streams = open_all(&service, &states, n_sessions, N_SEEN).await?;
     let idle = service.resident_kib()?;
     let busy = streams.split_off(n_sessions - n_busy);
     let started = Instant::now();

@@ -47,18 +47,7 @@ pub(crate) fn cave(side: i64, n_gold: usize, n_observations: usize, seed: u64) -
     }
     let mut moved = |at: i64| (at + random.below(7) - 3).clamp(0, side - 1);
     let gold: Vec<(i64, i64)> = gold.iter().map(|(x, y)| (moved(*x), moved(*y))).collect();
-    let cells = |cells: &[(i64, i64)]| cells.iter().map(|(x, y)| json!([x, y])).collect::<Value>();
-    let actions = ["forward", "turn_left", "turn_right", "grab", "climb"];
-    World {
-        name: format!("{side}x{side} cave, {n_gold} gold"),
-        model: json!({
-            "actions": actions.map(|name| json!({"name": name, "cost": 0.3})),
-            "dynamics": {
-                "kind": "wumpus", "width": side, "height": side, "wumpi": cells(&wumpi), "gold": cells(&gold),
-            },
-        }),
-        demonstration: seen.iter().map(State::observed).collect(),
-    }
+    world(side, n_gold, &wumpi, &gold, &seen)
 }
 
 /// The same, for a demonstrator who goes from place to place without an end, and takes the gold that it comes upon; none was moved.
@@ -82,6 +71,11 @@ pub(crate) fn wandered(side: i64, n_gold: usize, n_observations: usize, seed: u6
             goal = cell();
         }
     }
+    world(side, n_gold, &wumpi, &gold, &seen)
+}
+
+/// The world of a body that cannot shoot, in a cave with these wumpi and this gold, and of what was `seen`.
+fn world(side: i64, n_gold: usize, wumpi: &[(i64, i64)], gold: &[(i64, i64)], seen: &[State]) -> World {
     let cells = |cells: &[(i64, i64)]| cells.iter().map(|(x, y)| json!([x, y])).collect::<Value>();
     let actions = ["forward", "turn_left", "turn_right", "grab", "climb"];
     World {
@@ -89,7 +83,7 @@ pub(crate) fn wandered(side: i64, n_gold: usize, n_observations: usize, seed: u6
         model: json!({
             "actions": actions.map(|name| json!({"name": name, "cost": 0.3})),
             "dynamics": {
-                "kind": "wumpus", "width": side, "height": side, "wumpi": cells(&wumpi), "gold": cells(&gold),
+                "kind": "wumpus", "width": side, "height": side, "wumpi": cells(wumpi), "gold": cells(gold),
             },
         }),
         demonstration: seen.iter().map(State::observed).collect(),
