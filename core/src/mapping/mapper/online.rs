@@ -2,7 +2,7 @@
 
 use super::{Choices, Mapper, Mapping, Settings, Status, conclude, renumber};
 use crate::interrupt::{Cancelled, Interrupt};
-use crate::mapping::heuristic::projected::Projected;
+use crate::mapping::heuristic::projected::{Projected, TableRoom, most_bytes};
 use crate::mapping::search::Found;
 use crate::mapping::{Budget, Move, MoveKind, Problem, StoppedBy};
 use crate::model::{Space, States};
@@ -28,6 +28,11 @@ impl Mapper {
         let max_bytes = budget.max_bytes.clamp(Self::WINDOW_BYTES, Budget::DEFAULT.max_bytes);
         let as_if = Self::WINDOW_BYTES.max(problem.demonstration.len().saturating_mul(CHOICE_BYTES));
         let choices = Choices { max_bytes: as_if.min(Budget::DEFAULT.max_bytes), may_turn: false };
+        // Of two attempts to make tables, there is room for one.
+        let (table_bytes, _) = most_bytes(&self.projections, problem, TableRoom::within(choices.max_bytes));
+        if table_bytes / 2 > max_bytes {
+            return self.complete(problem, Vec::new(), None, StoppedBy::Memory, interrupt);
+        }
         let budget = Budget { max_bytes, ..budget };
         self.map_by(choices, problem, Settings { budget, ..Settings::default() }, interrupt)
     }
