@@ -85,7 +85,7 @@ fn read(text: &str, scope: &Scope, names: &mut Vec<String>) -> Result<Expression
             let detail = if error.msg.contains("Recursion limit") {
                 format!("more than {MAX_NESTED} brackets within one another")
             } else {
-                error.msg
+                plainly(&error.msg)
             };
             format!("{}: {detail}", place_of(error.pos.0, error.pos.1))
         });
@@ -103,6 +103,29 @@ fn read(text: &str, scope: &Scope, names: &mut Vec<String>) -> Result<Expression
     reads.sort_unstable();
     reads.dedup();
     Ok(Expression { text: text.into(), root, result, reads: reads.into() })
+}
+
+/// What the parser says of a mistake, in words of those who write expressions and not grammars.
+fn plainly(message: &str) -> String {
+    let unexpected = |found: &str| match found {
+        "<EOF>" => "the expression ends too early".to_owned(),
+        found => format!("`{found}` is not expected here"),
+    };
+    let after = |before: &str| message.split_once(before).map(|(_, rest)| rest);
+    let quoted = |rest: &str| rest.rsplit_once('\'').map_or_else(|| rest.to_owned(), |(quoted, _)| quoted.to_owned());
+    if let Some(rest) = after("missing '") {
+        return format!("`{}` is missing here", rest.split('\'').next().unwrap_or(rest));
+    }
+    if let Some(rest) = after("recognition error at: '") {
+        return format!("`{}` cannot be read", quoted(rest));
+    }
+    if let Some(rest) = after(" input '") {
+        return unexpected(&quoted(rest.split_once(" expecting").map_or(rest, |(found, _)| found)));
+    }
+    if message.starts_with("Incomplete") {
+        return "a part is missing after this".to_owned();
+    }
+    message.to_owned()
 }
 
 /// Where in `text` the character at the byte `offset` stands, in words.

@@ -172,3 +172,24 @@ fn a_place_is_told_by_characters() {
     assert_eq!(flaws("'\u{e9}' == '\u{e9}' && y")[0].split(':').next(), Some("column 15"));
     assert_eq!(flaws("x == 1 &&\n  y")[0].split(':').next(), Some("line 2, column 3"));
 }
+
+#[test]
+fn what_is_no_expression_is_told_in_plain_words() {
+    let told = |text: &str| {
+        let read = read_all(&[text], &Scope::open(), &mut Vec::new()).unwrap();
+        read.into_iter().next().unwrap().unwrap_err().remove(0)
+    };
+    for (text, expected) in [
+        ("x +", "column 4: the expression ends too early"),
+        ("x + )", "column 5: `)` is not expected here"),
+        ("1 2", "column 3: `2` is not expected here"),
+        ("x ==== 2", "column 5: `==` is not expected here"),
+        ("[1,", "column 4: `]` is missing here"),
+        ("a..b", "column 3: `..` is not expected here"),
+        ("#", "column 1: `#` cannot be read"),
+        ("'abc", "column 1: `'abc` cannot be read"),
+        ("x ? 1", "column 1: a part is missing after this"),
+    ] {
+        assert_eq!(told(text), expected, "{text}");
+    }
+}

@@ -87,7 +87,7 @@ fn all_that_is_wrong_with_rules_is_told_at_once_with_rule_and_column() {
         ("rules/0/then/x", "rule 0, column 3: + cannot be applied to int and double: write double(..)"),
         ("rules/1/when", "rule 1, column 1: unknown name \"fule\"; known here: \"door\", \"fuel\""),
         ("rules/1/when", "rule 1, column 15: in cannot be applied to int and string"),
-        ("rules/2/when", "rule 2, column 5: Syntax error"),
+        ("rules/2/when", "rule 2, column 5: the expression ends too early"),
         ("rules/2/then/heading", "rule 2, column 1: this is \"north\""),
         ("rules/2/then/load", "rule 2, column 6: + cannot be applied to double and int"),
         ("rules/2/cost", "rule 2, column 1: expected int or double, found string"),
