@@ -69,8 +69,9 @@ impl Session {
         let is_inline = self.is_inline(observations.len().max(1));
         let held_bytes = self.held.n_bytes();
         let (mapper, memory) = (Arc::clone(&self.mapper), etude.memory.clone());
-        // Any number of sessions may be searched in turn, each with its memory.
-        let n_bytes = (Mapper::WINDOW_BYTES as u64).min(memory.room() / 4);
+        // Any number of sessions may be searched in turn, each with its memory: as much again is for the window, its terms of distances above
+        // all, and for what an allocator takes beside.
+        let n_bytes = (2 * Mapper::WINDOW_BYTES as u64).min(memory.room() / 4);
         let window = if is_inline { None } else { Some(memory.take(n_bytes).await.map_err(ServiceError::from)?) };
         let job = move |interrupt: &mut dyn Interrupt| {
             let _window = window;

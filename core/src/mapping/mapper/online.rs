@@ -8,8 +8,8 @@ use crate::mapping::{Budget, Move, MoveKind, Problem, StoppedBy};
 use crate::model::{Space, States};
 
 impl Mapper {
-    /// What the search of a window may always take, in bytes; nearly all do with it.
-    pub const WINDOW_BYTES: usize = 8 << 20;
+    /// What the search of a window may always take, in bytes, beside the window itself; nearly all do with it.
+    pub const WINDOW_BYTES: usize = 4 << 20;
 
     /// The cheapest mapping of a window. Of those that cost the same, which is found does not depend on the budget, unless that runs out:
     /// whoever follows the same demonstration again, with more memory or less, comes to the same.
