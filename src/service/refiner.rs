@@ -60,20 +60,9 @@ impl Etude {
     /// Refines whatever waits to be refined, until `stopping` is cancelled.
     pub async fn refine_until(self: Arc<Self>, stopping: CancellationToken) {
         let mut after = 0;
-        let mut begun = None;
         let mut pause = FIRST_PAUSE;
-        loop {
-            let outcome = tokio::select! {
-                outcome = self.refine_next(&mut after, &mut begun) => outcome,
-                () = stopping.cancelled() => {
-                    // Being stopped is no fault of what was being refined.
-                    if let Some(policy_id) = begun {
-                        self.return_refinement(&policy_id).await;
-                    }
-                    return;
-                }
-            };
-            match outcome {
+        while !stopping.is_cancelled() {
+            match self.refine_next(&mut after, &stopping).await {
                 Ok(Some(Outcome::Ended)) => {
                     pause = FIRST_PAUSE;
                     continue;
@@ -97,8 +86,8 @@ impl Etude {
     }
 
     /// Refines the policy that has waited longest of those after the sequence number `after`, which becomes its; of all, if there is
-    /// none. Nothing if none waits. Meanwhile `begun` is the policy that an attempt is counted for.
-    async fn refine_next(&self, after: &mut i64, begun: &mut Option<String>) -> Result<Option<Outcome>, StoreError> {
+    /// none. Nothing if none waits. Only the search ends when `stopping` is cancelled, so that what is counted of attempts stays true.
+    async fn refine_next(&self, after: &mut i64, stopping: &CancellationToken) -> Result<Option<Outcome>, StoreError> {
         let next = match self.store.next_refinement(*after).await? {
             None => self.store.next_refinement(0).await?,
             next => next,
@@ -106,12 +95,7 @@ impl Etude {
         let Some((sequence, refinement)) = next else { return Ok(None) };
         *after = sequence;
         let policy_id = refinement.policy_id.clone();
-        *begun = Some(policy_id.clone());
-        let may_begin = self.store.begin_refinement(&policy_id).await;
-        if !matches!(may_begin, Ok(Attempt::Begun)) {
-            *begun = None;
-        }
-        match may_begin? {
+        match self.store.begin_refinement(&policy_id).await? {
             Attempt::Begun => {}
             Attempt::Gone => return Ok(Some(Outcome::Ended)),
             Attempt::GivenUp => {
@@ -122,8 +106,14 @@ impl Etude {
                 return Ok(Some(Outcome::Ended));
             }
         }
-        let refined = self.refine(refinement).await;
-        *begun = None;
+        let refined = tokio::select! {
+            refined = self.refine(refinement) => refined,
+            () = stopping.cancelled() => {
+                // Being stopped is no fault of what was being refined.
+                self.return_refinement(&policy_id).await;
+                return Ok(Some(Outcome::Later));
+            }
+        };
         let refined = match refined {
             Ok(Some(refined)) => Some(refined),
             Ok(None) => {

@@ -51,7 +51,7 @@ async fn what_can_never_be_refined_is_dropped_and_does_not_hold_up_the_others() 
     }
     let good = made(&etude, &request()).await;
     let mut after = 0;
-    while let Some(outcome) = etude.refine_next(&mut after, &mut None).await.unwrap() {
+    while let Some(outcome) = etude.refine_next(&mut after, &CancellationToken::new()).await.unwrap() {
         assert_eq!(outcome, Outcome::Ended);
     }
     assert!(etude.policy("unreadable").await.is_err(), "it stays what it is");
@@ -73,11 +73,11 @@ async fn who_waits_for_a_thread_comes_before_a_refinement_which_is_taken_up_agai
     }));
     assert!(futures_util::poll!(&mut running).is_pending());
     for _ in 0..=MAX_ATTEMPTS {
-        assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), Some(Outcome::Later));
+        assert_eq!(etude.refine_next(&mut after, &CancellationToken::new()).await.unwrap(), Some(Outcome::Later));
         assert_eq!(etude.store.n_attempts(&id).await, Some(0), "it does not count");
     }
     drop(running);
-    while etude.refine_next(&mut after, &mut None).await.unwrap() == Some(Outcome::Later) {
+    while etude.refine_next(&mut after, &CancellationToken::new()).await.unwrap() == Some(Outcome::Later) {
         tokio::task::yield_now().await;
     }
     assert!(read(&etude, &id).await["refined_by"].is_string());
@@ -94,8 +94,8 @@ async fn a_refinement_that_ends_the_process_is_given_up_after_three_attempts() {
         assert_eq!(etude.store.n_attempts(&id).await, Some(n));
     }
     let mut after = 0;
-    assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), Some(Outcome::Ended));
-    assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), None);
+    assert_eq!(etude.refine_next(&mut after, &CancellationToken::new()).await.unwrap(), Some(Outcome::Ended));
+    assert_eq!(etude.refine_next(&mut after, &CancellationToken::new()).await.unwrap(), None);
     assert_eq!(read(&etude, &id).await["refined_by"], Value::Null, "it stays what it is");
 }
 
@@ -127,7 +127,7 @@ async fn the_refined_policy_is_the_optimum_however_the_first_one_was_to_be_searc
     (request["heuristic"], request["max_expansions"]) = ("paper".into(), 0.into());
     let id = made(&etude, &request).await;
     let mut after = 0;
-    assert_eq!(etude.refine_next(&mut after, &mut None).await.unwrap(), Some(Outcome::Ended));
+    assert_eq!(etude.refine_next(&mut after, &CancellationToken::new()).await.unwrap(), Some(Outcome::Ended));
     let refined_by = read(&etude, &id).await["refined_by"].as_str().unwrap().to_owned();
     assert_eq!(read(&etude, &refined_by).await["status"], "optimal");
 
@@ -149,7 +149,7 @@ async fn a_policy_that_is_deleted_while_it_waits_or_is_refined_leaves_nothing_to
     let etude = etude(directory.path()).await;
     let waiting = made(&etude, &request()).await;
     etude.delete_policy(&waiting).await.unwrap();
-    assert_eq!(etude.refine_next(&mut 0, &mut None).await.unwrap(), None);
+    assert_eq!(etude.refine_next(&mut 0, &CancellationToken::new()).await.unwrap(), None);
     // It is gone between the look at it and its attempt,
     let early = made(&etude, &request()).await;
     let (_, refinement) = etude.store.next_refinement(0).await.unwrap().unwrap();
@@ -162,6 +162,6 @@ async fn a_policy_that_is_deleted_while_it_waits_or_is_refined_leaves_nothing_to
     assert_eq!(etude.policies(&PolicyFilter::default(), 0, 10).await.unwrap().items.len(), 0);
     // Others are refined as before.
     let next = made(&etude, &request()).await;
-    assert_eq!(etude.refine_next(&mut 0, &mut None).await.unwrap(), Some(Outcome::Ended));
+    assert_eq!(etude.refine_next(&mut 0, &CancellationToken::new()).await.unwrap(), Some(Outcome::Ended));
     assert!(read(&etude, &next).await["refined_by"].is_string());
 }
