@@ -109,8 +109,7 @@ fn read_head(lines: &mut Lines<impl BufRead>, choices: &mut Choices, edits: &Edi
                 }
             }
             "@reward_models" => {
-                let names: Vec<String> =
-                    lines.required("the names of rewards")?.split_ascii_whitespace().map(str::to_owned).collect();
+                let names = reward_names(lines.required("the names of rewards")?);
                 cost = (choices.choose_cost(&names, edits, lines.spot())?, names.len());
             }
             "@nr_states" => {
@@ -134,6 +133,18 @@ fn read_head(lines: &mut Lines<impl BufRead>, choices: &mut Choices, edits: &Edi
             }
             _ => return Err(ImportError::at(spot, format!("{} is not known here", Quoted(&line)))),
         }
+    }
+}
+
+/// The names in a line of them, after each of which Storm writes a space. A reward without a name is called as in UMB.
+fn reward_names(line: &str) -> Vec<String> {
+    const UNNAMED: &str = "default";
+    let name = |name: &str| if name.is_empty() { UNNAMED } else { name }.to_owned();
+    let names = |line: &str| line.split(' ').map(name).collect();
+    match line.strip_suffix(' ') {
+        Some(line) => names(line),
+        None if line.is_empty() => Vec::new(),
+        None => names(line),
     }
 }
 

@@ -2,16 +2,17 @@
 
 mod gymnasium;
 mod mangled;
+mod outcomes;
 mod sas;
 mod verification;
 
-use std::collections::BTreeMap;
 use std::io::Cursor;
 
 use crate::oracle::optimal_cost;
 use crate::problems::{close, example_bytes, mapper, solve};
 use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Definition, Edits, ImportError, ImportFile, ImportFormat, Limits, import};
+use outcomes::{Outcomes, millionths, outcomes};
 use serde_json::Value;
 
 fn file(name: &str, content: &[u8]) -> ImportFile<'static> {
@@ -39,31 +40,6 @@ fn edits(without: &[&str], costs: &[&str]) -> Edits {
         edits.add_cost(cost).unwrap();
     }
     edits
-}
-
-/// The outcomes of every state and action, by the state that they lead to: probability and cost, in millionths. A cost that is never paid is none.
-type Outcomes = BTreeMap<(usize, String), BTreeMap<usize, (i64, Option<i64>)>>;
-
-fn millionths(number: f64) -> i64 {
-    (number * 1e6).round() as i64
-}
-
-fn outcomes(model: &Value) -> Outcomes {
-    let mut outcomes = Outcomes::new();
-    let cost_of = |name: &str| {
-        let action = model["actions"].as_array().unwrap().iter().find(|action| action["name"] == name).unwrap();
-        action["cost"].as_f64().unwrap()
-    };
-    for transition in model["dynamics"]["transitions"].as_array().unwrap() {
-        let [from, to] = [0, 2].map(|end| transition[end].as_u64().unwrap() as usize);
-        let name = transition[1].as_str().unwrap();
-        let probability = transition[3].as_f64().unwrap_or(1.0);
-        let cost = transition[4].as_f64().unwrap_or_else(|| cost_of(name));
-        let cost = (from != to || probability < 1.0).then(|| millionths(cost));
-        let entry = (millionths(probability), cost);
-        assert!(outcomes.entry((from, name.to_owned())).or_default().insert(to, entry).is_none());
-    }
-    outcomes
 }
 
 /// The demonstration that goes through these states of a model.

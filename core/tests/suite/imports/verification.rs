@@ -169,6 +169,18 @@ fn several_rewards_need_a_choice_and_one_that_is_chosen_must_be_there() {
 }
 
 #[test]
+fn a_reward_without_a_name_is_the_cost_where_it_is_the_only_one_and_else_called_default() {
+    let content = String::from_utf8(example_bytes("verification/slippery.drn")).unwrap();
+    let described = example("verification/slippery.json");
+    assert!(content.contains("\ntime energy \n"));
+    let both = content.replacen("\ntime energy \n", "\ntime  \n", 1);
+    let both = imported(ImportFormat::Drn, both.as_bytes(), &edits(&[], &["default"])).unwrap();
+    check(&parsed(&both), &described, "energy");
+    let one = content.replacen("\ntime energy \n", "\n \n", 1).replace("[1, ", "[").replace("[0, ", "[");
+    check(&parsed(&imported(ImportFormat::Drn, one.as_bytes(), &Edits::default()).unwrap()), &described, "energy");
+}
+
+#[test]
 fn what_is_wrong_with_a_drn_file_is_told_with_its_line() {
     let right = String::from_utf8(example_bytes("verification/slippery.drn"))
         .unwrap()
