@@ -104,6 +104,12 @@ impl Definition {
         dynamics.downcast_ref()
     }
 
+    /// As [`Self::dynamics`], shared.
+    pub(super) fn shared_dynamics<D: Any + Send + Sync>(&self) -> Option<Arc<D>> {
+        let dynamics: Arc<dyn Any + Send + Sync> = self.0.clone();
+        dynamics.downcast().ok()
+    }
+
     /// About how much memory compiling it takes at most, in bytes: for as many states as it can have within `limits`.
     #[must_use]
     pub fn compiling_bytes(&self, limits: Limits) -> u64 {
@@ -194,11 +200,11 @@ fn read_dynamics(
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[cfg_attr(feature = "openapi", schema(as = ModelDefinition))]
 pub struct DefinitionDocument {
-    /// The attributes of a state, in order: 1 to 256. Required with `table` dynamics, and with `rules`, where they have `values`; implied
+    /// The attributes of a state, in order: 1 to 256. Required with `table` and `experience` dynamics, and with `rules`, where they have `values`; implied
     /// by `wumpus` dynamics and then left out.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub attributes: Option<Vec<AttributeDocument>>,
-    /// The actions of this body. Required with `table` dynamics and with `rules`; left out with `wumpus` dynamics: all six.
+    /// The actions of this body. Required with `table` and `experience` dynamics and with `rules`; left out with `wumpus` dynamics: all six.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub actions: Option<Vec<ActionDocument>>,
     /// Which states there are, and how actions lead from one to another.

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::dynamics::Read;
+use super::experience::{self, ExperienceDocument};
 use super::planning::{self, PlanningDocument};
 #[cfg(feature = "rules")]
 use super::rules::{self, RulesDocument};
@@ -14,6 +15,7 @@ const KINDS: &[(&str, Read)] = &[
     ("table", table::read),
     ("planning", planning::read),
     ("wumpus", wumpus::read),
+    ("experience", experience::read),
     #[cfg(feature = "rules")]
     ("rules", rules::read),
 ];
@@ -48,4 +50,7 @@ pub enum DynamicsDocument {
     #[cfg(feature = "rules")]
     #[cfg_attr(feature = "openapi", schema(title = "RulesDynamics"))]
     Rules(RulesDocument),
+    /// They are what was experienced.
+    #[cfg_attr(feature = "openapi", schema(title = "ExperienceDynamics"))]
+    Experience(ExperienceDocument),
 }

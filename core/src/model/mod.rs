@@ -20,9 +20,10 @@
 //! | `implicit`, `explored` | rules by which states follow from one another; what was found by them |
 //! | `reach`, `compiled`, `origin` | which values states have; the model; where a request says that the imitator starts |
 //! | `dynamics` | the seam: what every kind of dynamics is to the rest |
-//! | `table`, `planning`, `rules`, `wumpus` | the kinds, a folder each |
+//! | `table`, `planning`, `rules`, `wumpus`, `experience` | the kinds, a folder each |
 //! | `kinds` | the list of kinds |
 //! | `definition`, `builder`, `import` | what a client registers, as JSON, by calls, or from the files of other tools |
+//! | `experienced` | what was experienced with a registered model |
 //!
 //! Nothing here knows of demonstrations.
 
@@ -31,6 +32,8 @@ mod builder;
 mod compiled;
 mod definition;
 mod dynamics;
+mod experience;
+mod experienced;
 mod explored;
 mod graph;
 mod implicit;
@@ -55,6 +58,7 @@ pub use action::{Action, ActionDocument, ActionIdx};
 pub use builder::ModelBuilder;
 pub use compiled::Model;
 pub use definition::{Definition, DefinitionDocument};
+pub use experience::{Batch, Experience, ExperienceCounts, ExperienceDocument, NOTHING_YET, SeenStatesDocument, Tally};
 pub use graph::{Graph, OwnCost, Transition};
 pub use implicit::{Implicit, Outcome};
 pub use import::{Edits, ImportError, ImportFile, ImportFormat, Spot, import};

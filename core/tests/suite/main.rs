@@ -10,6 +10,7 @@
 mod cases;
 mod compiling;
 mod conditions;
+mod experience;
 mod implicit;
 mod imports;
 mod inspection;
