@@ -18,10 +18,11 @@ CREATE TABLE models (
     name           TEXT    NOT NULL PRIMARY KEY,
     hash           TEXT    NOT NULL,
     definition     TEXT    NOT NULL, -- the canonical text, unless it is in pieces; then empty
-    definition_id  INTEGER,          -- of a text in pieces
+    definition_id  INTEGER,          -- of a text in pieces, and of what a model of experience was told
+    definition_hash TEXT,            -- of a model of experience: SHA-256 of the canonical text; `hash` is one over that and all batches
     attributes     TEXT    NOT NULL, -- JSON
     actions        TEXT    NOT NULL, -- JSON
-    n_states       INTEGER NOT NULL, -- 0: the model is searched lazily
+    n_states       INTEGER NOT NULL, -- 0: the model is searched lazily, unless it is one of experience
     n_transitions  INTEGER NOT NULL,
     n_unsafe       INTEGER NOT NULL,
     n_stochastic   INTEGER NOT NULL, -- of how many states and actions there are several outcomes
@@ -42,6 +43,25 @@ CREATE TABLE definition_pieces (
     piece          BLOB    NOT NULL,
     PRIMARY KEY (definition_id, seq)
 ) STRICT;
+
+-- What models of experience were told, in the order in which it was accepted. Rows are only ever added, until the model is gone. What is
+-- experienced is folded from here.
+CREATE TABLE batches (
+    definition_id  INTEGER NOT NULL,
+    seq            INTEGER NOT NULL, -- from 1
+    batch          TEXT    NOT NULL, -- as the client calls it
+    content_hash   TEXT    NOT NULL, -- SHA-256 of the batch's canonical text
+    hash           TEXT    NOT NULL, -- of the model with it: SHA-256 of the model's hash before, and of the text
+    n_states       INTEGER NOT NULL, -- of the model with it, and so the next three
+    n_transitions  INTEGER NOT NULL,
+    n_unsafe       INTEGER NOT NULL,
+    n_stochastic   INTEGER NOT NULL,
+    content        BLOB    NOT NULL, -- the text, compressed (zstd)
+    UNIQUE (definition_id, seq),
+    UNIQUE (definition_id, batch)
+) STRICT;
+
+CREATE INDEX batches_by_hash ON batches (hash);
 
 -- Policies, in the order in which they became durable. A policy outlives its model.
 CREATE TABLE policies (

@@ -1,7 +1,7 @@
 //! An example for each operation: what the page under `/docs/` is filled in with.
 //!
-//! Each works as it stands, after those of the operations that are listed before it; but for ids, which only the service knows. In their
-//! place stands [`AN_ID`], to be replaced by one that was answered.
+//! Each works as it stands, after those of the operations that are listed before it; but for ids, which only the service knows, and for
+//! experience, which another model is told. In place of ids stands [`AN_ID`], to be replaced by one that was answered.
 
 use serde_json::{Value as Json, json};
 use yaml_serde::Value;
@@ -11,9 +11,11 @@ const AN_ID: &str = "paste-an-id-here";
 
 /// Gives an operation its example: its path's parameters, and its body.
 pub(super) fn add(operation: &mut Value) {
+    let is_experience = operation["operationId"] == "add_experience";
     let parameters = operation.get_mut("parameters").and_then(Value::as_sequence_mut);
     for parameter in parameters.into_iter().flatten().filter(|parameter| parameter["in"] == "path") {
         parameter["example"] = match parameter["name"].as_str() {
+            Some("model") if is_experience => "explored",
             Some("model") => "corridor",
             Some("learner") => "doors",
             _ => AN_ID,
@@ -47,6 +49,13 @@ fn body(operation_id: &str) -> Option<Json> {
                 "transitions": [[0, "forward", 1], [1, "push", 2], [2, "forward", 3]],
                 "start": 0,
             },
+        }),
+        "add_experience" => json!({
+            "batch": "monday",
+            "transitions": [
+                {"state": {"x": 0, "door": "shut"}, "action": "forward", "next": {"x": 1, "door": "shut"}, "count": 9},
+                {"state": {"x": 1, "door": "shut"}, "action": "push", "next": {"x": 1, "door": "open"}, "cost": 0.8},
+            ],
         }),
         "make_report" => json!({"demonstration": demonstration}),
         "make_policy" => json!({"model": "corridor", "demonstration": demonstration, "weights": {"x": 2}}),

@@ -17,6 +17,7 @@ mod connections;
 mod description;
 mod encoding;
 mod examples;
+mod experience;
 mod form;
 mod idempotency;
 mod learners;
@@ -127,6 +128,7 @@ fn routes() -> OpenApiRouter<SharedContext> {
     description.tags.get_or_insert_default().push(protocol.build());
     OpenApiRouter::with_openapi(description)
         .routes(routes!(models::put_model, models::get_model, models::delete_model))
+        .routes(routes!(experience::add_experience))
         .routes(routes!(reports::make_report, reports::get_report))
         .routes(routes!(models::list_models))
         .routes(routes!(policies::make_policy, policies::list_policies))

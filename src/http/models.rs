@@ -25,7 +25,7 @@ use super::path::PathName;
 use super::problem::{BodyProblems, NoBodyProblems, Problem};
 use super::tags::{has_tag, replaces, with_tag};
 use crate::service::{Caller, DefinitionReader, Etude, ModelDefinition, Registered, ServiceError};
-use crate::service::{ModelSummary, PIECE_BYTES};
+use crate::service::{ModelSummary, PIECE_BYTES, Revision};
 use etude_core::attribute::AttributeDocument;
 use etude_core::model::{ActionDocument, DefinitionDocument};
 
@@ -36,7 +36,8 @@ struct ModelBody {
     /// The name it is registered under.
     #[schema(example = "figure-4")]
     name: String,
-    /// SHA-256 of its content in canonical form: equal for equal content, however that was written.
+    /// SHA-256 of its content in canonical form: equal for equal content, however that was written. Of a model of experience, one over that
+    /// and all that it was told.
     hash: String,
     /// The attributes of a state, in order, defaults filled in.
     attributes: Vec<AttributeDocument>,
@@ -52,12 +53,12 @@ struct ModelBody {
 /// How much of everything a model has.
 #[derive(Debug, Serialize, ToSchema)]
 #[schema(as = ModelCounts)]
-struct Counts {
+pub(super) struct Counts {
     /// Attributes.
     attributes: usize,
     /// Actions.
     actions: usize,
-    /// States; where they follow from rules, those that the body can reach. `null` if there are more of these than the limit: such a world is
+    /// States; where they follow from rules, those that the body can reach; where they are experienced, those that were. `null` if there are more of these than the limit: such a world is
     /// searched lazily, each search finds and numbers the states that it comes to.
     states: Option<u64>,
     /// Transitions; `null` if the states are.
@@ -69,6 +70,15 @@ struct Counts {
     /// States that must never be entered.
     #[serde(rename = "unsafe")]
     n_unsafe: u64,
+}
+
+impl Counts {
+    /// Those of a revision of a model of experience.
+    pub(super) fn of_revision(attributes: usize, actions: usize, revision: Revision) -> Self {
+        let Revision { size, n_stochastic, n_unsafe } = revision;
+        let (states, transitions) = (Some(size.n_states), Some(size.n_transitions));
+        Self { attributes, actions, states, transitions, n_stochastic, n_unsafe }
+    }
 }
 
 impl From<ModelSummary> for ModelBody {
@@ -97,7 +107,7 @@ impl From<ModelSummary> for ModelBody {
 struct WholeModelBody {
     #[serde(flatten)]
     summary: ModelBody,
-    /// What it was registered as, in canonical form. Registering this elsewhere gives the same hash.
+    /// What it was registered as, in canonical form. Registering this elsewhere gives the same hash, unless it was told some experience.
     #[schema(value_type = DefinitionDocument)]
     definition: Box<RawValue>,
 }

@@ -301,6 +301,7 @@ impl From<ServiceError> for Problem {
         match error {
             ServiceError::Parse(ParseError::Syntax { .. }) => Self::new(ProblemKind::MalformedJson, detail),
             ServiceError::Parse(ParseError::Faults(faults)) | ServiceError::Faults(faults) => Self::invalid(&faults),
+            ServiceError::NothingExperienced { .. } => Self::invalid(&Faults::one("", detail)),
             ServiceError::TooLarge(_) => Self::new(ProblemKind::TooLarge, detail),
             ServiceError::Body(error) => Self::unreadable(&error),
             ServiceError::Unknown { kind, pointer, .. } => {
@@ -316,7 +317,7 @@ impl From<ServiceError> for Problem {
                 Self { errors: fault.into_iter().collect(), ..Self::new(problem, detail) }
             }
             ServiceError::BatchFull => Self::new(ProblemKind::BatchFull, detail),
-            ServiceError::Conflict { .. } => Self::new(ProblemKind::Conflict, detail),
+            ServiceError::Conflict { .. } | ServiceError::BatchTaken { .. } => Self::new(ProblemKind::Conflict, detail),
             ServiceError::PreconditionFailed { .. } => Self::new(ProblemKind::PreconditionFailed, detail),
             ServiceError::KeyReused { .. } => Self::new(ProblemKind::KeyReused, detail),
             ServiceError::InUse { .. } => Self::new(ProblemKind::InUse, detail),

@@ -94,6 +94,14 @@ impl MapperCache {
         self.keep_if_oversized(key, mapper);
     }
 
+    /// Takes out the model with this key, if it is there.
+    pub(super) fn remove(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
+        let mut oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner);
+        let removed = oversized.take_if(|(kept, _)| kept == key).map(|(_, mapper)| mapper);
+        drop(oversized);
+        self.cache.remove(key).map(|(_, kept)| kept.mapper).or(removed)
+    }
+
     /// The model with this key, if it is there.
     pub(super) fn get(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
         self.cache.get(key).map(|kept| kept.mapper).or_else(|| self.oversized(key))

@@ -9,6 +9,8 @@
 //! A compilation that was begun is finished even if nobody waits for it any more, so that the next request finds the model. A requester that
 //! goes away leaves no state behind.
 
+mod experienced;
+
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -22,13 +24,15 @@ use tracing::Instrument;
 use super::cache::MapperCache;
 use super::definitions::{DefinitionReader, ModelText, check_hash, corrupt_definition, unknown};
 use super::hash::hex;
+use super::limited::LimitedTime;
 use super::pool::Admission;
+use super::told::Experiences;
 use super::{Client, Etude, PipeWriter, PoolError, SearchPool, ServiceError, Settings, pipe};
 use crate::clock::Clock;
 use crate::memory::{Held, Memory, NoRoom};
 use crate::store::{ModelKey, ModelSize, ModelSummary, Store, StoredDefinition};
 use etude_core::document::Faults;
-use etude_core::interrupt::{Interrupt, Interrupted, Signal};
+use etude_core::interrupt::{Interrupt, Interrupted};
 use etude_core::mapping::Mapper;
 use etude_core::model::{CompileError, Definition, Format, Limits, Model, ReadError};
 
@@ -42,28 +46,47 @@ pub(super) struct Compiler {
     memory: Memory,
     max_time: Duration,
     tasks: TaskTracker,
+    /// What models of experience were told.
+    pub(super) experiences: Experiences,
     /// What is being made ready.
-    coming: Arc<Mutex<FxHashMap<ModelKey, Coming>>>,
+    coming: Arc<Mutex<FxHashMap<Asked, Coming>>>,
 }
 
-/// Completes with the model, or with why there is none.
-type Coming = watch::Receiver<Option<Result<Arc<Mapper>, Arc<ServiceError>>>>;
+/// What is being made ready.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+enum Asked {
+    /// The model with this key.
+    Exactly(ModelKey),
+    /// The model of experience of this name, as it is now: it had this key when it was asked for.
+    Current(String, ModelKey),
+}
+
+/// Completes with the model and its hash, or with why there is none.
+type Coming = watch::Receiver<Option<Result<(String, Arc<Mapper>), Arc<ServiceError>>>>;
 
 /// A model is being made ready until this is dropped.
 struct Begun {
     compiler: Compiler,
-    key: ModelKey,
+    asked: Asked,
 }
 
 impl Drop for Begun {
     fn drop(&mut self) {
-        self.compiler.coming().remove(&self.key);
+        self.compiler.coming().remove(&self.asked);
+    }
+}
+
+impl Asked {
+    fn key(&self) -> &ModelKey {
+        let (Self::Exactly(key) | Self::Current(_, key)) = self;
+        key
     }
 }
 
 impl Compiler {
     pub(super) fn new(store: Arc<Store>, pool: SearchPool, settings: &Settings, tasks: TaskTracker) -> Self {
         Self {
+            experiences: Experiences::new(Arc::clone(&store), pool.clone(), settings.memory.clone()),
             store,
             pool,
             clock: settings.clock.clone(),
@@ -75,7 +98,7 @@ impl Compiler {
         }
     }
 
-    fn coming(&self) -> MutexGuard<'_, FxHashMap<ModelKey, Coming>> {
+    fn coming(&self) -> MutexGuard<'_, FxHashMap<Asked, Coming>> {
         self.coming.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
@@ -93,6 +116,7 @@ impl Compiler {
         let n_bytes = n_bytes + beyond.min((MOST_OF_COUNTED - 1) * n_bytes);
         self.memory.try_take(n_bytes).or_else(|_| {
             drop(self.cache.make_room(n_bytes.saturating_sub(self.memory.free_for_large())));
+            self.experiences.make_room();
             self.memory.try_take(n_bytes)
         })
     }
@@ -122,18 +146,26 @@ impl Compiler {
         Ok(mapper.keeping(held))
     }
 
-    /// Begins to make the model with this name and key ready, by its `place` in the pool, if it has one; or joins whoever has.
+    /// Runs what is to come to its end, even if its caller goes away.
+    pub(super) async fn run<T: Send + 'static>(
+        &self,
+        task: impl Future<Output = T> + Send + 'static,
+    ) -> Result<T, PoolError> {
+        self.tasks.spawn(task).await.map_err(|_| PoolError::Panicked)
+    }
+
+    /// Begins to make the model with this name ready, by its `place` in the pool, if it has one; or joins whoever has.
     ///
     /// # Errors
     ///
     /// [`PoolError::Busy`] if there is no place for it.
-    fn begin(&self, name: &str, key: &ModelKey, place: Option<&Admission>) -> Result<Coming, ServiceError> {
+    fn begin(&self, name: &str, asked: &Asked, place: Option<&Admission>) -> Result<Coming, ServiceError> {
         let mut coming = self.coming();
-        if let Some(begun) = coming.get(key) {
+        if let Some(begun) = coming.get(asked) {
             return Ok(begun.clone());
         }
-        if let Some(mapper) = self.cache.get(key) {
-            return Ok(watch::channel(Some(Ok(mapper))).1);
+        if let Some(mapper) = self.cache.get(asked.key()) {
+            return Ok(watch::channel(Some(Ok((asked.key().hash.clone(), mapper)))).1);
         }
         // It waits for its turn even if its first requester leaves.
         let place = place.map(|place| place.clone().waiting_until(None));
@@ -141,11 +173,11 @@ impl Compiler {
             place.take()?;
         }
         let (sender, receiver) = watch::channel(None);
-        coming.insert(key.clone(), receiver.clone());
-        let (name, begun) = (name.to_owned(), Begun { compiler: self.clone(), key: key.clone() });
+        coming.insert(asked.clone(), receiver.clone());
+        let (name, begun) = (name.to_owned(), Begun { compiler: self.clone(), asked: asked.clone() });
         let making = async move {
-            let Begun { compiler, key } = &begun;
-            let made = Box::pin(compiler.make_ready(name, key, place)).await;
+            let Begun { compiler, asked } = &begun;
+            let made = Box::pin(compiler.make_ready(name, asked, place)).await;
             // From here on, it is found in the cache.
             drop(begun);
             sender.send_replace(Some(made.map_err(Arc::new)));
@@ -154,16 +186,23 @@ impl Compiler {
         Ok(receiver)
     }
 
-    /// Makes the model with this name and key ready, and puts it into the cache.
+    /// Makes the model with this name ready, and puts it into the cache.
     async fn make_ready(
         &self,
         name: String,
-        key: &ModelKey,
+        asked: &Asked,
         place: Option<Admission>,
-    ) -> Result<Arc<Mapper>, ServiceError> {
+    ) -> Result<(String, Arc<Mapper>), ServiceError> {
         let unknown = || unknown(&name, None);
+        let key = asked.key();
         // If the model was deleted and registered anew in between, its hash differs, and the next request finds the new one.
-        let row = self.store.model(&name).await?.filter(|row| row.summary.hash == key.hash).ok_or_else(unknown)?;
+        let row = self.store.model(&name).await?.ok_or_else(unknown)?;
+        if row.experience.is_some() {
+            return self.make_experienced_ready(&name, asked, place).await;
+        }
+        if row.summary.hash != key.hash {
+            return Err(unknown());
+        }
         let n_attributes = row.summary.attributes.len();
         let needed = |size: ModelSize| Model::compiled_bytes(size.n_states, size.n_transitions, n_attributes as u64);
         let n_bytes = row.summary.size.map_or(0, needed);
@@ -213,7 +252,7 @@ impl Compiler {
         }
         let mapper = Arc::new(mapper??);
         self.put(key.clone(), &mapper).await;
-        Ok(mapper)
+        Ok((key.hash.clone(), mapper))
     }
 
     /// Puts a model that has just been compiled into the cache.
@@ -229,6 +268,7 @@ fn shared(error: &ServiceError, name: &str, pointer: &'static str) -> ServiceErr
     match error {
         ServiceError::Unknown { .. } => unknown(name, Some(pointer)),
         ServiceError::Faults(faults) => faults.clone().into(),
+        ServiceError::NothingExperienced { .. } => Faults::one(pointer, error.to_string()).into(),
         ServiceError::Pool(error) => (*error).into(),
         ServiceError::NoRoom(error) => (*error).into(),
         ServiceError::Unavailable(outage) => ServiceError::Unavailable(outage.clone()),
@@ -249,29 +289,6 @@ async fn feed(store: &Store, mut pieces: DefinitionReader, to_reader: PipeWriter
     }
     to_reader.end().await;
     Ok(())
-}
-
-/// An interrupt with a time limit, which does not count the time in which the job makes way for others.
-pub(super) struct LimitedTime<'i> {
-    inner: &'i mut dyn Interrupt,
-    clock: Clock,
-    left: Duration,
-    last: Instant,
-}
-
-impl<'i> LimitedTime<'i> {
-    pub(super) fn new(inner: &'i mut dyn Interrupt, max_time: Duration, clock: Clock) -> Self {
-        Self { inner, left: max_time, last: clock.instant(), clock }
-    }
-}
-
-impl Interrupt for LimitedTime<'_> {
-    fn poll(&mut self) -> Signal {
-        self.left = self.left.saturating_sub(self.clock.elapsed(self.last));
-        let signal = self.inner.poll();
-        self.last = self.clock.instant();
-        if signal == Signal::Continue && self.left.is_zero() { Signal::Finish } else { signal }
-    }
 }
 
 impl From<CompileError> for ServiceError {
@@ -311,12 +328,50 @@ impl Etude {
         place: Option<&Admission>,
         deadline: Option<Instant>,
     ) -> Result<(String, Arc<Mapper>), ServiceError> {
-        let key = self.store.model_key(name).await?.ok_or_else(|| unknown(name, Some(pointer)))?;
-        let hash = key.hash.clone();
-        if let Some(mapper) = self.compiler.cache.get(&key) {
-            return Ok((hash, mapper));
+        let head = self.store.model_head(name).await?.ok_or_else(|| unknown(name, Some(pointer)))?;
+        let asked = match head.experience {
+            Some(_) => Asked::Current(name.to_owned(), head.key),
+            None => Asked::Exactly(head.key),
+        };
+        self.made_ready(name, &asked, pointer, place, deadline).await
+    }
+
+    /// The model called `name` as it was when it had this hash. `None` if another one is there, or if it is one of experience that never had it.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::mapper`].
+    pub(super) async fn mapper_with_hash(
+        &self,
+        (name, hash): (&str, &str),
+        pointer: &'static str,
+        place: Option<&Admission>,
+        deadline: Option<Instant>,
+    ) -> Result<Option<Arc<Mapper>>, ServiceError> {
+        let head = self.store.model_head(name).await?.ok_or_else(|| unknown(name, Some(pointer)))?;
+        let asked = match head.experience {
+            Some(id) if head.key.hash == hash || self.store.has_revision(id, hash).await? => {
+                Asked::Exactly(ModelKey { hash: hash.to_owned(), ..head.key })
+            }
+            None if head.key.hash == hash => Asked::Exactly(head.key),
+            Some(_) | None => return Ok(None),
+        };
+        let (_, mapper) = self.made_ready(name, &asked, pointer, place, deadline).await?;
+        Ok(Some(mapper))
+    }
+
+    async fn made_ready(
+        &self,
+        name: &str,
+        asked: &Asked,
+        pointer: &'static str,
+        place: Option<&Admission>,
+        deadline: Option<Instant>,
+    ) -> Result<(String, Arc<Mapper>), ServiceError> {
+        if let Some(mapper) = self.compiler.cache.get(asked.key()) {
+            return Ok((asked.key().hash.clone(), mapper));
         }
-        let mut coming = self.compiler.begin(name, &key, place)?;
+        let mut coming = self.compiler.begin(name, asked, place)?;
         let ready = coming.wait_for(Option::is_some);
         let ready = match deadline {
             None => ready.await,
@@ -326,7 +381,7 @@ impl Etude {
             },
         };
         match ready.ok().as_deref() {
-            Some(Some(Ok(mapper))) => Ok((hash, Arc::clone(mapper))),
+            Some(Some(Ok((hash, mapper)))) => Ok((hash.clone(), Arc::clone(mapper))),
             Some(Some(Err(error))) => Err(shared(error, name, pointer)),
             Some(None) | None => Err(PoolError::Panicked.into()),
         }

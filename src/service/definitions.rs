@@ -25,7 +25,13 @@ pub struct DefinitionReader {
 
 impl DefinitionReader {
     pub(super) fn new(summary: &ModelSummary, id: i64) -> Self {
-        Self { model: summary.name.clone(), expected: summary.hash.clone(), id, seq: 0, hash: Sha256::new() }
+        Self {
+            model: summary.name.clone(),
+            expected: summary.definition_hash().to_owned(),
+            id,
+            seq: 0,
+            hash: Sha256::new(),
+        }
     }
 
     /// The next piece of the canonical text; `None` after the last one.

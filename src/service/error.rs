@@ -8,6 +8,7 @@ use crate::memory::NoRoom;
 use crate::store::{StoreError, Unavailable};
 use etude_core::document::{Faults, ParseError, Quoted};
 use etude_core::mapping::WriteError;
+use etude_core::model::NOTHING_YET;
 
 /// Why the service could not do as asked.
 #[derive(Debug, thiserror::Error)]
@@ -51,6 +52,23 @@ pub enum ServiceError {
         name: String,
         /// The hash of what is there, if anything is.
         existing_hash: Option<String>,
+    },
+    /// The model was told another batch of the same name.
+    #[error(
+        "model {model:?} was told batch {} before, with other content; give each batch a name of its own",
+        Quoted(batch)
+    )]
+    BatchTaken {
+        /// The model.
+        model: String,
+        /// The name of the batch.
+        batch: String,
+    },
+    /// A model of experience has no state that the imitator may start in.
+    #[error("of model {model:?}, {NOTHING_YET}")]
+    NothingExperienced {
+        /// The model.
+        model: String,
     },
     /// A request with the same key and another body was answered.
     #[error(

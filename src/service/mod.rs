@@ -14,10 +14,12 @@ mod caller;
 mod compiler;
 mod definitions;
 mod error;
+mod experience;
 mod hash;
 mod idempotency;
 mod learner_task;
 mod learners;
+mod limited;
 mod models;
 mod name;
 mod opening;
@@ -31,6 +33,7 @@ mod reports;
 mod requests;
 mod search;
 mod sessions;
+mod told;
 mod trials;
 
 use std::path::PathBuf;
@@ -43,6 +46,7 @@ pub use batch::{MAX_BATCH_ITEMS, MadePolicies};
 pub use caller::{Caller, Client};
 pub use definitions::{DefinitionReader, ModelForm, ModelText, OpenText};
 pub use error::{Outage, OutageKind, ServiceError};
+pub use experience::ExperienceAnswer;
 pub use hash::hash_of;
 pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
@@ -67,7 +71,7 @@ use crate::memory::Memory;
 pub(crate) use crate::store::PIECE_BYTES;
 use crate::store::Store;
 pub use crate::store::{
-    AcceptedReward, ModelSummary, Page, PolicyFilter, Replaces, SessionFilter, SessionRecord, SessionStatus,
+    AcceptedReward, ModelSummary, Page, PolicyFilter, Replaces, Revision, SessionFilter, SessionRecord, SessionStatus,
     TrialStatus,
 };
 use cache::ModelNames;

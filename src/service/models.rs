@@ -5,23 +5,25 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use serde_json::value::RawValue;
 use tokio::sync::mpsc;
 
-use super::compiler::{Compiler, LimitedTime};
+use super::compiler::Compiler;
 use super::definitions::{
     DefinitionReader, DefinitionWriter, ModelForm, ModelText, check_hash, corrupt_definition, definition_writer,
     unknown,
 };
 use super::hash::hash_of;
+use super::limited::LimitedTime;
 use super::pool::Places;
+use super::told::revision;
 use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
 use crate::memory::{Held, NoRoom, SMALL_BYTES};
 use crate::store::{
     Deletion, ModelKey, ModelRegistration, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, Page, Replaces,
-    StoredDefinition,
+    Revision, StoredDefinition,
 };
 use etude_core::attribute::AttributeDocument;
 use etude_core::interrupt::{Interrupt, Interrupted};
 use etude_core::mapping::Mapper;
-use etude_core::model::{ActionDocument, Definition, Format, Limits, ReadError};
+use etude_core::model::{ActionDocument, Definition, Format, Limits, ReadError, Tally};
 
 /// A model and its definition, as registered.
 #[derive(Debug)]
@@ -106,7 +108,7 @@ impl Etude {
         self.replace_model(name, text, format.into(), Replaces::Nothing, caller).await
     }
 
-    /// Registers the model in `text` under `name`, at once in the place of a model that it `replaces`. Sessions that run go on with the model
+    /// Registers the model in `text` under `name`, at once in the place of a model that it `replaces`. What that was told goes with it. Sessions that run go on with the model
     /// that they were opened with, and policies keep its hash; a session that is resumed and a policy that is to be refined do not find
     /// it any more, as if it were deleted.
     ///
@@ -153,29 +155,28 @@ impl Etude {
         // The first error is that of storing: preparing fails because of it.
         let stored = stored?;
         let Prepared { text, hash, compiled } = prepared??;
-        let Some(Compiled { mapper, attributes, actions }) = compiled else {
+        let Some(Compiled { content, attributes, actions }) = compiled else {
             // Looked up again, as the model may have been deleted meanwhile.
             return match self.store.model(name.as_str()).await? {
-                Some(existing) if existing.summary.hash == hash => Ok((Registered::Already, existing.summary)),
+                Some(existing) if existing.summary.definition_hash() == hash => {
+                    Ok((Registered::Already, existing.summary))
+                }
                 None if replaces == Replaces::Nothing => Err(PoolError::Busy.into()),
                 existing => Err(conflict(name, &replaces, existing.map(|existing| existing.summary.hash))),
             };
         };
-        let model = mapper.model();
         let summary = ModelSummary {
             name: name.to_string(),
+            definition_hash: matches!(content, Content::Experience(_)).then(|| hash.clone()),
             hash,
             attributes,
             actions,
-            size: (!model.is_lazy()).then(|| ModelSize {
-                n_states: model.graph().n_states() as u64,
-                n_transitions: model.n_transitions() as u64,
-            }),
-            n_stochastic: model.n_stochastic() as u64,
-            n_unsafe: model.n_unsafe() as u64,
+            size: content.size(),
+            n_stochastic: content.n_stochastic(),
+            n_unsafe: content.n_unsafe(),
             created_at: as_stored(caller.now),
         };
-        let key = ModelKey { hash: summary.hash.clone(), is_lazy: model.is_lazy() };
+        let key = ModelKey { hash: summary.hash.clone(), is_lazy: content.size().is_none() };
         let definition = match (text, stored) {
             (Some(text), _) => NewDefinition::Text(text),
             (None, Some(pieces)) => NewDefinition::Pieces(pieces),
@@ -188,7 +189,12 @@ impl Etude {
             ModelRegistration::Unchanged(summary) => (Registered::Already, summary),
             ModelRegistration::Conflict { existing_hash } => return Err(conflict(name, &replaces, existing_hash)),
         };
-        self.compiler.put(key, &Arc::new(mapper)).await;
+        match content {
+            Content::Mapper(mapper) => self.compiler.put(key, &Arc::from(mapper)).await,
+            // What is there may have been told something.
+            Content::Experience(_) if registered == Registered::Already => {}
+            Content::Experience(_) => self.compiler.experiences.forget(name.as_str()),
+        }
         Ok((registered, summary))
     }
 
@@ -226,7 +232,7 @@ impl Etude {
         let row = self.store.model(name.as_str()).await?.ok_or_else(|| unknown(name.as_str(), None))?;
         let definition = match row.definition {
             StoredDefinition::Text(text) => {
-                check_hash(name.as_str(), &hash_of(&text), &row.summary.hash)?;
+                check_hash(name.as_str(), &hash_of(&text), row.summary.definition_hash())?;
                 let text = RawValue::from_string(text);
                 ModelDefinition::Text(text.map_err(|error| corrupt_definition(name.as_str(), error.into()))?)
             }
@@ -262,7 +268,10 @@ impl Etude {
     /// If there is none.
     pub async fn delete_model(&self, name: &Name) -> Result<(), ServiceError> {
         match self.store.delete_model(name.as_str()).await? {
-            Deletion::Deleted => Ok(()),
+            Deletion::Deleted => {
+                self.compiler.experiences.forget(name.as_str());
+                Ok(())
+            }
             Deletion::Unknown => Err(unknown(name.as_str(), None)),
         }
     }
@@ -300,9 +309,45 @@ struct Prepared {
 }
 
 struct Compiled {
-    mapper: Mapper,
+    content: Content,
     attributes: Vec<AttributeDocument>,
     actions: Vec<ActionDocument>,
+}
+
+/// What a model is made of.
+enum Content {
+    /// All that its definition says.
+    Mapper(Box<Mapper>),
+    /// What it will be told; so much for now.
+    Experience(Revision),
+}
+
+impl Content {
+    /// How large the model is; `None` if it is searched lazily.
+    fn size(&self) -> Option<ModelSize> {
+        let model = match self {
+            Self::Mapper(mapper) => mapper.model(),
+            Self::Experience(revision) => return Some(revision.size),
+        };
+        (!model.is_lazy()).then(|| ModelSize {
+            n_states: model.graph().n_states() as u64,
+            n_transitions: model.n_transitions() as u64,
+        })
+    }
+
+    fn n_stochastic(&self) -> u64 {
+        match self {
+            Self::Mapper(mapper) => mapper.model().n_stochastic() as u64,
+            Self::Experience(revision) => revision.n_stochastic,
+        }
+    }
+
+    fn n_unsafe(&self) -> u64 {
+        match self {
+            Self::Mapper(mapper) => mapper.model().n_unsafe() as u64,
+            Self::Experience(revision) => revision.n_unsafe,
+        }
+    }
 }
 
 /// Writes the canonical text of a model, and compiles it if there is a compiler.
@@ -316,12 +361,17 @@ fn prepare(
     definition.write(&mut writer).map_err(|error| ServiceError::Write(serde_json::Error::io(error)))?;
     let (hash, text) = writer.finish()?;
     let compile = |compiler: &Compiler| -> Result<Compiled, ServiceError> {
+        if let Some(tally) = Tally::new(&definition) {
+            let attributes = tally.schema().attributes().iter().map(AttributeDocument::from).collect();
+            let actions = tally.actions().iter().map(ActionDocument::from).collect();
+            return Ok(Compiled { content: Content::Experience(revision(&tally)), attributes, actions });
+        }
         let held = compiler.take(definition.compiling_bytes(limits))?;
         let mapper = compiler.compile(definition, held, limits, interrupt)?;
         let model = mapper.model();
         let attributes = model.schema().attributes().iter().map(AttributeDocument::from).collect();
         let actions = model.actions().iter().map(ActionDocument::from).collect();
-        Ok(Compiled { mapper, attributes, actions })
+        Ok(Compiled { content: Content::Mapper(Box::new(mapper)), attributes, actions })
     };
     Ok(Prepared { text, hash, compiled: compiler.map(compile).transpose()? })
 }

@@ -164,12 +164,12 @@ impl Etude {
     async fn refine(&self, refinement: NewRefinement) -> Result<Option<PolicyText>, ServiceError> {
         let NewRefinement { policy_id, model_hash, session_id, request } = refinement;
         let refined: RefinedRequest<'_> = serde_json::from_str(&request).map_err(ServiceError::Write)?;
-        let (hash, mapper) = self.mapper(&refined.model, "/model", None, None).await?;
-        if hash != model_hash {
+        let mapper = self.mapper_with_hash((&refined.model, &model_hash), "/model", None, None).await?;
+        let Some(mapper) = mapper else {
             // Another one is there under its name.
             let name = refined.model.into_owned();
             return Err(ServiceError::Unknown { kind: Kind::Model, name, pointer: None });
-        }
+        };
         let (texts, held) = match (&session_id, refined.demonstration) {
             (Some(session), _) => {
                 let n_observations = self.session(session).await?.n_observations;

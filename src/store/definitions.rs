@@ -1,4 +1,4 @@
-//! The tables of definitions that are too large for a column.
+//! The tables of definitions that are too large for a column, and their removal with what models of experience were told.
 //!
 //! ```text
 //! begin -> piece, piece, ..            each in a transaction of its own: nobody waits for long
@@ -167,9 +167,14 @@ impl Verb for BeginDefinition {
     type Answer = i64;
 
     async fn apply(&self, writing: &mut Writing<'_>) -> Result<i64, StoreError> {
-        let inserted = sqlx::query("INSERT INTO definitions DEFAULT VALUES").execute(&mut *writing.connection).await?;
-        Ok(inserted.last_insert_rowid())
+        begin(writing.connection).await
     }
+}
+
+/// A new id.
+pub(super) async fn begin(connection: &mut SqliteConnection) -> Result<i64, StoreError> {
+    let inserted = sqlx::query("INSERT INTO definitions DEFAULT VALUES").execute(connection).await?;
+    Ok(inserted.last_insert_rowid())
 }
 
 /// Stores a piece of a definition.
@@ -247,7 +252,7 @@ impl Verb for SweepDefinition {
                  (SELECT seq FROM definition_pieces WHERE definition_id = $1 ORDER BY seq DESC LIMIT $2)",
         );
         let removed = removed.bind(id).bind(N_SWEPT_AT_ONCE).execute(&mut *writing.connection).await?;
-        if removed.rows_affected() > 0 {
+        if removed.rows_affected() > 0 || super::batches::remove_some(&mut *writing.connection, id).await? {
             return Ok(Swept::Some);
         }
         sqlx::query("DELETE FROM definitions WHERE id = $1").bind(id).execute(&mut *writing.connection).await?;

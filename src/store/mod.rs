@@ -13,6 +13,7 @@
 
 mod alive;
 mod arrivals;
+mod batches;
 mod database;
 mod definitions;
 mod deletions;
@@ -37,6 +38,7 @@ use std::time::{Duration, Instant};
 
 use crate::clock::Clock;
 use alive::{Down, NoteAlive};
+pub use batches::{AcceptedBatch, NewBatch, Revision, StoredBatch, pack_batch};
 use database::{Database, Locking, Readers};
 use definitions::Sweeper;
 pub use definitions::{NewPieces, PIECE_BYTES};
@@ -45,7 +47,7 @@ pub use error::{StoreError, Unavailable};
 use jiff::Timestamp;
 pub use learners::{Fold, LearnerRecord, NewLearner, RewardRecord, WeightsRecord};
 pub use models::{
-    ModelKey, ModelRecord, ModelRegistration, ModelSize, ModelSummary, NewDefinition, NewModel, Replaces,
+    ModelHead, ModelKey, ModelRecord, ModelRegistration, ModelSize, ModelSummary, NewDefinition, NewModel, Replaces,
     StoredDefinition,
 };
 pub use observations::{NewObservations, NewSteps, Owner, ServiceTime, SessionRefusal};

@@ -1,14 +1,16 @@
 //! The table of models.
 
+mod registration;
+
 use jiff::Timestamp;
 use sqlx::Row;
 use sqlx::SqliteConnection;
 use sqlx::sqlite::SqliteRow;
 
-use super::definitions::{self, NewPieces};
+use super::definitions::NewPieces;
 use super::page::Rows;
-use super::writer::{MAX_LARGE_BYTES, Verb, Writing};
-use super::{Deletion, Page, Store, StoreError, as_integer, corrupt, count, page, timestamp};
+use super::writer::{Verb, Writing};
+use super::{Deletion, Page, Store, StoreError, corrupt, count, page, timestamp};
 use etude_core::attribute::AttributeDocument;
 use etude_core::model::ActionDocument;
 
@@ -17,8 +19,10 @@ use etude_core::model::ActionDocument;
 pub struct ModelSummary {
     /// The name it is registered under.
     pub name: String,
-    /// SHA-256 of its canonical text.
+    /// SHA-256 of its canonical text; of a model of experience, one over that and what it was told.
     pub hash: String,
+    /// SHA-256 of the canonical text of a model of experience.
+    pub definition_hash: Option<String>,
     /// Its attributes, in order.
     pub attributes: Vec<AttributeDocument>,
     /// The actions of the body, in order.
@@ -33,6 +37,14 @@ pub struct ModelSummary {
     pub created_at: Timestamp,
 }
 
+impl ModelSummary {
+    /// SHA-256 of its canonical text.
+    #[must_use]
+    pub fn definition_hash(&self) -> &str {
+        self.definition_hash.as_ref().unwrap_or(&self.hash)
+    }
+}
+
 /// How large a model is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ModelSize {
@@ -45,10 +57,19 @@ pub struct ModelSize {
 /// The key of a compiled model.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct ModelKey {
-    /// SHA-256 of its canonical text.
+    /// As in its summary.
     pub hash: String,
     /// Whether it is searched lazily, which the limit on states has decided when the model was registered.
     pub is_lazy: bool,
+}
+
+/// What there is to know of a model before anything else.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ModelHead {
+    /// Its key.
+    pub key: ModelKey,
+    /// As in [`ModelRecord`].
+    pub experience: Option<i64>,
 }
 
 /// A model to be registered.
@@ -118,6 +139,8 @@ pub struct ModelRecord {
     pub summary: ModelSummary,
     /// Its canonical text.
     pub definition: StoredDefinition,
+    /// What a model of experience was told, by the id under which [`Store::batches`] gives it.
+    pub experience: Option<i64>,
 }
 
 /// The canonical text of a model as it is stored.
@@ -136,7 +159,7 @@ struct DeleteModel(String);
 /// A model that was deleted, or replaced.
 #[derive(Debug)]
 pub(super) struct DeletedModel {
-    /// Of a definition in pieces.
+    /// Of a definition in pieces, or of what it was told.
     definition_id: Option<i64>,
 }
 
@@ -178,11 +201,14 @@ impl Store {
         let query = sqlx::query("SELECT * FROM models WHERE name = $1").bind(name);
         let row = query.fetch_optional(&mut *self.reader().await?).await?;
         let read = |row: SqliteRow| {
-            let definition = match row.try_get("definition_id")? {
-                Some(id) => StoredDefinition::Pieces(id),
-                None => StoredDefinition::Text(row.try_get("definition")?),
+            let (text, id): (String, Option<i64>) = (row.try_get("definition")?, row.try_get("definition_id")?);
+            let definition = match id {
+                Some(id) if text.is_empty() => StoredDefinition::Pieces(id),
+                _ => StoredDefinition::Text(text),
             };
-            Ok(ModelRecord { summary: read_summary(&row)?, definition })
+            let summary = read_summary(&row)?;
+            let experience = id.filter(|_| summary.definition_hash.is_some());
+            Ok(ModelRecord { summary, definition, experience })
         };
         row.map(read).transpose()
     }
@@ -193,10 +219,22 @@ impl Store {
     ///
     /// If the database failed.
     pub async fn model_key(&self, name: &str) -> Result<Option<ModelKey>, StoreError> {
-        let query = sqlx::query("SELECT hash, n_states FROM models WHERE name = $1").bind(name);
-        let row = query.fetch_optional(&mut *self.reader().await?).await?;
+        Ok(self.model_head(name).await?.map(|head| head.key))
+    }
+
+    /// The key of the model called `name`, and by which id [`Self::batches`] gives what it was told.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub async fn model_head(&self, name: &str) -> Result<Option<ModelHead>, StoreError> {
+        let query = sqlx::query("SELECT hash, definition_hash, definition_id, n_states FROM models WHERE name = $1");
+        let row = query.bind(name).fetch_optional(&mut *self.reader().await?).await?;
         let read = |row: SqliteRow| {
-            Ok(ModelKey { hash: row.try_get("hash")?, is_lazy: row.try_get::<i64, _>("n_states")? == UNKNOWN })
+            let is_experience = row.try_get::<Option<String>, _>("definition_hash")?.is_some();
+            let is_lazy = !is_experience && row.try_get::<i64, _>("n_states")? == UNKNOWN;
+            let experience = row.try_get::<Option<i64>, _>("definition_id")?.filter(|_| is_experience);
+            Ok(ModelHead { key: ModelKey { hash: row.try_get("hash")?, is_lazy }, experience })
         };
         row.map(read).transpose()
     }
@@ -238,7 +276,7 @@ impl Store {
         let sizes: Vec<i64> = sizes.fetch_all(&mut *reader).await?;
         let (n_rows, rest) = page::fitting(&sizes, limit);
         let query = sqlx::query(
-            "SELECT name, hash, attributes, actions, n_states, n_transitions, n_stochastic, n_unsafe, created_at_ms
+            "SELECT name, hash, definition_hash, attributes, actions, n_states, n_transitions, n_stochastic, n_unsafe, created_at_ms
              FROM models WHERE name > $1 ORDER BY name LIMIT $2",
         );
         let rows = query.bind(after.unwrap_or_default()).bind(n_rows).fetch(&mut *reader);
@@ -248,45 +286,27 @@ impl Store {
     }
 }
 
-/// Stands for a number of states that is not known. No model has so few.
+/// Stands for a number of states that is not known. No model has so few, but one of which nothing was experienced.
 const UNKNOWN: i64 = 0;
 
 fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
     const TABLE: &str = "models";
     let count = |column| count(row, TABLE, column);
+    let definition_hash: Option<String> = row.try_get("definition_hash")?;
     Ok(ModelSummary {
         name: row.try_get("name")?,
         hash: row.try_get("hash")?,
         attributes: serde_json::from_str(row.try_get("attributes")?).map_err(corrupt(TABLE, "attributes"))?,
         actions: serde_json::from_str(row.try_get("actions")?).map_err(corrupt(TABLE, "actions"))?,
         size: match row.try_get::<i64, _>("n_states")? {
-            UNKNOWN => None,
+            UNKNOWN if definition_hash.is_none() => None,
             _ => Some(ModelSize { n_states: count("n_states")?, n_transitions: count("n_transitions")? }),
         },
         n_stochastic: count("n_stochastic")?,
         n_unsafe: count("n_unsafe")?,
         created_at: timestamp(TABLE, "created_at_ms", row.try_get("created_at_ms")?)?,
+        definition_hash,
     })
-}
-
-impl Verb for NewModel {
-    type Answer = (ModelRegistration, Option<DeletedModel>);
-
-    fn n_bytes(&self) -> usize {
-        match &self.definition {
-            NewDefinition::Text(text) => text.len(),
-            // It may have as many labels, which are stored once more.
-            NewDefinition::Pieces(_) => MAX_LARGE_BYTES,
-        }
-    }
-
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Self::Answer, StoreError> {
-        let registered = register(writing.connection, self).await?;
-        if let ModelRegistration::Created(_) | ModelRegistration::Replaced(_) = registered.0 {
-            note_change(writing).await?;
-        }
-        Ok(registered)
-    }
 }
 
 impl Verb for DeleteModel {
@@ -307,74 +327,9 @@ async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<Option<
 }
 
 /// Counts a registration, replacement or deletion.
-async fn note_change(writing: &mut Writing<'_>) -> Result<(), StoreError> {
+pub(super) async fn note_change(writing: &mut Writing<'_>) -> Result<(), StoreError> {
     let query = "UPDATE service SET models_generation = models_generation + 1 RETURNING models_generation";
     let row = sqlx::query(query).fetch_one(&mut *writing.connection).await?;
     writing.effects.models_generation = Some(count(&row, "service", "models_generation")?);
     Ok(())
-}
-
-async fn register(
-    connection: &mut SqliteConnection,
-    model: &NewModel,
-) -> Result<(ModelRegistration, Option<DeletedModel>), StoreError> {
-    let NewModel { summary, definition, replaces } = model;
-    let mut replaced = None;
-    if *replaces != Replaces::Nothing {
-        let query = sqlx::query_scalar::<_, String>("SELECT hash FROM models WHERE name = $1").bind(&summary.name);
-        match query.fetch_optional(&mut *connection).await? {
-            None => return Ok((ModelRegistration::Conflict { existing_hash: None }, None)),
-            Some(hash) if hash != summary.hash && replaces.admits(&hash) => {
-                replaced = delete(&mut *connection, &summary.name).await?;
-            }
-            Some(_) => {}
-        }
-    }
-    let (text, definition_id) = match definition {
-        NewDefinition::Text(text) => (text.as_str(), None),
-        NewDefinition::Pieces(pieces) => ("", Some(pieces.id)),
-    };
-    let json = |source: serde_json::Error| corrupt("models", "attributes")(source);
-    let inserted = sqlx::query(
-        "INSERT INTO models
-             (name, hash, definition, definition_id, attributes, actions, n_states, n_transitions, n_stochastic, n_unsafe,
-              created_at_ms)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11) ON CONFLICT (name) DO NOTHING",
-    )
-    .bind(&summary.name)
-    .bind(&summary.hash)
-    .bind(text)
-    .bind(definition_id)
-    .bind(serde_json::to_string(&summary.attributes).map_err(json)?)
-    .bind(serde_json::to_string(&summary.actions).map_err(json)?)
-    .bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_states)))
-    .bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_transitions)))
-    .bind(as_integer(summary.n_stochastic))
-    .bind(as_integer(summary.n_unsafe))
-    .bind(summary.created_at.as_millisecond())
-    .execute(&mut *connection)
-    .await?;
-    if inserted.rows_affected() == 1 {
-        if let NewDefinition::Pieces(NewPieces { id, n_pieces, .. }) = definition
-            && !definitions::is_whole(connection, *id, *n_pieces).await?
-        {
-            // Takes the insertion back.
-            return Err(StoreError::Lost);
-        }
-        let summary = summary.clone();
-        let created = if replaced.is_some() { ModelRegistration::Replaced } else { ModelRegistration::Created };
-        return Ok((created(summary), replaced));
-    }
-    let query = sqlx::query(
-        "SELECT name, hash, attributes, actions, n_states, n_transitions, n_stochastic, n_unsafe, created_at_ms
-         FROM models WHERE name = $1",
-    );
-    let query = query.bind(&summary.name);
-    let existing = read_summary(&query.fetch_one(connection).await?)?;
-    let registration = if existing.hash == summary.hash {
-        ModelRegistration::Unchanged(existing)
-    } else {
-        ModelRegistration::Conflict { existing_hash: Some(existing.hash) }
-    };
-    Ok((registration, None))
 }

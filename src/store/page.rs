@@ -192,6 +192,7 @@ mod tests {
             let summary = ModelSummary {
                 name: n.to_string(),
                 hash: String::new(),
+                definition_hash: None,
                 attributes: vec![attribute.clone()],
                 actions: Vec::new(),
                 size: None,

@@ -33,6 +33,15 @@ fn path(template: &str, operation: &Map<String, Value>, ids: &BTreeMap<&str, Str
     })
 }
 
+/// A model that is told the example of an experience.
+fn explored() -> Value {
+    json!({
+        "attributes": [{"name": "x", "kind": "number"}, {"name": "door", "kind": "category"}],
+        "actions": [{"name": "forward"}, {"name": "push"}],
+        "dynamics": {"kind": "experience"},
+    })
+}
+
 #[tokio::test]
 async fn the_example_of_each_operation_works_after_those_before_it() {
     let service = Service::start(&["--learn-every", "1h"]).await;
@@ -44,6 +53,9 @@ async fn the_example_of_each_operation_works_after_those_before_it() {
         if id == "fail_trial" {
             let (_, made) = service.post("/v1/learners/doors/trials", &trial).await;
             ids.insert("trial", made["id"].as_str().unwrap().to_owned());
+        }
+        if id == "add_experience" {
+            assert_eq!(service.put("/v1/models/explored", &explored()).await.0, 201);
         }
         let path = path(&template, &operation, &ids);
         if id == "websocket" {
@@ -199,6 +211,7 @@ async fn a_fault_of_form_is_refused_and_not_valid() {
             examples.insert(id, (method, template, operation.clone()));
         }
     }
+    assert_eq!(service.put("/v1/models/explored", &explored()).await.0, 201);
     let (_, made) = service.post("/v1/learners/doors/trials", body(&examples["make_trial"].2).unwrap().1).await;
     let ids = BTreeMap::from([("trial", made["id"].as_str().unwrap().to_owned())]);
     for (id, pointer, faulty) in [
@@ -223,6 +236,18 @@ async fn a_fault_of_form_is_refused_and_not_valid() {
         ("put_model", "/dynamics", json!({"kind": "wumpus", "width": 4, "height": 4, "arrows": 101})),
         ("put_model", "/dynamics", json!({"kind": "wumpus", "width": 4, "height": 4, "gold": [[1, 2, 3]]})),
         ("put_model", "/dynamics", json!({"kind": "wumpus", "width": 4, "height": 4, "start": {"x": 0}})),
+        ("put_model", "/dynamics", json!({"kind": "experience", "min_count": 0})),
+        ("put_model", "/dynamics", json!({"kind": "experience", "bin": {"x": "wide"}})),
+        ("put_model", "/dynamics", json!({"kind": "experience", "start": 0})),
+        ("put_model", "/dynamics", json!({"kind": "experience", "unsafe": {}})),
+        ("add_experience", "/batch", json!("")),
+        ("add_experience", "/speed", json!(1)),
+        ("add_experience", "/transitions", json!({})),
+        ("add_experience", "/transitions/0/state", json!(1)),
+        ("add_experience", "/transitions/0/action", json!(0)),
+        ("add_experience", "/transitions/0/count", json!(0)),
+        ("add_experience", "/transitions/0/count", json!(1.5)),
+        ("add_experience", "/transitions/0/cost", json!(-0.5)),
         ("make_policy", "/model", json!(7)),
         ("make_policy", "/demonstration", json!({})),
         ("make_policy", "/demonstration/0", json!(3)),

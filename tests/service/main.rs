@@ -18,6 +18,7 @@ mod agreement;
 mod batch;
 mod contract;
 mod deletion;
+mod experience;
 mod filters;
 mod front;
 mod http;

@@ -70,8 +70,9 @@ async fn whoever_leaves_before_a_cold_model_is_ready_leaves_nothing_behind() {
     assert_eq!(etude.pool().n_jobs(), before.1 + 1, "one place for all");
     // One that compiles, and what that waits for.
     assert!(tasks.len() <= before.0 + 2, "{} and {before:?}", tasks.len());
+    let asked = Asked::Exactly(etude.store.model_key("world").await.unwrap().unwrap());
     for _ in 0..10 {
-        others.push(etude.compiler.begin("world", &etude.store.model_key("world").await.unwrap().unwrap(), None));
+        others.push(etude.compiler.begin("world", &asked, None));
     }
     drop(kept);
     let (_, mapper) =
@@ -79,7 +80,7 @@ async fn whoever_leaves_before_a_cold_model_is_ready_leaves_nothing_behind() {
     for other in others {
         let mut other = other.unwrap();
         let ready = tokio::time::timeout(PATIENCE, other.wait_for(Option::is_some)).await.unwrap().unwrap();
-        assert!(matches!(&*ready, Some(Ok(same)) if Arc::ptr_eq(same, &mapper)), "it is compiled once");
+        assert!(matches!(&*ready, Some(Ok((_, same))) if Arc::ptr_eq(same, &mapper)), "it is compiled once");
     }
     assert!(etude.compiler.coming().is_empty());
     etude.close().await;

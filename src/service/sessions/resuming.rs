@@ -89,13 +89,15 @@ impl Etude {
         // Nobody says how long it may take.
         let deadline = caller.arrived.checked_add(time_until_finish(self.time_limits.default_deadline));
         let place = self.pool.admit_when_needed(caller.client).waiting_until(deadline);
-        let (hash, mapper) = self.mapper(&row.model, "/model", Some(&place), deadline).await?;
+        let wanted = (row.model.as_str(), row.model_hash.as_str());
+        let mapper = self.mapper_with_hash(wanted, "/model", Some(&place), deadline).await?;
         drop(place);
         let name = format!("{} with hash {}", row.model, row.model_hash);
         let gone = move || SessionError::from(ServiceError::Unknown { kind: Kind::Model, name, pointer: None });
+        let Some(mapper) = mapper else { return Err(gone()) };
         // Registered anew, the same world may have become too large to be known in full.
         let can_be_followed = row.lookahead.is_some() || !mapper.model().is_lazy();
-        if hash != row.model_hash || !can_be_followed || !row.conditions.fit(mapper.model()) {
+        if !can_be_followed || !row.conditions.fit(mapper.model()) {
             return Err(gone());
         }
         let weights = weights_in_order(&row.weights, mapper.model().schema(), &row.id)?;

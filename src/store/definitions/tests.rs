@@ -51,6 +51,7 @@ fn model(name: &str, pieces: NewPieces) -> NewModel {
     let summary = ModelSummary {
         name: name.to_owned(),
         hash: "hash".to_owned(),
+        definition_hash: None,
         attributes: Vec::new(),
         actions: Vec::new(),
         size: Some(ModelSize { n_states: 1, n_transitions: 0 }),
