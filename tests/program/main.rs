@@ -11,6 +11,7 @@ mod disk;
 mod imports;
 mod inputs;
 mod inspect;
+mod kill_experience;
 mod kill_rewards;
 mod kill_streams;
 mod observe;

@@ -163,6 +163,7 @@ fn every_file_of_the_examples_is_valid_against_the_schema_of_what_it_is() {
             _ if document.is_array() => json!({"type": "array", "items": {"$ref": "#/components/schemas/Observation"}}),
             "request.json" if document["model"] == "figure-6" => body_schema("make_trial"),
             "request.json" => body_schema("make_policy"),
+            _ if document.get("transitions").is_some() => body_schema("add_experience"),
             "policy.json" => json!({"$ref": "#/components/schemas/Policy"}),
             _ => body_schema("put_model"),
         };

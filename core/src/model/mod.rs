@@ -58,7 +58,9 @@ pub use action::{Action, ActionDocument, ActionIdx};
 pub use builder::ModelBuilder;
 pub use compiled::Model;
 pub use definition::{Definition, DefinitionDocument};
-pub use experience::{Batch, Experience, ExperienceCounts, ExperienceDocument, NOTHING_YET, SeenStatesDocument, Tally};
+pub use experience::{
+    Batch, Experience, ExperienceCounts, ExperienceDocument, NOTHING_YET, SeenStateDocument, SeenStatesDocument, Tally,
+};
 pub use graph::{Graph, OwnCost, Transition};
 pub use implicit::{Implicit, Outcome};
 pub use import::{Edits, ImportError, ImportFile, ImportFormat, Spot, import};

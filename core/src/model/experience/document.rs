@@ -30,21 +30,33 @@ pub struct ExperienceDocument {
     /// that was seen is a candidate.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<SeenStatesDocument>,
-    /// States that must never be entered, in any order: the value of each attribute, by name.
+    /// States that must never be entered.
     #[serde(default, rename = "unsafe", skip_serializing_if = "Vec::is_empty")]
-    pub unsafe_states: Vec<BTreeMap<String, Scalar>>,
+    pub unsafe_states: Vec<SeenStateDocument>,
 }
 
-/// A state, or several: the value of each attribute, by name.
+/// A state, or several.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
 #[serde(untagged)]
 #[cfg_attr(feature = "openapi", schema(as = ExperienceStart))]
 pub enum SeenStatesDocument {
-    /// One.
+    /// One: the value of each attribute, by name.
     One(BTreeMap<String, Scalar>),
     /// At least one.
-    Several(Vec<BTreeMap<String, Scalar>>),
+    Several(Vec<SeenStateDocument>),
+}
+
+/// A state.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[cfg_attr(feature = "openapi", derive(utoipa::ToSchema))]
+#[serde(untagged)]
+#[cfg_attr(feature = "openapi", schema(as = ExperienceState))]
+pub enum SeenStateDocument {
+    /// The value of each attribute, by name.
+    ByName(BTreeMap<String, Scalar>),
+    /// In attribute order.
+    InOrder(Vec<Scalar>),
 }
 
 fn once() -> u64 {

@@ -22,7 +22,7 @@ use std::sync::Arc;
 use serde::Serialize;
 
 pub use batch::Batch;
-pub use document::{ExperienceDocument, SeenStatesDocument};
+pub use document::{ExperienceDocument, SeenStateDocument, SeenStatesDocument};
 pub(super) use reading::read;
 pub use tally::{ExperienceCounts, Tally};
 

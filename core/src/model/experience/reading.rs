@@ -1,10 +1,10 @@
 //! Reading the definition of a model of experience.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 
-use super::{Experience, ExperienceDocument, SeenStatesDocument};
-use crate::attribute::{Attribute, Cycle, Kind, Schema, Value};
+use super::{Experience, ExperienceDocument, SeenStateDocument, SeenStatesDocument};
+use crate::attribute::{Attribute, Cycle, Kind, Scalar, Schema, Value};
 use crate::document::{Faults, Object, Path, Place, Quoted, Range, list_known};
 use crate::interrupt::{Interrupted, Meter};
 use crate::model::Limits;
@@ -144,20 +144,22 @@ fn document_of(
     unsafe_states: &[Vec<Value>],
 ) -> ExperienceDocument {
     let attributes = schema.attributes();
-    let written = |state: &Vec<Value>| {
+    let written = |state: &Vec<Value>| -> BTreeMap<String, Scalar> {
         let values = attributes.iter().zip(state);
         values.map(|(attribute, value)| (attribute.name.clone(), attribute.write_value(value))).collect()
     };
+    let by_name =
+        |states: &[Vec<Value>]| states.iter().map(|state| SeenStateDocument::ByName(written(state))).collect();
     let start = match start {
         [] => None,
         [one] => Some(SeenStatesDocument::One(written(one))),
-        several => Some(SeenStatesDocument::Several(several.iter().map(written).collect())),
+        several => Some(SeenStatesDocument::Several(by_name(several))),
     };
     let bins = attributes.iter().zip(bins);
     ExperienceDocument {
         min_count,
         bin: bins.filter_map(|(attribute, width)| Some((attribute.name.clone(), (*width)?))).collect(),
         start,
-        unsafe_states: unsafe_states.iter().map(written).collect(),
+        unsafe_states: by_name(unsafe_states),
     }
 }

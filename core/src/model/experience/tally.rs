@@ -63,8 +63,11 @@ struct SeenOutcome {
     count: u64,
     /// How often its cost was told.
     n_costs: u64,
-    /// The mean of those costs.
+    /// What it cost first, and in all when it was told.
     cost: f64,
+    cost_sum: f64,
+    /// Whether it cost the same each time.
+    is_same: bool,
 }
 
 /// A state and an action that were seen.
@@ -194,14 +197,26 @@ impl Tally {
         let at = *self.known.entry((from, action, to)).or_insert(new) as usize;
         let is_new = at == self.outcomes.len();
         if is_new {
-            self.outcomes.push(SeenOutcome { from, action, to, count: 0, n_costs: 0, cost: 0.0 });
+            self.outcomes.push(SeenOutcome {
+                from,
+                action,
+                to,
+                count: 0,
+                n_costs: 0,
+                cost: 0.0,
+                cost_sum: 0.0,
+                is_same: true,
+            });
         }
         let outcome = &mut self.outcomes[at];
         outcome.count = outcome.count.saturating_add(count);
         if let Some(cost) = cost {
+            if outcome.n_costs == 0 {
+                outcome.cost = cost;
+            }
             outcome.n_costs = outcome.n_costs.saturating_add(count);
-            // What costs the same each time costs that.
-            outcome.cost += (cost - outcome.cost) * ratio(count, outcome.n_costs);
+            outcome.cost_sum += float(count) * cost;
+            outcome.is_same &= outcome.cost.to_bits() == cost.to_bits();
         }
         let pair = self.pairs.entry((from, action)).or_default();
         let before = pair.present(self.experience.min_count);
@@ -299,13 +314,21 @@ impl Pair {
 impl SeenOutcome {
     /// What it costs, if it was told at least once what it did. Where it was not told, it was what the action costs.
     fn mean_cost(&self, action_cost: f64) -> Option<f64> {
-        let told = self.cost + (action_cost - self.cost) * ratio(self.count - self.n_costs, self.count);
-        (self.n_costs > 0).then_some(told)
+        let n_untold = self.count - self.n_costs;
+        match self.n_costs {
+            0 => None,
+            // Sums are rounded; what costs the same each time costs that.
+            _ if self.is_same && n_untold == 0 => Some(self.cost),
+            _ => Some((self.cost_sum + float(n_untold) * action_cost) / float(self.count)),
+        }
     }
 }
 
-/// Counts as far as they are told apart by floats.
-#[expect(clippy::cast_precision_loss, reason = "what is beyond 2^53 is rounded")]
 fn ratio(part: u64, whole: u64) -> f64 {
-    part as f64 / whole as f64
+    float(part) / float(whole)
+}
+
+#[expect(clippy::cast_precision_loss, reason = "what is beyond 2^53 is rounded")]
+fn float(count: u64) -> f64 {
+    count as f64
 }
