@@ -16,8 +16,12 @@ pub(crate) struct Failure {
     pub(crate) detail: String,
 }
 
-/// Most steps that macros take in one evaluation: about a tenth of a millisecond.
-const MAX_STEPS: u32 = 10_000;
+/// Most steps of one evaluation: of macros, and of making and comparing texts and lists. About a tenth of a millisecond.
+const MAX_STEPS: usize = 10_000;
+/// Bytes of texts that are made or looked at in a step.
+const STEP_BYTES: usize = 64;
+/// Items of lists, likewise.
+const STEP_ITEMS: usize = 16;
 
 /// The value of `node` where the variables have these values, by their numbers.
 pub(super) fn evaluate<'a>(node: &'a Node, variables: &'a [Datum<'a>]) -> Result<Datum<'a>, Failure> {
@@ -27,7 +31,7 @@ pub(super) fn evaluate<'a>(node: &'a Node, variables: &'a [Datum<'a>]) -> Result
 struct Evaluation<'a> {
     variables: &'a [Datum<'a>],
     locals: Vec<Datum<'a>>,
-    steps_left: u32,
+    steps_left: usize,
 }
 
 impl<'a> Evaluation<'a> {
@@ -64,6 +68,9 @@ impl<'a> Evaluation<'a> {
             }
             Kind::Binary(operation, operands) => {
                 let (a, b) = (self.value(&operands[0])?, self.value(&operands[1])?);
+                if let (Datum::Text(_) | Datum::List(_), _) | (_, Datum::Text(_) | Datum::List(_)) = (&a, &b) {
+                    self.spend(node, length_of(&a) + length_of(&b))?;
+                }
                 operate(node, *operation, &a, &b)
             }
             Kind::OneOf(operand, known) => match self.value(operand)? {
@@ -71,6 +78,7 @@ impl<'a> Evaluation<'a> {
                 value => Ok(Datum::Bool(known.contains(&value))),
             },
             Kind::List(items) => {
+                self.spend(node, items.len() / STEP_ITEMS)?;
                 let items: Vec<_> = items.iter().map(|item| self.value(item)).collect::<Result<_, _>>()?;
                 Ok(Datum::List(List::Owned(items.into())))
             }
@@ -79,10 +87,19 @@ impl<'a> Evaluation<'a> {
             }
             Kind::Call(function, operands) => {
                 let arguments: Vec<_> = operands.iter().map(|operand| self.value(operand)).collect::<Result<_, _>>()?;
+                self.spend(node, arguments.iter().map(length_of).sum())?;
                 call(node, *function, &arguments)
             }
             Kind::Fold(fold) => self.folded(node, fold),
         }
+    }
+
+    /// Counts steps.
+    #[inline]
+    fn spend(&mut self, node: &Node, n_steps: usize) -> Result<(), Failure> {
+        let left = self.steps_left.checked_sub(n_steps);
+        self.steps_left = left.ok_or_else(|| failure(node, format!("it takes more than {MAX_STEPS} steps")))?;
+        Ok(())
     }
 
     /// `a && b` or `a || b`, of which one that is `decisive` decides, also where the other has no value.
@@ -124,13 +141,7 @@ impl<'a> Evaluation<'a> {
         item: usize,
     ) -> Result<Datum<'a>, Failure> {
         for value in list.iter() {
-            let so_far = if let Datum::List(list) = &self.locals[item + 1] { list.len() } else { 0 };
-            // A list that grows is copied.
-            let n_steps = 1 + u32::try_from(so_far).unwrap_or(u32::MAX) / 16;
-            let Some(left) = self.steps_left.checked_sub(n_steps) else {
-                return Err(failure(node, format!("it takes more than {MAX_STEPS} steps")));
-            };
-            self.steps_left = left;
+            self.spend(node, 1)?;
             self.locals[item] = value.clone();
             if matches!(self.value(&fold.go_on)?, Datum::Bool(false)) {
                 break;
@@ -139,6 +150,16 @@ impl<'a> Evaluation<'a> {
         }
         self.locals[item] = Datum::Null;
         self.value(&fold.result)
+    }
+}
+
+/// In how many steps a text or a list is looked at.
+#[inline]
+fn length_of(datum: &Datum<'_>) -> usize {
+    match datum {
+        Datum::Text(text) => text.len() / STEP_BYTES,
+        Datum::List(list) => list.len() / STEP_ITEMS,
+        _ => 0,
     }
 }
 

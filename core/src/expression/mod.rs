@@ -24,6 +24,7 @@ mod evaluating;
 mod names;
 mod node;
 mod parsing;
+mod told;
 
 pub(crate) use checking::Type;
 pub(crate) use datum::Datum;
@@ -80,7 +81,7 @@ impl Expression {
 
     /// Where in the text the character at the byte `offset` stands, in words.
     pub(crate) fn place(&self, offset: u32) -> String {
-        parsing::place_in(&self.text, offset)
+        told::place_in(&self.text, offset)
     }
 }
 

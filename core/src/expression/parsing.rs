@@ -12,6 +12,7 @@ use super::checking::{Type, called, operated};
 use super::datum::Datum;
 use super::names::{function, known_functions, operation, sign};
 use super::node::{Fold, Kind, Node, Operation};
+use super::told::{place_in, place_of, plainly};
 use crate::document::{Quoted, list_known, normal};
 
 /// Longest text of an expression, in bytes.
@@ -31,6 +32,8 @@ pub(crate) struct Scope {
     /// The number and the type of each variable; `None`: any name is a variable, of any type, and is numbered as it is met.
     variables: Option<HashMap<String, (usize, Type)>>,
     constants: HashMap<String, Datum<'static>>,
+    /// The items of long lists among the constants, by where these are in memory: they are looked up by many expressions.
+    items: HashMap<usize, Arc<HashSet<Datum<'static>>>>,
 }
 
 impl Scope {
@@ -40,12 +43,18 @@ impl Scope {
         constants: HashMap<String, Datum<'static>>,
     ) -> Self {
         let variables = variables.into_iter().enumerate();
-        Self { variables: Some(variables.map(|(n, (name, kind))| (name, (n, kind))).collect()), constants }
+        let variables = Some(variables.map(|(n, (name, kind))| (name, (n, kind))).collect());
+        let long = constants.values().filter_map(|constant| match constant {
+            Datum::List(list) if list.len() >= MANY => Some((list.as_ptr().addr(), items_of(list))),
+            _ => None,
+        });
+        let items = long.collect();
+        Self { variables, constants, items }
     }
 
     /// Any variables, of any type.
     pub(crate) fn open() -> Self {
-        Self { variables: None, constants: HashMap::new() }
+        Self { variables: None, constants: HashMap::new(), items: HashMap::new() }
     }
 
     /// Whether an `int` may stand for a `double`.
@@ -103,41 +112,6 @@ fn read(text: &str, scope: &Scope, names: &mut Vec<String>) -> Result<Expression
     reads.sort_unstable();
     reads.dedup();
     Ok(Expression { text: text.into(), root, result, reads: reads.into() })
-}
-
-/// What the parser says of a mistake, in words of those who write expressions and not grammars.
-fn plainly(message: &str) -> String {
-    let unexpected = |found: &str| match found {
-        "<EOF>" => "the expression ends too early".to_owned(),
-        found => format!("`{found}` is not expected here"),
-    };
-    let after = |before: &str| message.split_once(before).map(|(_, rest)| rest);
-    let quoted = |rest: &str| rest.rsplit_once('\'').map_or_else(|| rest.to_owned(), |(quoted, _)| quoted.to_owned());
-    if let Some(rest) = after("missing '") {
-        return format!("`{}` is missing here", rest.split('\'').next().unwrap_or(rest));
-    }
-    if let Some(rest) = after("recognition error at: '") {
-        return format!("`{}` cannot be read", quoted(rest));
-    }
-    if let Some(rest) = after(" input '") {
-        return unexpected(&quoted(rest.split_once(" expecting").map_or(rest, |(found, _)| found)));
-    }
-    if message.starts_with("Incomplete") {
-        return "a part is missing after this".to_owned();
-    }
-    message.to_owned()
-}
-
-/// Where in `text` the character at the byte `offset` stands, in words.
-pub(super) fn place_in(text: &str, offset: u32) -> String {
-    let before = text.char_indices().take_while(|(at, _)| *at < offset as usize).map(|(_, c)| c);
-    let (line, column) =
-        before.fold((1, 1), |(line, column), c| if c == '\n' { (line + 1, 1) } else { (line, column + 1) });
-    if text.contains('\n') { place_of(line, column) } else { format!("column {column}") }
-}
-
-fn place_of(line: isize, column: isize) -> String {
-    if line > 1 { format!("line {line}, column {column}") } else { format!("column {column}") }
 }
 
 /// Makes nodes of the parser's tree.
@@ -315,8 +289,8 @@ impl Lowering<'_> {
         };
         let node = match (operation, b.0.kind) {
             (Operation::In, Kind::Constant(Datum::List(list))) if list.len() >= MANY => {
-                let known: HashSet<Datum<'static>> = list.iter().cloned().collect();
-                Kind::OneOf(Box::new(a.0), Arc::new(known))
+                let known = self.scope.items.get(&list.as_ptr().addr()).cloned();
+                Kind::OneOf(Box::new(a.0), known.unwrap_or_else(|| items_of(&list)))
             }
             (operation, b_kind) => Kind::Binary(operation, Box::new([a.0, Node { offset: b.0.offset, kind: b_kind }])),
         };
@@ -374,6 +348,11 @@ impl Lowering<'_> {
         let ((step, _), (go_on, _), (result, kind)) = (step?, go_on?, result?);
         Some((Node { offset, kind: Kind::Fold(Box::new(Fold { range: range.0, first, go_on, step, result })) }, kind))
     }
+}
+
+/// The items of a list, to be looked up.
+fn items_of(list: &[Datum<'static>]) -> Arc<HashSet<Datum<'static>>> {
+    Arc::new(list.iter().cloned().collect())
 }
 
 fn constant_node(offset: u32, constant: Datum<'static>) -> (Node, Type) {

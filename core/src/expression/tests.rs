@@ -166,6 +166,26 @@ fn where_types_are_not_declared_numbers_mix_and_null_decides_nothing() {
 }
 
 #[test]
+fn what_grows_without_end_or_is_long_to_look_at_is_given_up() {
+    let long = Datum::text(&"a".repeat(50_000));
+    let ints = Datum::list((0..20_000).map(Datum::Int).collect());
+    let values = [("s", long), ("l", ints)];
+    assert_eq!(open("size(s + s)", &values), "100000");
+    for text in [
+        &format!("size({})", ["s"; 100].join(" + ")),
+        &format!("size({})", ["l"; 100].join(" + ")),
+        &format!("{} > 0", ["size(s)"; 100].join(" + ")),
+        &["s == s"; 100].join(" && "),
+        &["s.contains('b')"; 100].join(" || "),
+        &format!("l.all(x, size([{}]) > 0)", ["x"; 900].join(", ")),
+        &"size(l.map(x, s + s)) > 0".to_owned(),
+    ] {
+        let told = open(text, &values);
+        assert!(told.contains("it takes more than 10000 steps"), "{text}: {told}");
+    }
+}
+
+#[test]
 fn a_place_is_told_by_characters() {
     let scope = Scope::declared([("x".to_owned(), Type::Int)], std::collections::HashMap::new());
     let flaws = |text: &str| read(text, &scope).unwrap_err();

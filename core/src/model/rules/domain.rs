@@ -6,18 +6,24 @@ use crate::attribute::{Attribute, Cycle, Kind, Scalar, Value, ValuesDocument};
 use crate::document::{Faults, Object, Path, Place, Range, list_known, whole};
 use crate::expression::{Datum, Type};
 
-/// Most values of an attribute.
-const MAX_VALUES: usize = 1 << 20;
+/// Most values of all attributes together.
+pub(super) const MAX_VALUES: usize = 1 << 20;
 
 /// The values that states may have of an attribute, in order: as they are compared, and as expressions see them.
 #[derive(Clone, Debug)]
 pub(super) struct Domain {
-    values: Vec<Value>,
-    data: Vec<Datum<'static>>,
+    values: Values,
     kind: Type,
-    lookup: Lookup,
     /// As they are written in JSON; `None`: they are the labels.
     document: Option<ValuesDocument>,
+}
+
+#[derive(Clone, Debug)]
+enum Values {
+    /// Whole numbers, evenly apart, `len` of them. They are not kept: a few bytes of a definition may tell of many.
+    Whole { from: i64, step: i64, len: u32 },
+    /// Others, as they are compared, and as expressions see them.
+    Listed { values: Vec<Value>, data: Vec<Datum<'static>>, lookup: Lookup },
 }
 
 /// How a value is found.
@@ -30,8 +36,13 @@ enum Lookup {
 }
 
 impl Domain {
-    /// Reads the member `values` of an attribute, or takes its labels.
-    pub(super) fn read(attribute: &Attribute, object: &Object<'_, '_>, faults: &mut Faults) -> Option<Self> {
+    /// Reads the member `values` of an attribute, or takes its labels. There may be at most `most`.
+    pub(super) fn read(
+        attribute: &Attribute,
+        object: &Object<'_, '_>,
+        most: usize,
+        faults: &mut Faults,
+    ) -> Option<Self> {
         if let Kind::Cyclic { cycle: Cycle::Labels(labels), .. } = &attribute.kind {
             if let Some(place) = object.optional("values") {
                 faults.note(&place, "the values are the `labels`; leave this out");
@@ -42,22 +53,22 @@ impl Domain {
         }
         let place = object.required("values", faults)?;
         if place.value.is_array() {
-            Self::read_list(attribute, &place, faults)
+            Self::read_list(attribute, &place, most, faults)
         } else {
-            Self::read_even(attribute, &place, faults)
+            Self::read_even(attribute, &place, most, faults)
         }
     }
 
     fn of(values: Vec<(Value, Datum<'static>)>, kind: Type, document: Option<ValuesDocument>) -> Self {
         let (values, data): (Vec<_>, Vec<_>) = values.into_iter().unzip();
         let known = data.iter().cloned().zip(0..).collect();
-        Self { values, data, kind, lookup: Lookup::Known(known), document }
+        Self { values: Values::Listed { values, data, lookup: Lookup::Known(known) }, kind, document }
     }
 
-    fn read_list(attribute: &Attribute, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Self> {
+    fn read_list(attribute: &Attribute, place: &Place<'_, '_>, most: usize, faults: &mut Faults) -> Option<Self> {
         let items = place.array(faults)?;
-        if items.is_empty() || items.len() > MAX_VALUES {
-            return place.mismatch(&format!("1 to {MAX_VALUES} values"), faults);
+        if items.is_empty() || items.len() > most {
+            return place.mismatch(&expected(most), faults);
         }
         let n_before = faults.count();
         let read = |(n, item)| attribute.read_value(&place.item(n, item), faults);
@@ -88,7 +99,7 @@ impl Domain {
         (faults.count() == n_before).then(|| Self::of(values.into_iter().zip(data).collect(), kind, Some(document)))
     }
 
-    fn read_even(attribute: &Attribute, place: &Place<'_, '_>, faults: &mut Faults) -> Option<Self> {
+    fn read_even(attribute: &Attribute, place: &Place<'_, '_>, most: usize, faults: &mut Faults) -> Option<Self> {
         if attribute.kind == Kind::Category {
             return place.mismatch("an array of values", faults);
         }
@@ -107,9 +118,9 @@ impl Domain {
         // Of the steps, each may be off by a rounding error.
         let is_whole = ((to - from) / step - n_steps).abs() <= 1e-9 * n_steps.max(1.0);
         #[expect(clippy::cast_precision_loss, reason = "a small number")]
-        let is_allowed = to >= from && n_steps < MAX_VALUES as f64;
+        let is_allowed = to >= from && n_steps < most as f64;
         if !is_allowed {
-            let detail = format!("expected 1 to {MAX_VALUES} values, found those from {from} to {to} by {step}");
+            let detail = format!("expected {}, found those from {from} to {to} by {step}", expected(most));
             faults.note(place, detail);
             return None;
         }
@@ -119,7 +130,10 @@ impl Domain {
         }
         #[expect(clippy::cast_possible_truncation, clippy::cast_sign_loss, reason = "checked to be small")]
         let n_values = n_steps as u32 + 1;
-        let are_whole = [from, to, step].into_iter().all(|number| whole(number).is_some());
+        let document = Some(ValuesDocument::Range { from, to, step: Some(step) });
+        if let (Some(from), Some(_), Some(step)) = (whole(from), whole(to), whole(step)) {
+            return Some(Self { values: Values::Whole { from, step, len: n_values }, kind: Type::Int, document });
+        }
         let number = |n: u32| match n {
             0 => from,
             _ if n + 1 == n_values => to,
@@ -127,27 +141,44 @@ impl Domain {
             _ => shortest(from + f64::from(n) * step),
         };
         let values: Vec<Value> = (0..n_values).map(|n| Value::Number(number(n) + 0.0)).collect();
-        let data = values.iter().map(|value| datum_of(value, are_whole)).collect();
-        let kind = if are_whole { Type::Int } else { Type::Double };
-        let document = ValuesDocument::Range { from, to, step: Some(step) };
-        Some(Self { values, data, kind, lookup: Lookup::Even { from, step }, document: Some(document) })
+        let data = values.iter().map(|value| datum_of(value, false)).collect();
+        let values = Values::Listed { values, data, lookup: Lookup::Even { from, step } };
+        Some(Self { values, kind: Type::Double, document })
     }
 
     /// The values, as they are compared.
-    pub(super) fn values(&self) -> &[Value] {
-        &self.values
+    pub(super) fn values(&self) -> Vec<Value> {
+        match &self.values {
+            Values::Whole { len, .. } => (0..*len).map(|index| self.value(index)).collect(),
+            Values::Listed { values, .. } => values.clone(),
+        }
+    }
+
+    /// The value at `index`, as it is compared.
+    pub(super) fn value(&self, index: u32) -> Value {
+        match &self.values {
+            #[expect(clippy::cast_precision_loss, reason = "whole numbers between two that are floats of their own")]
+            Values::Whole { from, step, .. } => Value::Number((from + i64::from(index) * step) as f64),
+            Values::Listed { values, .. } => values[index as usize].clone(),
+        }
     }
 
     /// How many there are.
     #[expect(clippy::cast_possible_truncation, reason = "at most MAX_VALUES")]
     pub(super) fn len(&self) -> u32 {
-        self.values.len() as u32
+        match &self.values {
+            Values::Whole { len, .. } => *len,
+            Values::Listed { values, .. } => values.len() as u32,
+        }
     }
 
     /// The value at `index`, as expressions see it.
     #[inline]
     pub(super) fn datum(&self, index: u32) -> Datum<'_> {
-        self.data[index as usize].borrowed()
+        match &self.values {
+            Values::Whole { from, step, .. } => Datum::Int(from + i64::from(index) * step),
+            Values::Listed { data, .. } => data[index as usize].borrowed(),
+        }
     }
 
     /// The type that expressions see.
@@ -161,27 +192,41 @@ impl Domain {
     }
 
     /// Where a value stands, if it is one of them; a number may be off by a rounding error.
+    #[inline]
     pub(super) fn position(&self, datum: &Datum<'_>) -> Option<u32> {
-        match &self.lookup {
-            Lookup::Known(known) => known.get(datum).copied(),
-            Lookup::Even { from, step } => {
-                #[expect(clippy::cast_precision_loss, reason = "what is out of precision is out of the domain")]
-                let number = match datum {
-                    Datum::Int(number) => *number as f64,
-                    Datum::Double(number) => *number,
-                    _ => return None,
-                };
-                let n = ((number - from) / step).round();
-                #[expect(
-                    clippy::cast_possible_truncation,
-                    clippy::cast_sign_loss,
-                    reason = "too large a float is the largest u32"
-                )]
-                let index = (n >= 0.0 && n < f64::from(self.len())).then_some(n as u32)?;
-                let Value::Number(value) = self.values[index as usize] else { return None };
-                ((number - value).abs() <= 1e-6 * step).then_some(index)
+        match (&self.values, datum) {
+            (Values::Whole { from, step, len }, Datum::Int(number)) => {
+                let above = number.checked_sub(*from)?;
+                // Division takes longer than the rest.
+                let index = if *step == 1 { above } else { (above % step == 0).then_some(above / step)? };
+                u32::try_from(index).ok().filter(|index| index < len)
             }
+            #[expect(clippy::cast_precision_loss, reason = "both are floats of their own")]
+            (Values::Whole { from, step, .. }, Datum::Double(number)) => {
+                self.nearest(*number, *from as f64, *step as f64)
+            }
+            (Values::Whole { .. }, _) => None,
+            (Values::Listed { lookup: Lookup::Known(known), .. }, _) => known.get(datum).copied(),
+            (Values::Listed { lookup: Lookup::Even { from, step }, .. }, _) => match datum {
+                #[expect(clippy::cast_precision_loss, reason = "what is out of precision is out of the domain")]
+                Datum::Int(number) => self.nearest(*number as f64, *from, *step),
+                Datum::Double(number) => self.nearest(*number, *from, *step),
+                _ => None,
+            },
         }
+    }
+
+    /// Where the number next to this one stands, of numbers evenly apart, if they are the same but for a rounding error.
+    fn nearest(&self, number: f64, from: f64, step: f64) -> Option<u32> {
+        let n = ((number - from) / step).round();
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "too large a float is the largest u32"
+        )]
+        let index = (n >= 0.0 && n < f64::from(self.len())).then_some(n as u32)?;
+        let Value::Number(value) = self.value(index) else { return None };
+        ((number - value).abs() <= 1e-6 * step).then_some(index)
     }
 
     /// Where the value of an attribute stands, if it is one of them.
@@ -198,17 +243,19 @@ impl Domain {
 
     /// Says that a value is none of them.
     pub(super) fn refusal(&self, datum: &Datum<'_>, name: &str) -> String {
-        let values = match &self.lookup {
-            Lookup::Even { .. } => {
-                let (first, last) = (self.datum(0), self.datum(self.len() - 1));
-                format!("which are {first} to {last}")
-            }
-            Lookup::Known(_) => {
-                format!("which are {}", list_known(self.data.iter().map(ToString::to_string).map(Unquoted)))
-            }
+        let values = if let Values::Listed { data, lookup: Lookup::Known(_), .. } = &self.values {
+            format!("which are {}", list_known(data.iter().map(ToString::to_string).map(Unquoted)))
+        } else {
+            format!("which are {} to {}", self.datum(0), self.datum(self.len() - 1))
         };
         format!("this is {datum}, which is none of the values of {}, {values}", crate::document::Quoted(name))
     }
+}
+
+/// How many values there may be, in words, if there may be at most `most` beside those of attributes before.
+fn expected(most: usize) -> String {
+    let others = if most < MAX_VALUES { format!(" ({MAX_VALUES} of all attributes)") } else { String::new() };
+    format!("1 to {most} values{others}")
 }
 
 /// A text that is not to be quoted again.

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use serde::Serialize;
 
+use super::domain::Domain;
 use super::{Effect, Placed, Rules, RulesDocument, State, Unfit};
 use crate::attribute::{AttributeDocument, Schema, Value};
 use crate::document::Faults;
@@ -22,7 +23,9 @@ impl Dynamics for Rules {
         let n_states = self.domains.iter().fold(1u64, |n, domain| n.saturating_mul(domain.len().into()));
         let n_states = n_states.min(limits.max_states as u64);
         let n_transitions = n_states.saturating_mul(self.actions.len() as u64);
+        let n_values: u64 = self.domains.iter().map(|domain| u64::from(domain.len())).sum();
         let compiled = Model::compiled_bytes(n_states, n_transitions, self.schema.len() as u64);
+        let compiled = compiled.saturating_add(n_values * size_of::<Value>() as u64);
         // Exploring keeps the states themselves, their numbers, and the transitions from each, beside what is compiled.
         let state_bytes = 2 * self.state_bytes() + 4 * size_of::<(State, StateIdx)>();
         compiled.saturating_add(n_states.saturating_mul(state_bytes as u64)).min(limits.max_bytes as u64)
@@ -75,8 +78,7 @@ impl Rules {
             /// Longest text of a state.
             const MAX_CHARS: usize = 300;
             let values = self.schema.attributes().iter().zip(self.domains.iter().zip(state));
-            let values =
-                values.map(|(attribute, (domain, index))| attribute.write_value(&domain.values()[*index as usize]));
+            let values = values.map(|(attribute, (domain, index))| attribute.write_value(&domain.value(*index)));
             let shown = serde_json::to_string(&self.schema.by_attribute(values)).unwrap_or_default();
             let cut: String = shown.chars().take(MAX_CHARS).collect();
             let ellipsis = if cut.len() < shown.len() { ".." } else { "" };
@@ -142,7 +144,7 @@ impl Implicit for Rules {
     type State = State;
 
     fn domains(&self) -> Vec<Vec<Value>> {
-        self.domains.iter().map(|domain| domain.values().to_vec()).collect()
+        self.domains.iter().map(Domain::values).collect()
     }
 
     fn row(&self, state: &State) -> impl Iterator<Item = u32> {

@@ -154,7 +154,7 @@ fn values_and_starts_are_checked() {
         ("/attributes/2/values", "the values are the `labels`"),
         ("/attributes/3/values", "values of one type are needed"),
         ("/attributes/4/values", "is missing"),
-        ("/attributes/5/values", "1 to 1048576 values"),
+        ("/attributes/5/values", "1 to 1048572 values (1048576 of all attributes)"),
         ("/attributes/6/values/1", "stands twice"),
         ("/dynamics/start/0/speed", "unknown attribute"),
         ("/dynamics/start/0/x", "none of the values of \"x\", which are 0 to 3"),

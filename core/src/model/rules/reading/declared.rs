@@ -1,5 +1,6 @@
 //! The attributes of rules, and states of them.
 
+use super::super::domain::MAX_VALUES;
 use super::super::{Domain, State};
 use crate::attribute::{Attribute, Schema};
 use crate::document::{Faults, Path, Place, Quoted, list_known, normal};
@@ -21,13 +22,15 @@ impl ReadAttributes {
     pub(super) fn read(place: &Place<'_, '_>, faults: &mut Faults) -> Option<Self> {
         let attributes = Schema::read_with_values(place, faults)?;
         let items = place.value.as_array()?;
+        let mut most = MAX_VALUES;
         let read = |((n, item), attribute): ((usize, &serde_json::Value), Option<Attribute>)| {
             let name = item.get("name").and_then(serde_json::Value::as_str).map(|name| normal(name).into_owned());
             let item = place.item(n, item);
             let domain = attribute.as_ref().and_then(|attribute| {
                 let object = item.open_object(faults)?;
-                Domain::read(attribute, &object, faults)
+                Domain::read(attribute, &object, most, faults)
             });
+            most -= domain.as_ref().map_or(0, |domain| domain.len() as usize);
             (name, attribute.zip(domain))
         };
         Some(Self { attributes: items.iter().enumerate().zip(attributes).map(read).collect() })

@@ -161,9 +161,10 @@ fn document_of(
         members.map(|(name, value)| (normal(name).into_owned(), text(value))).collect()
     };
     let state = |row: &State| -> BTreeMap<String, Scalar> {
-        let written = attributes.iter().zip(row).map(|((attribute, domain), index)| {
-            (attribute.name.clone(), attribute.write_value(&domain.values()[*index as usize]))
-        });
+        let written = attributes
+            .iter()
+            .zip(row)
+            .map(|((attribute, domain), index)| (attribute.name.clone(), attribute.write_value(&domain.value(*index))));
         written.collect()
     };
     let start = match start {
