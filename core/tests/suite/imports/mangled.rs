@@ -3,7 +3,7 @@
 use super::{edits, file};
 use crate::problems::example_bytes;
 use etude_core::interrupt::Uninterrupted;
-use etude_core::model::{Edits, ImportFormat, Limits, import};
+use etude_core::model::{ImportFormat, Limits, import};
 use proptest::prelude::*;
 
 /// As little as a service might allow.
@@ -83,24 +83,6 @@ fn files_are_read_within_these_limits() {
     for (format, content) in files() {
         assert!(read(format, &content), "{}", format.name());
     }
-}
-
-/// What the fuzz target `import` begins with, and what it has found.
-#[test]
-fn the_corpus_of_the_fuzz_target_is_read_or_refused() {
-    let mut roots = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).ancestors();
-    let corpus = roots.find_map(|root| Some(root.join("fuzz/corpus/import")).filter(|path| path.exists())).unwrap();
-    let mut n_read = [0; ImportFormat::ALL.len()];
-    for entry in std::fs::read_dir(corpus).unwrap() {
-        let bytes = std::fs::read(entry.unwrap().path()).unwrap();
-        let Some((first, content)) = bytes.split_first() else { continue };
-        let number = usize::from(*first) % ImportFormat::ALL.len();
-        let edits = if first & 0x80 == 0 { Edits::default() } else { edits(&[], &["*=1"]) };
-        let content = vec![file("", content)];
-        n_read[number] +=
-            usize::from(import(ImportFormat::ALL[number], content, &edits, LIMITS, &mut Uninterrupted).is_ok());
-    }
-    assert!(n_read[..4].iter().all(|n| *n > 0), "{n_read:?}");
 }
 
 proptest! {
