@@ -19,6 +19,7 @@ use super::heuristic::paper::Paper;
 use super::heuristic::projected::{Projected, TableRoom};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Guide, Heuristic, HeuristicName};
+use super::online::SharedWaysIn;
 use super::search::{Found, Move, astar, layered};
 use super::{Budget, PolicyEnd, Problem, StoppedBy};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
@@ -100,6 +101,7 @@ pub struct Mapper {
     abstractions: Abstractions,
     buffers: BufferPool,
     patience: Patience,
+    ways_in: SharedWaysIn,
     /// See [`Self::keeping`].
     #[expect(dead_code, reason = "it is kept to be dropped")]
     kept: Option<Box<dyn Any + Send + Sync>>,
@@ -124,8 +126,9 @@ impl Mapper {
     pub fn within(model: Model, max_bytes: usize, interrupt: &mut dyn Interrupt) -> Result<Self, Interrupted> {
         let left = max_bytes.saturating_sub(model.size_bytes());
         let projections = Projections::new(&model, left, interrupt)?;
-        let (model, abstractions, buffers) = (Arc::new(model), Abstractions::default(), BufferPool::default());
-        Ok(Self { model, projections, abstractions, buffers, patience: Patience::DEFAULT, kept: None })
+        let (abstractions, buffers, ways_in) = Default::default();
+        let (model, patience) = (Arc::new(model), Patience::DEFAULT);
+        Ok(Self { model, projections, abstractions, buffers, patience, ways_in, kept: None })
     }
 
     /// The same mapper, which keeps `token` for as long as it lives: what its memory is counted by, for whoever counts that.
@@ -142,6 +145,10 @@ impl Mapper {
 
     pub(in crate::mapping) fn shared_model(&self) -> Arc<Model> {
         Arc::clone(&self.model)
+    }
+
+    pub(in crate::mapping) fn shared_ways_in(&self) -> &SharedWaysIn {
+        &self.ways_in
     }
 
     /// Approximate size in memory, in bytes: that of the model, and of what is kept for searches, which grows with these. Of as many

@@ -35,7 +35,7 @@ impl Ahead {
     /// Nothing was observed yet.
     pub(super) fn new(mapper: &Arc<Mapper>, weights: Weights, conditions: &Conditions, keeps_layers: bool) -> Self {
         if keeps_layers {
-            Self::Layers(Box::new(Layers::new(mapper.shared_model(), weights, conditions)))
+            Self::Layers(Box::new(Layers::new(mapper, weights, conditions)))
         } else {
             Self::Windows(Box::new(Windows::new(Arc::clone(mapper), weights, conditions)))
         }

@@ -43,6 +43,7 @@ use committed::Committed;
 pub use committed::{CommittedMove, CommittedStep, Stopped};
 pub(in crate::mapping) use decided::Halt;
 use decided::{Decided, Rest};
+pub(in crate::mapping) use layers::SharedWaysIn;
 pub(crate) use layers::longest_lookahead;
 pub use root::{PassedStates, Root};
 

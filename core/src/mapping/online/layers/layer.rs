@@ -1,376 +1,322 @@
-//! The cheapest ways to every state at one observation, made from those at the observation before.
+//! The cheapest ways to every state at one observation.
 
-use std::collections::BinaryHeap;
-
-use rustc_hash::FxHashMap;
-
-use crate::mapping::conditions::Body;
+use super::ways_in::WaysIn;
 use crate::mapping::distances::ObservedDistances;
-use crate::mapping::open_list::CheapestFirst;
-use crate::mapping::recurrence::Recurrence;
-use crate::mapping::{Conditions, MoveKind};
-use crate::model::{Model, StateIdx};
+use crate::model::StateIdx;
 
-/// Where a way comes from: a state of the layer before (by a skip if it is the same state, else by a match) or of the same
-/// layer (by an extra). The action is the cheapest that leads from there, the first among equals. The highest bit tells
-/// which: memory ends before there are 2^31 states.
+/// How a way comes to a node: the last of its links.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Source(u32);
+pub(super) struct Link(u32);
 
-impl Source {
-    const WITHIN: u32 = 1 << 31;
+impl Link {
     /// Of the root, and of states that no way leads to.
-    pub(super) const NONE: Self = Self(u32::MAX);
+    pub(super) const NONE: Self = Self(0);
+    /// From the same state in the layer before. What comes from [before the starts](Layer::before_starts) has this too.
+    pub(super) const SKIP: Self = Self(1);
 
-    pub(super) fn before(state: StateIdx) -> Self {
-        Self(state)
+    /// From the layer before, by the way into the state that has this number.
+    #[inline]
+    pub(super) fn matched(way: usize) -> Self {
+        #[expect(clippy::cast_possible_truncation, reason = "memory ends before there are 2^30 ways")]
+        let way = way as u32;
+        Self(2 + 2 * way)
     }
 
-    pub(super) fn within(state: StateIdx) -> Self {
-        Self(state | Self::WITHIN)
+    /// From the same layer.
+    #[inline]
+    pub(super) fn extra(way: usize) -> Self {
+        Self(Self::matched(way).0 + 1)
     }
 
+    #[inline]
     pub(super) fn is_within(self) -> bool {
-        self.0 & Self::WITHIN != 0
+        self.way().is_some() && self.0 % 2 == 1
     }
 
-    pub(super) fn state(self) -> StateIdx {
-        self.0 & !Self::WITHIN
+    /// The number of the way into the state, if it is one.
+    #[inline]
+    pub(super) fn way(self) -> Option<usize> {
+        (self.0 as usize / 2).checked_sub(1)
+    }
+
+    /// The state that the node with this state comes from.
+    #[inline]
+    pub(super) fn from(self, ways_in: &WaysIn, state: StateIdx) -> StateIdx {
+        self.way().map_or(state, |way| ways_in.sources(state)[way])
     }
 }
 
 /// A state at an observation, as part of a way.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Node {
-    pub(super) source: Source,
-    /// How many nodes with a survivor have it as their source; [`Self::DEAD`] if no survivor hangs on it.
+    pub(super) link: Link,
+    /// How many nodes with a survivor come from it; [`Self::DEAD`] if no survivor hangs on it.
     pub(super) n_children: u32,
 }
 
 impl Node {
     pub(super) const DEAD: u32 = u32::MAX;
-    const ABSENT: Self = Self { source: Source::NONE, n_children: Self::DEAD };
+    pub(super) const ABSENT: Self = Self { link: Link::NONE, n_children: Self::DEAD };
 
     pub(super) fn is_alive(self) -> bool {
         self.n_children != Self::DEAD
     }
 }
 
-/// How much memory a state takes in a layer that is whole, in bytes.
-pub(super) const NODE_BYTES: usize = size_of::<f64>() + size_of::<Node>();
+/// A number of a node as a layer keeps it: in a byte where all numbers fit, and the greatest is for [`Node::DEAD`].
+pub(super) trait Number: Copy {
+    fn of(number: u32) -> Self;
 
-/// The cheapest ways to every state at one observation.
+    fn get(self) -> u32;
+}
+
+impl Number for u8 {
+    #[inline]
+    fn of(number: u32) -> Self {
+        #[expect(clippy::cast_possible_truncation, reason = "the greatest is the greatest")]
+        let number = number as Self;
+        number
+    }
+
+    #[inline]
+    fn get(self) -> u32 {
+        if self == Self::MAX { u32::MAX } else { u32::from(self) }
+    }
+}
+
+impl Number for u32 {
+    #[inline]
+    fn of(number: u32) -> Self {
+        number
+    }
+
+    #[inline]
+    fn get(self) -> u32 {
+        self
+    }
+}
+
+/// A [`Node`] in few bytes.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Packed<N> {
+    link: N,
+    n_children: N,
+}
+
+impl<N: Number> From<Node> for Packed<N> {
+    #[inline]
+    fn from(Node { link, n_children }: Node) -> Self {
+        Self { link: N::of(link.0), n_children: N::of(n_children) }
+    }
+}
+
+impl<N: Number> Packed<N> {
+    #[inline]
+    pub(super) fn node(self) -> Node {
+        Node { link: Link(self.link.get()), n_children: self.n_children.get() }
+    }
+
+    /// Counts a child of a node that is alive.
+    #[inline]
+    pub(super) fn add_child(&mut self) {
+        self.n_children = N::of(self.n_children.get() + 1);
+    }
+}
+
+/// The nodes of a layer.
+#[derive(Debug)]
+pub(super) enum Nodes {
+    /// Shape `[n_states]`, if no node has so many ways that their numbers do not fit.
+    Narrow(Vec<Packed<u8>>),
+    /// Shape `[n_states]`, else.
+    Wide(Vec<Packed<u32>>),
+    /// Those that are alive, or were when they were gathered; in the order of their states.
+    Few(Vec<(StateIdx, Node)>),
+}
+
+impl Nodes {
+    /// The most ways into a state, or out of one, for which nodes are narrow: twice as many links with numbers, and twice as many children.
+    const MOST_NARROW: usize = 126;
+
+    /// How much memory a state takes at most, in bytes.
+    pub(super) const MOST_BYTES_EACH: usize = size_of::<Packed<u32>>();
+
+    /// None, of `n_states`.
+    pub(super) fn absent(n_states: usize, ways_in: &WaysIn) -> Self {
+        if ways_in.most <= Self::MOST_NARROW {
+            Self::Narrow(vec![Node::ABSENT.into(); n_states])
+        } else {
+            Self::Wide(vec![Node::ABSENT.into(); n_states])
+        }
+    }
+
+    /// How much memory a state takes, in bytes.
+    pub(super) fn bytes_each(most_ways: usize) -> usize {
+        if most_ways <= Self::MOST_NARROW { size_of::<Packed<u8>>() } else { Self::MOST_BYTES_EACH }
+    }
+
+    fn clear(&mut self) {
+        match self {
+            Self::Narrow(nodes) => nodes.fill(Node::ABSENT.into()),
+            Self::Wide(nodes) => nodes.fill(Node::ABSENT.into()),
+            Self::Few(nodes) => nodes.clear(),
+        }
+    }
+
+    #[inline]
+    fn get(&self, state: StateIdx) -> Node {
+        match self {
+            Self::Narrow(nodes) => nodes[state as usize].node(),
+            Self::Wide(nodes) => nodes[state as usize].node(),
+            Self::Few(nodes) => {
+                nodes.binary_search_by_key(&state, |(state, _)| *state).map_or(Node::ABSENT, |at| nodes[at].1)
+            }
+        }
+    }
+
+    /// Changes the node of a state that there is one of.
+    #[inline]
+    pub(super) fn set(&mut self, state: StateIdx, node: Node) {
+        match self {
+            Self::Narrow(nodes) => nodes[state as usize] = node.into(),
+            Self::Wide(nodes) => nodes[state as usize] = node.into(),
+            Self::Few(nodes) => {
+                let at = nodes.binary_search_by_key(&state, |(state, _)| *state);
+                nodes[at.expect("what a survivor hangs on is kept")].1 = node;
+            }
+        }
+    }
+
+    /// Those that are alive, in the order of their states.
+    fn alive(&self) -> Vec<(StateIdx, Node)> {
+        fn among<N: Number>(nodes: &[Packed<N>]) -> Vec<(StateIdx, Node)> {
+            let nodes = (0..).zip(nodes).map(|(state, node)| (state, node.node()));
+            nodes.filter(|(_, node)| node.is_alive()).collect()
+        }
+        match self {
+            Self::Narrow(nodes) => among(nodes),
+            Self::Wide(nodes) => among(nodes),
+            Self::Few(nodes) => nodes.iter().filter(|(_, node)| node.is_alive()).copied().collect(),
+        }
+    }
+
+    pub(super) fn size_bytes(&self) -> usize {
+        match self {
+            Self::Narrow(nodes) => size_of_val(nodes.as_slice()),
+            Self::Wide(nodes) => size_of_val(nodes.as_slice()),
+            Self::Few(nodes) => nodes.capacity() * size_of::<(StateIdx, Node)>(),
+        }
+    }
+}
+
+/// The cheapest ways to every state at one observation: how each comes there.
 #[derive(Debug)]
 pub(super) struct Layer {
     /// Of the states to the observation.
     pub(super) observed: ObservedDistances,
-    /// Costs of the ways; infinite where there is none. Shape `[n_states]`; empty once they were forgotten.
-    pub(super) costs: Vec<f64>,
-    nodes: LayerNodes,
+    pub(super) nodes: Nodes,
     n_alive: usize,
-    /// How many states there may be a way to, if nothing was written of others; else 0.
+    /// How many states there may be a way to; nothing was written of others. Else 0.
     n_reached: usize,
 }
 
+/// An array that a layer has no more use for, kept to be filled again.
 #[derive(Debug)]
-enum LayerNodes {
-    /// Shape `[n_states]`.
-    Dense(Vec<Node>),
-    /// Those that are alive.
-    Sparse(FxHashMap<StateIdx, Node>),
-}
-
-/// Arrays that a layer has no more use for, kept to be filled again.
-#[derive(Debug, Default)]
 pub(super) struct Spare {
-    pub(super) costs: Vec<f64>,
-    pub(super) nodes: Vec<Node>,
-    /// How many states were written of, since all was cleared.
-    pub(super) n_reached: usize,
+    nodes: Nodes,
+    n_reached: usize,
 }
 
 impl Spare {
     /// Approximate size in memory, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
-        self.costs.capacity() * size_of::<f64>() + self.nodes.capacity() * size_of::<Node>()
+        self.nodes.size_bytes()
     }
 
-    /// Arrays that say of states out of reach that no way leads there. As what is within reach only ever shrinks, those
-    /// written of as many states as now are have nothing to be cleared.
-    fn cleared(mut self, n_states: usize, n_reached: usize) -> Self {
-        if self.costs.len() != n_states || self.nodes.len() != n_states || self.n_reached != n_reached {
-            self.costs.clear();
-            self.costs.resize(n_states, f64::INFINITY);
+    /// Nodes of which those out of reach are absent. As what is within reach only ever shrinks, those written of as many states as now are
+    /// have nothing to be cleared.
+    pub(super) fn cleared(mut self, n_reached: usize) -> Nodes {
+        if self.n_reached != n_reached {
             self.nodes.clear();
-            self.nodes.resize(n_states, Node::ABSENT);
         }
-        self
+        self.nodes
     }
 }
 
 impl Layer {
+    /// Of nodes that are alive at `n_reached` states, and absent at the others.
+    pub(super) fn new(observed: ObservedDistances, nodes: Nodes, n_reached: usize) -> Self {
+        Self { observed, nodes, n_alive: n_reached, n_reached }
+    }
+
+    /// What stands before the first observation's layer while the start is not decided: a node 0 from which all starts come, for nothing.
+    pub(super) fn before_starts() -> Self {
+        let root = Node { link: Link::NONE, n_children: 0 };
+        Self { observed: ObservedDistances::default(), nodes: Nodes::Few(vec![(0, root)]), n_alive: 1, n_reached: 0 }
+    }
+
     /// How many nodes survivors hang on.
     pub(super) fn n_alive(&self) -> usize {
         self.n_alive
     }
 
+    #[inline]
     pub(super) fn node(&self, state: StateIdx) -> Node {
-        match &self.nodes {
-            LayerNodes::Dense(nodes) => nodes[state as usize],
-            LayerNodes::Sparse(nodes) => nodes.get(&state).copied().unwrap_or(Node::ABSENT),
-        }
+        self.nodes.get(state)
     }
 
-    /// The node of a state that there is one of.
-    fn node_mut(&mut self, state: StateIdx) -> &mut Node {
-        match &mut self.nodes {
-            LayerNodes::Dense(nodes) => &mut nodes[state as usize],
-            LayerNodes::Sparse(nodes) => nodes.get_mut(&state).expect("what a survivor hangs on is kept"),
-        }
+    /// Makes a node the root: it comes from nowhere.
+    pub(super) fn set_root(&mut self, state: StateIdx) {
+        self.nodes.set(state, Node { link: Link::NONE, ..self.node(state) });
     }
 
-    pub(super) fn set_source(&mut self, state: StateIdx, source: Source) {
-        self.node_mut(state).source = source;
+    /// Counts a child of a node that is alive.
+    pub(super) fn add_child(&mut self, state: StateIdx) {
+        let node = self.node(state);
+        self.nodes.set(state, Node { n_children: node.n_children + 1, ..node });
     }
 
-    /// Counts a child of `state`. Says whether that brought it to life.
-    pub(super) fn add_child(&mut self, state: StateIdx) -> bool {
-        let node = self.node_mut(state);
-        let was_dead = !node.is_alive();
-        node.n_children = if was_dead { 1 } else { node.n_children + 1 };
-        self.n_alive += usize::from(was_dead);
-        was_dead
-    }
-
-    /// Takes off a child of `state`, and gives how many are left.
+    /// Takes off a child of a node, and gives how many are left.
+    #[inline]
     pub(super) fn remove_child(&mut self, state: StateIdx) -> u32 {
-        let node = self.node_mut(state);
-        node.n_children -= 1;
-        node.n_children
+        let node = self.node(state);
+        let n_children = node.n_children - 1;
+        self.nodes.set(state, Node { n_children, ..node });
+        n_children
     }
 
-    /// Lets a node die.
-    pub(super) fn kill(&mut self, state: StateIdx) {
+    /// Lets a node die, and gives what it hung on by.
+    #[inline]
+    pub(super) fn kill(&mut self, state: StateIdx) -> Link {
+        let node = self.node(state);
         self.n_alive -= 1;
-        match &mut self.nodes {
-            LayerNodes::Dense(nodes) => nodes[state as usize].n_children = Node::DEAD,
-            LayerNodes::Sparse(nodes) => drop(nodes.remove(&state)),
-        }
-    }
-
-    /// Lets every node die.
-    pub(super) fn kill_all(&mut self) {
-        self.n_alive = 0;
-        match &mut self.nodes {
-            LayerNodes::Dense(nodes) => nodes.iter_mut().for_each(|node| node.n_children = Node::DEAD),
-            LayerNodes::Sparse(nodes) => nodes.clear(),
-        }
-    }
-
-    /// Lets every node that has a way live: the newest layer's are the survivors. There are none but at `reached`.
-    pub(super) fn revive_all(&mut self, reached: &[StateIdx]) {
-        let LayerNodes::Dense(nodes) = &mut self.nodes else { return };
-        self.n_alive = 0;
-        for state in reached.iter().map(|state| *state as usize) {
-            let is_reached = self.costs[state].is_finite();
-            nodes[state].n_children = if is_reached { 0 } else { Node::DEAD };
-            self.n_alive += usize::from(is_reached);
-        }
-    }
-
-    /// What stands before the first observation's layer while the start is not decided: a node 0 from which all starts come, for nothing.
-    pub(super) fn before_starts(n_states: usize) -> Self {
-        let (mut costs, mut nodes) = (vec![f64::INFINITY; n_states], vec![Node::ABSENT; n_states]);
-        costs[0] = 0.0;
-        nodes[0].n_children = 0;
-        let nodes = LayerNodes::Dense(nodes);
-        Self { observed: ObservedDistances::default(), costs, nodes, n_alive: 1, n_reached: 0 }
+        self.nodes.set(state, Node { n_children: Node::DEAD, ..node });
+        node.link
     }
 
     /// Approximate size in memory, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
-        /// Of a hash table, with the free ones beside it.
-        const ENTRY_BYTES: usize = 16;
-        let n_node_bytes = match &self.nodes {
-            LayerNodes::Dense(nodes) => nodes.len() * size_of::<Node>(),
-            LayerNodes::Sparse(nodes) => nodes.capacity() * ENTRY_BYTES,
-        };
-        size_of::<Self>() + n_node_bytes + self.costs.len() * size_of::<f64>() + self.observed.size_bytes()
+        size_of::<Self>() + self.nodes.size_bytes() + self.observed.size_bytes()
     }
 
-    /// Forgets the costs and the tables of distances, and where few survivors hang on it, all nodes but theirs. Gives what can
-    /// be filled again.
-    pub(super) fn forget(&mut self) -> Spare {
-        self.observed.drop_tables();
-        let nodes = self.thin().unwrap_or_default();
-        Spare { costs: std::mem::take(&mut self.costs), nodes, n_reached: self.n_reached }
-    }
-
-    /// Keeps only nodes that are alive, if that takes less memory. Gives the array that is free then.
-    pub(super) fn thin(&mut self) -> Option<Vec<Node>> {
-        /// A hash table's entry is taken for this many of an array's.
-        const ENTRY: usize = 16;
-        let LayerNodes::Dense(nodes) = &self.nodes else { return None };
-        if self.n_alive * ENTRY > nodes.len() {
+    /// Keeps only nodes that are alive, if that takes much less memory. Gives the array that is free then.
+    pub(super) fn thin(&mut self) -> Option<Spare> {
+        if 2 * self.n_alive * size_of::<(StateIdx, Node)>() > self.nodes.size_bytes() {
             return None;
         }
-        let alive = (0..).zip(nodes.iter().copied()).filter(|(_, node)| node.is_alive()).collect();
-        match std::mem::replace(&mut self.nodes, LayerNodes::Sparse(alive)) {
-            LayerNodes::Dense(nodes) => Some(nodes),
-            LayerNodes::Sparse(_) => None,
+        let alive = Nodes::Few(self.nodes.alive());
+        match std::mem::replace(&mut self.nodes, alive) {
+            Nodes::Few(_) => None,
+            nodes => Some(Spare { nodes, n_reached: self.n_reached }),
         }
     }
 
     /// What can be filled again.
-    pub(super) fn into_spare(self) -> (Spare, ObservedDistances) {
-        let nodes = match self.nodes {
-            LayerNodes::Dense(nodes) => nodes,
-            LayerNodes::Sparse(_) => Vec::new(),
+    pub(super) fn into_spare(self) -> (Option<Spare>, ObservedDistances) {
+        let spare = match self.nodes {
+            Nodes::Few(_) => None,
+            nodes => Some(Spare { nodes, n_reached: self.n_reached }),
         };
-        (Spare { costs: self.costs, nodes, n_reached: self.n_reached }, self.observed)
-    }
-
-    /// The state with the cheapest way, the lowest among equals. `None` if no state has one.
-    pub(super) fn cheapest(&self) -> Option<StateIdx> {
-        self.cheapest_to_end(|_| 0.0)
-    }
-
-    /// The state with the cheapest way where to end in a state costs `end`, the lowest among equals. `None` if no state has one.
-    pub(super) fn cheapest_to_end(&self, end: impl Fn(StateIdx) -> f64) -> Option<StateIdx> {
-        let reached = (0..).zip(&self.costs).filter(|(_, cost)| cost.is_finite());
-        let costs = reached.map(|(state, cost)| (state, cost + end(state)));
-        costs.min_by(|(_, cost), (_, other)| cost.total_cmp(other)).map(|(state, _)| state)
-    }
-}
-
-/// Makes layers.
-#[derive(Debug)]
-pub(super) struct Sweep {
-    pub(super) body: Body,
-    pub(super) recurrence: Recurrence,
-    /// Distances to the observation in hand. Shape `[n_states]`.
-    distances: Vec<f64>,
-    pub(super) open: BinaryHeap<CheapestFirst>,
-}
-
-impl Sweep {
-    pub(super) fn new(model: &Model, conditions: &Conditions) -> Self {
-        let (body, recurrence) = (conditions.body(model), conditions.recurrence());
-        Self { body, recurrence, distances: vec![0.0; model.graph().n_states()], open: BinaryHeap::new() }
-    }
-
-    /// Approximate size in memory, in bytes.
-    pub(super) fn size_bytes(&self) -> usize {
-        self.distances.len() * size_of::<f64>() + self.open.capacity() * size_of::<CheapestFirst>()
-    }
-
-    /// The layer of these states, each with what it costs and where its way comes from: extras lead on from there (Dijkstra's algorithm).
-    /// They lead to none but `reached`.
-    pub(super) fn begin(
-        &mut self,
-        model: &Model,
-        first: impl IntoIterator<Item = (StateIdx, f64, Source)>,
-        reached: &[StateIdx],
-        observed: ObservedDistances,
-        spare: Spare,
-    ) -> Layer {
-        for state in reached {
-            self.distances[*state as usize] = observed.distance(model, *state);
-        }
-        let Spare { mut costs, mut nodes, .. } = spare.cleared(model.graph().n_states(), usize::MAX);
-        for (state, cost, source) in first {
-            costs[state as usize] = cost;
-            nodes[state as usize].source = source;
-            self.open.push(CheapestFirst { cost, id: state });
-        }
-        while let Some(CheapestFirst { cost, id: state }) = self.open.pop() {
-            if cost <= costs[state as usize] {
-                self.extras(model, state, &mut costs, &mut nodes, |_, _| true);
-            }
-        }
-        let mut layer =
-            Layer { observed, costs, nodes: LayerNodes::Dense(nodes), n_alive: 0, n_reached: reached.len() };
-        layer.revive_all(reached);
-        layer
-    }
-
-    /// The layer after one with the costs `before`: skips and matches from there, and extras wherever they lead to a state
-    /// more cheaply. There are no ways but to `reached`.
-    ///
-    /// If an extra pays the whole distance, one from a state is worth a look only where the state costs less than it did in the layer before:
-    /// from there, the same action would have matched.
-    pub(super) fn follow(
-        &mut self,
-        model: &Model,
-        before: &[f64],
-        reached: &[StateIdx],
-        observed: ObservedDistances,
-        spare: Spare,
-    ) -> Layer {
-        let (space, recurrence) = (model.whole(), self.recurrence);
-        let Spare { mut costs, mut nodes, .. } = spare.cleared(before.len(), reached.len());
-        for state in reached {
-            costs[*state as usize] = before[*state as usize];
-            nodes[*state as usize] = Node { source: Source::before(*state), n_children: 0 };
-        }
-        for state in reached {
-            let from = before[*state as usize];
-            for (transition, action_cost) in self.body.ways(&space, *state) {
-                let cost = from + action_cost;
-                let to = transition.to as usize;
-                if cost < costs[to] {
-                    costs[to] = cost;
-                    nodes[to].source = Source::before(*state);
-                }
-            }
-        }
-        for state in reached {
-            let at = *state as usize;
-            self.distances[at] = observed.distance(model, *state);
-            costs[at] = recurrence.arrive(MoveKind::Match, costs[at], self.distances[at]);
-        }
-        let is_lower = |state: StateIdx, cost: f64| !recurrence.pays_alike() || cost < before[state as usize];
-        for state in reached {
-            let cost = costs[*state as usize];
-            if is_lower(*state, cost) {
-                self.open.push(CheapestFirst { cost, id: *state });
-            }
-        }
-        while let Some(CheapestFirst { cost, id: state }) = self.open.pop() {
-            if cost <= costs[state as usize] {
-                self.extras(model, state, &mut costs, &mut nodes, is_lower);
-            }
-        }
-        let n_alive = reached.len();
-        Layer { observed, costs, nodes: LayerNodes::Dense(nodes), n_alive, n_reached: n_alive }
-    }
-
-    /// Takes extras from `state`; what they improve is looked at later if `leads_on`.
-    fn extras(
-        &mut self,
-        model: &Model,
-        state: StateIdx,
-        costs: &mut [f64],
-        nodes: &mut [Node],
-        leads_on: impl Fn(StateIdx, f64) -> bool,
-    ) {
-        let from = costs[state as usize];
-        let space = model.whole();
-        for (transition, action_cost) in self.body.ways(&space, state) {
-            let to = transition.to as usize;
-            let cost = from + action_cost;
-            // A distance is never negative.
-            if cost >= costs[to] {
-                continue;
-            }
-            let cost = self.recurrence.arrive(MoveKind::Extra, cost, self.distances[to]);
-            if cost < costs[to] {
-                costs[to] = cost;
-                nodes[to].source = Source::within(state);
-                if leads_on(transition.to, cost) {
-                    self.open.push(CheapestFirst { cost, id: transition.to });
-                }
-            }
-        }
+        (spare, self.observed)
     }
 }

@@ -2,7 +2,9 @@
 
 use std::num::NonZeroU32;
 
-use super::layer::{NODE_BYTES, Node};
+use super::layer::Nodes;
+use super::sweep::STATE_BYTES;
+use super::ways_in::most_bytes as ways_in_bytes;
 use super::{Layer, Layers};
 use crate::mapping::online::decided::Halt;
 use crate::mapping::open_list::CheapestFirst;
@@ -12,7 +14,7 @@ use crate::model::{Model, StateIdx};
 /// The longest lookahead whose window takes about `max_bytes` with `model` if all of its nodes are alive, as when nothing tells the ways
 /// apart: that has one layer more, and 8 bytes a node. With 1 GB it has at most 134 million nodes. 0 if not even the shortest one fits.
 pub(crate) fn longest_lookahead(model: &Model, max_bytes: usize) -> u32 {
-    let n_layers = max_bytes / size_of::<Node>() / (model.states().len() as usize).max(1);
+    let n_layers = max_bytes / Nodes::MOST_BYTES_EACH / (model.states().len() as usize).max(1);
     u32::try_from(n_layers.saturating_sub(1)).unwrap_or(u32::MAX)
 }
 
@@ -34,7 +36,7 @@ impl Layers {
     /// How much memory the next layer takes, in bytes.
     pub(super) fn next_layer_bytes(&self) -> usize {
         let observed = self.n_terms * size_of::<f64>() + self.weights.as_slice().len() * OBSERVED_BYTES;
-        self.tree.layer_bytes(self.model.graph().n_states()) + observed
+        self.tree.layer_bytes(self.model.graph().n_states(), &self.sweep.ways_in) + observed
     }
 }
 
@@ -51,10 +53,11 @@ pub(in crate::mapping::online) fn most_bytes(
     let n_terms = n_terms(model, |_| true);
     let reach = lookahead.map_or(usize::MAX, |lookahead| lookahead.get() as usize);
     let n_layers = n_observations.min(reach.saturating_add(1));
-    let each = n_states * size_of::<Node>() + size_of::<Layer>() + model.schema().len() * OBSERVED_BYTES;
+    let each = n_states * Nodes::MOST_BYTES_EACH + size_of::<Layer>() + model.schema().len() * OBSERVED_BYTES;
     let once = n_states
-        * (size_of::<f64>() + size_of::<StateIdx>() + OPEN * size_of::<CheapestFirst>() + 3 * NODE_BYTES)
-        + n_terms * size_of::<f64>();
+        * (STATE_BYTES + 2 * size_of::<StateIdx>() + OPEN * size_of::<CheapestFirst>() + 3 * Nodes::MOST_BYTES_EACH)
+        + n_terms * size_of::<f64>()
+        + ways_in_bytes(model);
     n_layers.saturating_mul(each).saturating_add(once)
 }
 

@@ -25,12 +25,19 @@
 //! - extras from a state that costs no less than it did at the observation before, if an extra pays the whole distance: the same action
 //!   would have led from there as a match, to the same state, for no more.
 //!
-//! **Memory.** Older layers keep the observation and the nodes that survivors hang on, at most 8 bytes per state; but no costs, and no
-//! distances: of the few states that steps lead to, these are computed again.
+//! **Time.** A layer is made by one look at each way into each state, in the order in which these lie in memory. Of extras, those are
+//! tried first that the layer before had: where the demonstration goes on as it did, next to nothing is left for a queue. A state on which
+//! no survivor hangs any more is looked at once more, when it dies.
+//!
+//! **Memory.** Older layers keep the observation and the nodes that survivors hang on, each as the number of the way by which it is reached
+//! and that of its children: 2 bytes per state, or 8 where some state has more than 126 ways; but no costs, and no distances: of the few
+//! states that steps lead to, these are computed again.
 
 mod layer;
 mod memory;
+mod sweep;
 mod tree;
+mod ways_in;
 
 use std::sync::Arc;
 
@@ -39,13 +46,15 @@ use crate::attribute::{Value, Weights};
 use crate::interrupt::{Interrupt, Signal};
 use crate::mapping::distances::{EndDistances, ObservedDistances};
 use crate::mapping::problem::Starts;
-use crate::mapping::{Budget, Conditions, MoveKind, PolicyEnd, StoppedBy};
+use crate::mapping::{Budget, Conditions, Mapper, MoveKind, PolicyEnd, StoppedBy};
 use crate::model::{Model, Origin, StateIdx};
-use layer::{Layer, Source, Sweep};
+use layer::{Layer, Link};
 pub(crate) use memory::longest_lookahead;
 pub(super) use memory::most_bytes;
 use memory::n_terms;
+use sweep::Sweep;
 use tree::{NodePlace, Tree};
+pub(in crate::mapping) use ways_in::SharedWaysIn;
 
 /// The ways to every state.
 #[derive(Debug)]
@@ -69,11 +78,12 @@ pub(in crate::mapping) struct Layers {
 
 impl Layers {
     /// Nothing was observed yet.
-    pub(super) fn new(model: Arc<Model>, weights: Weights, conditions: &Conditions) -> Self {
+    pub(super) fn new(mapper: &Mapper, weights: Weights, conditions: &Conditions) -> Self {
+        let model = mapper.shared_model();
         assert!(!model.is_lazy(), "each layer needs all states");
         Self {
             n_terms: n_terms(&model, |position| weights.as_slice()[position] > 0.0),
-            sweep: Sweep::new(&model, conditions),
+            sweep: Sweep::new(mapper.shared_ways_in().of(&model, &conditions.body(&model)), &model, conditions),
             tree: Tree::new(model.states().len()),
             starts: conditions.starts.clone(),
             end_weight: conditions.end_weight,
@@ -106,10 +116,9 @@ impl Layers {
         self.newest.clear();
         self.newest.extend_from_slice(observation);
         if !self.tree.layers.is_empty() {
-            let layer = self.follow(observed, budget, interrupt)?;
-            self.tree.push(layer);
+            self.follow(observed, budget, interrupt)?;
         } else if self.tree.n_before > 0 {
-            self.begin(&[(self.tree.root, self.root_cost)], Source::NONE, observed, budget)?;
+            self.begin(&[(self.tree.root, self.root_cost)], Link::NONE, observed, budget)?;
         } else {
             let starts = Starts::of(model, self.starts.as_deref());
             let arrived = |state: &StateIdx| {
@@ -117,15 +126,15 @@ impl Layers {
                 (*state, self.sweep.recurrence.arrive(MoveKind::Start, 0.0, distance))
             };
             let first: Vec<(StateIdx, f64)> = starts.states().iter().map(arrived).collect();
-            self.tree.add(Layer::before_starts(model.graph().n_states()));
-            self.begin(&first, Source::before(self.tree.root), observed, budget)?;
+            self.tree.add(Layer::before_starts());
+            self.begin(&first, Link::SKIP, observed, budget)?;
         }
         Ok(())
     }
 
     /// The next step, if all survivors share it.
     pub(super) fn shared(&mut self) -> Option<Decided> {
-        let child = self.tree.only_child(&self.model)?;
+        let child = self.tree.only_child(&self.model, &self.sweep.ways_in)?;
         let decided = self.decided(child);
         self.go_on(&decided, child);
         Some(decided)
@@ -133,8 +142,8 @@ impl Layers {
 
     /// The first steps of the cheapest way to the newest observation.
     pub(super) fn decide(&mut self, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Vec<Decided>, Halt> {
-        let cheapest = self.tree.layers.back().and_then(Layer::cheapest);
-        let path = cheapest.map(|survivor| self.tree.path(survivor)).unwrap_or_default();
+        let cheapest = self.sweep.cheapest();
+        let path = cheapest.map(|survivor| self.tree.path(&self.sweep.ways_in, survivor)).unwrap_or_default();
         let mut steps = Vec::new();
         for place in path {
             let decided = self.decided(place);
@@ -153,14 +162,14 @@ impl Layers {
 
     /// The cheapest way to the end.
     pub(super) fn rest(&self) -> Option<Rest> {
-        let newest = self.tree.layers.back()?;
         let (schema, states) = (self.model.schema(), self.model.states());
         let end = (self.end_weight > 0.0)
             .then(|| EndDistances::new(schema, states, &self.newest, &self.weights, self.end_weight));
         let end_cost = |state| end.as_ref().map_or(0.0, |end| end.cost(states.row(state)));
-        let survivor = newest.cheapest_to_end(end_cost)?;
+        let survivor = self.sweep.cheapest_to_end(end_cost)?;
+        let path = self.tree.path(&self.sweep.ways_in, survivor);
         Some(Rest {
-            steps: self.tree.path(survivor).into_iter().map(|place| self.decided(place)).collect(),
+            steps: path.into_iter().map(|place| self.decided(place)).collect(),
             end_cost: end_cost(survivor),
             end: PolicyEnd::at(&self.model, states.row(survivor), &self.newest, &self.weights),
             stopped_by: None,
@@ -192,7 +201,7 @@ impl Layers {
 
     /// The step that leads to a node.
     fn decided(&self, place: NodePlace) -> Decided {
-        let (step, action_cost) = self.tree.step(&self.model, &self.sweep.body, place);
+        let (step, action_cost) = self.tree.step(&self.model, &self.sweep.ways_in, place);
         let observed = &self.tree.layers[place.0].observed;
         Decided { step, action_cost, terms: observed.terms(&self.model, step.state).collect(), row: None }
     }
@@ -218,51 +227,53 @@ impl Layers {
         if let Some(mut first) = observed.next() {
             first.fill_tables(model);
             self.tree.root = root;
-            self.begin(&[(root, self.root_cost)], Source::NONE, first, budget)?;
+            self.begin(&[(root, self.root_cost)], Link::NONE, first, budget)?;
         }
         for mut observed in observed {
             observed.fill_tables(model);
-            let layer = self.follow(observed, budget, interrupt)?;
-            self.tree.push(layer);
+            self.follow(observed, budget, interrupt)?;
         }
         Ok(())
     }
 
-    /// Begins with the layer of these states, which come from `source`, and to which the way costs so much.
+    /// Begins with the layer of these states, which hang on by `link`, and to which the way costs so much.
     fn begin(
         &mut self,
         first: &[(StateIdx, f64)],
-        source: Source,
+        link: Link,
         observed: ObservedDistances,
         budget: Budget,
     ) -> Result<(), Halt> {
         self.spend(budget)?;
-        let spare = self.tree.spare();
-        let first = first.iter().map(|(state, cost)| (*state, *cost, source));
-        let layer = self.sweep.begin(&self.model, first, &self.tree.reached, observed, spare);
-        self.tree.add(layer);
-        self.tree.shrink();
-        self.tree.recount();
+        let Self { model, tree, sweep, .. } = self;
+        let nodes = tree.nodes(model.graph().n_states(), usize::MAX, &sweep.ways_in);
+        let layer = sweep.begin(model, first.iter().copied(), link, &mut tree.reached, observed, nodes);
+        tree.begin(layer, &sweep.ways_in);
         Ok(())
     }
 
-    /// The layer of the observation after the newest.
+    /// Adds the layer of the observation after the newest.
     fn follow(
         &mut self,
         observed: ObservedDistances,
         budget: Budget,
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Layer, Halt> {
+    ) -> Result<(), Halt> {
         match interrupt.poll() {
             Signal::Continue => {}
             Signal::Finish => return Err(Halt::OutOf(StoppedBy::Deadline)),
             Signal::Cancel => return Err(Halt::Cancelled),
         }
-        self.check_memory(self.tree.layer_bytes(self.model.graph().n_states()), budget)?;
+        let n_states = self.model.graph().n_states();
+        self.check_memory(self.tree.layer_bytes(n_states, &self.sweep.ways_in), budget)?;
         self.spend(budget)?;
-        let spare = self.tree.spare();
-        let before = self.tree.layers.back().expect("the first observation's layer begins a tree");
-        Ok(self.sweep.follow(&self.model, &before.costs, &self.tree.reached, observed, spare))
+        let Self { model, tree, sweep, .. } = self;
+        let nodes = tree.nodes(n_states, tree.reached.len(), &sweep.ways_in);
+        let reached = std::mem::take(&mut tree.reached);
+        let layer = sweep.follow(model, tree.newest(), &reached, observed, nodes);
+        tree.reached = reached;
+        tree.push(layer, &mut sweep.childless, &sweep.ways_in);
+        Ok(())
     }
 
     /// Counts a layer that is about to be swept.

@@ -1,27 +1,26 @@
 use proptest::prelude::*;
-use serde_json::json;
+use serde_json::{Value as Json, json};
 
 use std::num::NonZeroU32;
 
 use super::*;
 use crate::interrupt::Uninterrupted;
-use crate::mapping::by_definition::{fitted, prepared};
+use crate::mapping::by_definition::{any_conditions, fitted, least_costs, prepared, problem, with_conditions};
 use crate::mapping::online::ahead::Ahead;
 use crate::mapping::{
     CommittedStep, Demonstration, HeuristicName, Mapper, OnlineMapping, Problem, Settings, Status, Stopped,
 };
 
-/// States on a line, in any order, with any transitions.
-fn mapper(places: &[u32], transitions: &[(usize, usize, usize)]) -> Arc<Mapper> {
+/// States on a line, in any order, with any transitions, of which the cheapest cost so much.
+fn line(places: &[u32], transitions: &[(usize, usize, usize)], least_cost: f64) -> Json {
     let states: Vec<_> = places.iter().map(|x| json!([x])).collect();
-    let actions = [("a", 0.0), ("b", 0.5), ("c", 2.0)];
+    let actions = [("a", least_cost), ("b", 0.5), ("c", 2.0)];
     let transitions = fitted(transitions.to_vec(), places.len());
-    let document = json!({
+    json!({
         "attributes": [{"name": "x", "kind": "number"}],
         "actions": actions.map(|(name, cost)| json!({"name": name, "cost": cost})),
         "dynamics": {"kind": "table", "states": states, "transitions": transitions, "start": 0},
-    });
-    Arc::new(prepared(&document))
+    })
 }
 
 /// Two loops of as many states each. From state 0 either can be entered, and none is left. All attributes tell all states
@@ -99,8 +98,77 @@ fn an_observation_that_would_take_more_memory_than_there_is_is_not_taken_and_wha
     }
 }
 
+#[test]
+fn a_state_to_which_hundreds_of_others_lead_is_one_like_any() {
+    // From everywhere one action leads back to the beginning.
+    let n_states = 300;
+    let on = (0..n_states - 1).map(|n| json!([n, "on", n + 1]));
+    let back = (1..n_states).map(|n| json!([n, "back", 0]));
+    let mapper = Arc::new(prepared(&json!({
+        "attributes": [{"name": "x", "kind": "number"}],
+        "actions": [{"name": "on", "cost": 0.1}, {"name": "back", "cost": 0.7}],
+        "dynamics": {
+            "kind": "table", "states": (0..n_states).map(|n| json!([n])).collect::<Vec<_>>(),
+            "transitions": on.chain(back).collect::<Vec<_>>(), "start": 0,
+        },
+    })));
+    let weights = mapper.model().schema().weights();
+    let mut online = OnlineMapping::new(&mapper, weights.clone(), Conditions::default(), None);
+    let observations: Vec<_> = (0..100).map(|n| vec![Some(Value::Number(f64::from(n * 3 % 70)))]).collect();
+    for observation in &observations {
+        online.observe(observation, None, &mut Uninterrupted).unwrap();
+        assert!(layers(&online).tree.knows_its_size());
+    }
+    let problem =
+        Problem::new(mapper.model(), Demonstration::of(observations).unwrap(), weights, Conditions::default());
+    let whole = mapper.map(&problem, Settings::default(), &mut Uninterrupted).unwrap();
+    let (_, followed) = online.end().unwrap();
+    assert!(whole.moves.iter().any(|step| step.state == 0 && step.kind != MoveKind::Start), "it goes back");
+    assert!(
+        (followed.cost.total - whole.cost.total).abs() < 1e-9,
+        "{} against {}",
+        followed.cost.total,
+        whole.cost.total
+    );
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 500, failure_persistence: None, ..ProptestConfig::default() })]
+
+    #[test]
+    fn without_a_lookahead_every_survivors_way_costs_what_the_definition_says_and_is_there_to_be_followed(
+        places in prop::collection::vec(0..12_u32, 5..16),
+        transitions in prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..50),
+        observed in prop::collection::vec(prop::option::weighted(0.9, 0..12_u32), 1..12),
+        least_cost in prop_oneof![Just(0.0), Just(0.25)],
+        conditions in any_conditions(),
+    ) {
+        let document = line(&places, &transitions, least_cost);
+        let mapper = Arc::new(prepared(&document));
+        let demonstration: Vec<_> = observed.iter().map(|x| json!({"x": x})).collect();
+        let request = with_conditions(json!({"model": "m", "demonstration": demonstration}), &document, &conditions);
+        let problem = problem(mapper.model(), &request);
+        let [from_start, _] = least_costs(&problem);
+        let conditions = problem.conditions.clone();
+        let mut online = OnlineMapping::new(&mapper, problem.weights.clone(), conditions, None);
+        for (observation, costs) in problem.demonstration.iter().zip(from_start) {
+            online.observe(observation, None, &mut Uninterrupted).unwrap();
+            let layers = layers(&online);
+            for (state, cost) in (0..).zip(costs) {
+                let known = layers.sweep.costs[state as usize];
+                prop_assert!(known == cost || (known - cost).abs() <= 1e-9 * (1.0 + cost), "{known}, not {cost}");
+                if cost.is_infinite() {
+                    continue;
+                }
+                let steps = layers.tree.path(&layers.sweep.ways_in, state).into_iter().map(|place| layers.decided(place));
+                let paid = steps.fold(layers.root_cost, |paid, step| {
+                    let distance = step.terms.iter().map(|(_, term)| term).sum();
+                    layers.sweep.recurrence.arrive(step.step.kind, paid + step.action_cost, distance)
+                });
+                prop_assert!((paid - cost).abs() <= 1e-9 * (1.0 + cost), "{paid} is paid, not {cost}");
+            }
+        }
+    }
 
     #[test]
     fn what_is_decided_is_as_cheap_as_any_search_finds_and_so_is_every_survivors_way(
@@ -108,8 +176,9 @@ proptest! {
         transitions in prop::collection::vec((0..25_usize, 0..3_usize, 0..25_usize), 10..70),
         observed in prop::collection::vec(0..12_u32, 5..25),
         lookahead in 1..7_u32,
+        least_cost in prop_oneof![Just(0.0), Just(0.25)],
     ) {
-        let mapper = mapper(&places, &transitions);
+        let mapper = Arc::new(prepared(&line(&places, &transitions, least_cost)));
         let weights = mapper.model().schema().weights();
         let observations: Vec<_> = observed.iter().map(|x| vec![Some(Value::Number(f64::from(*x)))]).collect();
         // What it costs to go on from a node to the observation `to`, by a search of its own.
@@ -152,7 +221,7 @@ proptest! {
                 swept.observe(observation, None, &mut Uninterrupted).unwrap();
             }
             let before = layers(&online).root_cost - layers(&online).tree.layers[0].observed.distance(mapper.model(), root);
-            let newest = |online: &OnlineMapping| layers(online).tree.layers.back().unwrap().costs.clone();
+            let newest = |online: &OnlineMapping| layers(online).sweep.costs.clone();
             for (cost, swept) in newest(&online).into_iter().zip(newest(&swept)) {
                 let is_same = cost == before + swept || (cost - before - swept).abs() <= 1e-9 * (1.0 + cost);
                 prop_assert!(is_same, "{cost}, not {before} + {swept}");

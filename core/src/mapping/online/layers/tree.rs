@@ -2,7 +2,8 @@
 
 use std::collections::VecDeque;
 
-use super::layer::{Layer, NODE_BYTES, Source, Spare};
+use super::layer::{Layer, Link, Nodes, Spare};
+use super::ways_in::WaysIn;
 use crate::mapping::conditions::Body;
 use crate::mapping::distances::ObservedDistances;
 use crate::mapping::{Move, MoveKind};
@@ -57,14 +58,14 @@ impl Tree {
     }
 
     /// How much memory a layer takes that is made now, in bytes, besides its distances.
-    pub(super) fn layer_bytes(&self, n_states: usize) -> usize {
-        let has_spare = self.spare.last().is_some_and(|spare| spare.size_bytes() >= n_states * NODE_BYTES);
-        size_of::<Layer>() + if has_spare { 0 } else { n_states * NODE_BYTES }
+    pub(super) fn layer_bytes(&self, n_states: usize, ways_in: &WaysIn) -> usize {
+        let nodes = if self.spare.is_empty() { n_states * Nodes::bytes_each(ways_in.most) } else { 0 };
+        size_of::<Layer>() + nodes
     }
 
-    /// Arrays to be filled.
-    pub(super) fn spare(&mut self) -> Spare {
-        self.spare.pop().unwrap_or_default()
+    /// Nodes to be filled, of which those out of reach are absent.
+    pub(super) fn nodes(&mut self, n_states: usize, n_reached: usize, ways_in: &WaysIn) -> Nodes {
+        self.spare.pop().map_or_else(|| Nodes::absent(n_states, ways_in), |spare| spare.cleared(n_reached))
     }
 
     /// Drops all layers, and gives the distances to their observations.
@@ -79,24 +80,30 @@ impl Tree {
         observed.collect()
     }
 
-    fn recycle(&mut self, spare: Spare) {
+    fn recycle(&mut self, spare: Option<Spare>) {
         /// A layer comes, another goes; more are used where all are swept anew.
         const MAX_SPARE: usize = 2;
         if self.spare.len() < MAX_SPARE {
-            self.spare.push(spare);
+            self.spare.extend(spare);
         }
     }
 
     /// The source of a node; `None` of the root.
-    pub(super) fn source(&self, place: NodePlace) -> Option<NodePlace> {
-        let (index, state) = place;
-        let source = self.layers[index].node(state).source;
-        if source == Source::NONE {
+    pub(super) fn source(&self, ways_in: &WaysIn, (index, state): NodePlace) -> Option<NodePlace> {
+        let link = self.layers[index].node(state).link;
+        self.place_of(link, ways_in, (index, state))
+    }
+
+    /// Where a node comes from that hangs on by `link`.
+    fn place_of(&self, link: Link, ways_in: &WaysIn, (index, state): NodePlace) -> Option<NodePlace> {
+        if link == Link::NONE {
             None
-        } else if source.is_within() {
-            Some((index, source.state()))
+        } else if link.is_within() {
+            Some((index, link.from(ways_in, state)))
+        } else if self.n_before == 0 && index == 1 {
+            Some((0, self.root))
         } else {
-            Some((index.checked_sub(1)?, source.state()))
+            Some((index.checked_sub(1)?, link.from(ways_in, state)))
         }
     }
 
@@ -104,6 +111,59 @@ impl Tree {
     pub(super) fn add(&mut self, layer: Layer) {
         self.layer_bytes += layer.size_bytes();
         self.layers.push_back(layer);
+    }
+
+    /// The newest layer.
+    pub(super) fn newest(&mut self) -> &mut Layer {
+        self.layers.back_mut().expect("the first observation's layer begins a tree")
+    }
+
+    /// Adds the first layer, whose nodes hang on each other or on what is before the starts.
+    pub(super) fn begin(&mut self, layer: Layer, ways_in: &WaysIn) {
+        self.add(layer);
+        if self.layers.len() > 1 {
+            for state in self.reached.iter().copied() {
+                let source = self.source(ways_in, (1, state));
+                if let Some((0, root)) = source {
+                    self.layers[0].add_child(root);
+                }
+            }
+        }
+    }
+
+    /// Adds a layer, whose nodes hang on those of the layer before or on each other. Of these, the `childless` are what nothing hangs on; with
+    /// them dies what had no other child, and so on up, but not the root.
+    pub(super) fn push(&mut self, layer: Layer, childless: &mut Vec<StateIdx>, ways_in: &WaysIn) {
+        let newest = self.layers.len();
+        self.add(layer);
+        self.lighten(newest - 1, |layer| layer.observed.drop_tables());
+        let mut earlier = Vec::new();
+        for index in (0..newest).rev() {
+            let mut pair = self.layers.range_mut(index.saturating_sub(1)..=index);
+            let Some(layer) = pair.next_back() else { break };
+            let mut before = pair.next();
+            let is_first = self.n_before == 0 && index == 1;
+            while let Some(state) = childless.pop() {
+                if (index, state) == (0, self.root) {
+                    continue;
+                }
+                let link = layer.kill(state);
+                let from = if is_first && !link.is_within() { self.root } else { link.from(ways_in, state) };
+                if link.is_within() {
+                    if layer.remove_child(from) == 0 {
+                        childless.push(from);
+                    }
+                } else if before.as_mut().is_some_and(|before| before.remove_child(from) == 0) {
+                    earlier.push(from);
+                }
+            }
+            let spare = self.lighten(index, Layer::thin);
+            self.recycle(spare);
+            if earlier.is_empty() {
+                break;
+            }
+            std::mem::swap(childless, &mut earlier);
+        }
     }
 
     /// Has the layer at `index` keep less.
@@ -115,85 +175,14 @@ impl Tree {
         freed
     }
 
-    /// Adds a layer, whose nodes hang on those of the layer before or on each other.
-    pub(super) fn push(&mut self, layer: Layer) {
-        self.add(layer);
-        let newest = self.layers.len() - 1;
-        let reached = std::mem::take(&mut self.reached);
-        for state in reached.iter().copied() {
-            self.attach((newest, state));
-        }
-        if newest > 0 {
-            for state in reached.iter().copied() {
-                if self.layers[newest - 1].node(state).n_children == 0 {
-                    self.cut((newest - 1, state), newest - 1);
-                }
-            }
-            let spare = self.lighten(newest - 1, Layer::forget);
-            self.recycle(spare);
-        }
-        self.reached = reached;
-    }
-
-    /// States that no way leads to any more are out of reach for good.
-    pub(super) fn shrink(&mut self) {
-        if let Some(newest) = self.layers.back() {
-            self.reached.retain(|state| newest.costs[*state as usize].is_finite());
-        }
-    }
-
-    /// Counts a node as a child of its source, and so on up if that brings the source to life.
-    fn attach(&mut self, mut place: NodePlace) {
-        while let Some((index, state)) = self.source(place) {
-            if !self.layers[index].add_child(state) {
-                return;
-            }
-            place = (index, state);
-        }
-    }
-
-    /// Lets a childless node die, and so on up, but not the root. The layer at `held` is not thinned.
-    fn cut(&mut self, mut place: NodePlace, held: usize) {
-        while place != (0, self.root) {
-            let source = self.source(place);
-            let (index, state) = place;
-            self.layers[index].kill(state);
-            if index != held {
-                // It is left to the allocator: there is one for the next layer already.
-                drop(self.lighten(index, Layer::thin));
-            }
-            let Some(source) = source else { return };
-            if self.layers[source.0].remove_child(source.1) > 0 {
-                return;
-            }
-            place = source;
-        }
-    }
-
-    /// Finds anew what is alive.
-    pub(super) fn recount(&mut self) {
-        let newest = self.layers.len() - 1;
-        for layer in self.layers.range_mut(..newest) {
-            layer.kill_all();
-        }
-        let reached = std::mem::take(&mut self.reached);
-        self.layers[newest].revive_all(&reached);
-        for state in reached.iter().copied() {
-            if self.layers[newest].node(state).is_alive() {
-                self.attach((newest, state));
-            }
-        }
-        self.reached = reached;
-    }
-
     /// The only child of the root, if the root has just one, and is not in the newest layer itself.
-    pub(super) fn only_child(&self, model: &Model) -> Option<NodePlace> {
+    pub(super) fn only_child(&self, model: &Model, ways_in: &WaysIn) -> Option<NodePlace> {
         let root = self.root;
         if self.layers.len() == 1 || self.layers[0].node(root).n_children != 1 {
             return None;
         }
         let is_child = |(index, state): NodePlace| {
-            self.layers[index].node(state).is_alive() && self.source((index, state)) == Some((0, root))
+            self.layers[index].node(state).is_alive() && self.source(ways_in, (index, state)) == Some((0, root))
         };
         if self.n_before == 0 {
             return self.reached.iter().map(|state| (1, *state)).find(|at| is_child(*at));
@@ -205,7 +194,8 @@ impl Tree {
     /// Makes a node the root. Layers before its own go.
     pub(super) fn advance(&mut self, (index, state): NodePlace) {
         if index == 0 {
-            self.layers[0].kill(self.root);
+            let root = self.root;
+            self.layers[0].kill(root);
         }
         for _ in 0..index {
             if let Some(layer) = self.layers.pop_front() {
@@ -216,16 +206,16 @@ impl Tree {
             }
         }
         self.root = state;
-        self.layers[0].set_source(state, Source::NONE);
+        self.layers[0].set_root(state);
     }
 
     /// The places of the way from the root, without it, to the state `survivor` of the newest layer.
-    pub(super) fn path(&self, survivor: StateIdx) -> Vec<NodePlace> {
+    pub(super) fn path(&self, ways_in: &WaysIn, survivor: StateIdx) -> Vec<NodePlace> {
         let mut path = Vec::new();
         let mut place = (self.layers.len() - 1, survivor);
         while place != (0, self.root) {
             path.push(place);
-            let Some(source) = self.source(place) else { break };
+            let Some(source) = self.source(ways_in, place) else { break };
             place = source;
         }
         path.reverse();
@@ -233,22 +223,21 @@ impl Tree {
     }
 
     /// The step that leads to a node, and what its action costs.
-    pub(super) fn step(&self, model: &Model, body: &Body, place: NodePlace) -> (Move, f64) {
+    pub(super) fn step(&self, model: &Model, ways_in: &WaysIn, place: NodePlace) -> (Move, f64) {
         let (index, state) = place;
-        let source = self.layers[index].node(state).source;
+        let link = self.layers[index].node(state).link;
         #[expect(clippy::cast_possible_truncation, reason = "observations are counted in u32")]
         let n_before = self.n_before + index as u32;
-        let kind = if source.is_within() {
+        let kind = if link.is_within() {
             MoveKind::Extra
         } else if n_before == 1 {
             MoveKind::Start
-        } else if source.state() == state {
+        } else if link == Link::SKIP {
             MoveKind::Skip
         } else {
             MoveKind::Match
         };
-        let acts = matches!(kind, MoveKind::Extra | MoveKind::Match);
-        let way = acts.then(|| cheapest_way(model, body, source.state(), state)).flatten();
+        let way = link.way().and_then(|_| cheapest_way(model, &ways_in.body, link.from(ways_in, state), state));
         let step = Move { kind, action: way.map(|(action, _)| action), observation: n_before - 1, state };
         (step, way.map_or(0.0, |(_, cost)| cost))
     }
