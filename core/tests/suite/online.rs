@@ -9,7 +9,7 @@ use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Signal, Uninterrupted};
 use etude_core::mapping::{
     CommittedMove, CommittedStep, Conditions, Mapper, Mapping, OnlineMapping, Policy, Request, Root, Stamp, Status,
-    StoppedBy,
+    Stopped, StoppedBy,
 };
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -209,6 +209,40 @@ proptest! {
         }
         prop_assert_eq!(resumed.root(), unbroken.root());
         prop_assert_eq!(resumed.end().unwrap(), unbroken.end().unwrap());
+    }
+
+    #[test]
+    fn a_decision_that_was_cancelled_is_made_again_as_if_it_had_never_been(
+        case in case(),
+        lookahead in 1u32..6,
+        patience in prop::collection::vec(0..3_u32, 50),
+    ) {
+        let mapper = case.mapper();
+        let (mut unbroken, mut cancelled) = (case.begun(&mapper, Some(lookahead), true), case.begun(&mapper, Some(lookahead), true));
+        prop_assert!(cancelled.searches());
+        let mut patience = patience.into_iter();
+        for observation in observations(&mapper, &case.request) {
+            let mut steps = cancelled.receive(&observation, None, &mut Uninterrupted).unwrap();
+            loop {
+                let mut left = patience.next().unwrap_or(u32::MAX);
+                let decided = cancelled.decide_next(&mut || match left.checked_sub(1) {
+                    None => Signal::Cancel,
+                    Some(fewer) => {
+                        left = fewer;
+                        Signal::Continue
+                    }
+                });
+                match decided {
+                    Ok(Some(decided)) => steps.extend(decided),
+                    Ok(None) => break,
+                    Err(stopped) => prop_assert_eq!(stopped, Stopped::Cancelled(Cancelled)),
+                }
+            }
+            prop_assert_eq!(steps, unbroken.observe(&observation, None, &mut Uninterrupted).unwrap());
+        }
+        // Where there is little to find, nobody is asked.
+        prop_assert!(matches!(cancelled.find_rest(&mut || Signal::Cancel), Ok(()) | Err(Cancelled)));
+        prop_assert_eq!(cancelled.end().unwrap(), unbroken.end().unwrap());
     }
 }
 

@@ -49,7 +49,7 @@ impl CommittedSteps {
         self
     }
 
-    /// Appends steps, whose memory was taken.
+    /// Appends steps, whose memory is counted.
     pub(super) fn extend(&mut self, steps: Vec<CommittedStep>) {
         self.steps.extend(steps);
     }

@@ -12,6 +12,7 @@ mod error;
 mod kept;
 mod left;
 mod reading;
+mod received;
 mod resuming;
 mod session;
 mod waits;
@@ -30,9 +31,10 @@ pub use error::SessionError;
 pub use kept::ShortStep;
 use kept::Unwritten;
 pub(super) use left::Left;
+pub use received::{Observation, Received};
 pub use resuming::Resumed;
 use session::Source;
-pub use session::{Observation, Received, RewardState, Session};
+pub use session::{RewardState, Session};
 pub(crate) use waits::Waits;
 
 use super::opening::{self, SessionOptions};
@@ -129,6 +131,7 @@ impl Etude {
             n_met: 0,
             waits: Waits::of(lookahead_ms),
             unwritten: Unwritten::default(),
+            is_slow: false,
             watch: Watch::new(&weights),
             weights,
             online,

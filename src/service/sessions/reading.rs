@@ -1,7 +1,7 @@
 //! What was observed in a session, read again from the store.
 
 use super::SessionError;
-use super::session::Observation;
+use super::received::Observation;
 use crate::service::ServiceError;
 use crate::service::requests::STATES;
 use crate::store::{ServiceTime, StoredObservations};

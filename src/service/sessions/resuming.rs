@@ -8,7 +8,8 @@ use super::ending::SessionPolicy;
 use super::kept::{Kept, ShortStep, Unwritten};
 use super::left::RETRY_AFTER;
 use super::reading::{ReadAgain, StoredSession, read_again};
-use super::session::{Observation, Session, Source};
+use super::received::Observation;
+use super::session::{Session, Source};
 use super::waits::Waits;
 use super::{SessionError, unknown};
 use crate::memory::{Held, Memory};
@@ -121,6 +122,7 @@ impl Etude {
             waits: None,
             unwritten: Unwritten::default(),
             watch: Watch::new(&weights),
+            is_slow: false,
             online: None,
             mapper,
             held: self.memory.try_take(0).map_err(ServiceError::from)?,
@@ -148,7 +150,7 @@ impl Etude {
             let again = self.read_session(&session, (first, n_watched), is_done).await?;
             session.watch = again.watch;
             (warnings, times) = (again.warnings, again.times);
-            steps = session.advance(self, again.observations).await?.with(steps);
+            steps = session.advance(self, again.observations.into()).await?.with(steps);
         }
         let policy = match (row.status, session.online.take()) {
             (SessionStatus::Done, Some(online)) => {

@@ -12,6 +12,7 @@ use super::committed::CommittedSteps;
 use super::ending::{Ended, conclude, take_for_end, written_bytes};
 use super::kept::Unwritten;
 use super::left::Leaving;
+use super::received::{Observation, Received};
 use super::waits::Waits;
 use crate::memory::{Held, SMALL_BYTES};
 use crate::service::owners::Ownership;
@@ -25,10 +26,6 @@ use etude_core::interrupt::Interrupt;
 use etude_core::mapping::{
     Conditions, Demonstration, Mapper, OnlineMapping, Options, Perception, Policy, Stamp, Warning, Watch,
 };
-
-/// Work up to this many states and transitions times layers is done where it arrives, which takes less than a millisecond; more
-/// in the pool.
-const MAX_INLINE_WORK: usize = 1 << 14;
 
 /// An open session, and the right to drive it.
 #[derive(Debug)]
@@ -52,6 +49,8 @@ pub struct Session {
     /// How long steps wait, where that is limited.
     pub(super) waits: Option<Waits>,
     pub(super) unwritten: Unwritten,
+    /// Whether its last decisions took longer than what is done where observations arrive.
+    pub(super) is_slow: bool,
     /// `None` once the session has ended.
     pub(super) online: Option<OnlineMapping>,
     /// What was observed and can hardly be meant.
@@ -74,15 +73,6 @@ pub(super) struct Source {
     pub(super) learner: Option<String>,
     pub(super) weights_version: Option<u64>,
     pub(super) trial_id: Option<String>,
-}
-
-/// What became of observations that were received, besides being durable.
-#[derive(Debug)]
-pub enum Received {
-    /// They were mapped at the same time, and commit these steps.
-    Mapped(CommittedSteps),
-    /// They take longer to be mapped: see [`Session::advance`].
-    Waiting(Vec<Observation>),
 }
 
 /// What has become of the reward of a session.
@@ -276,13 +266,7 @@ impl Session {
             service_time: self.waits.as_ref().map(|_| etude.store.service_time(now)),
             steps,
         });
-        let mapping = async {
-            if self.is_inline(observations.len()) {
-                self.advance(etude, observations).await.map(Received::Mapped)
-            } else {
-                Ok(Received::Waiting(observations))
-            }
-        };
+        let mapping = async { self.map_here(etude, observations.into(), 0) };
         // In this order: the disk is at work before the mapping begins.
         let (appended, mapped) = tokio::join!(biased; appending, mapping);
         appended??;
@@ -293,14 +277,6 @@ impl Session {
     /// What there is to warn of since the last time that this was asked; the frame that was received begins with the state `seq`.
     pub fn news(&mut self, seq: u32) -> Vec<Warning> {
         self.watch.news(self.mapper.model(), seq as usize, &STATES)
-    }
-
-    /// Whether so many observations are mapped where they arrive.
-    pub(super) fn is_inline(&self, n_observations: usize) -> bool {
-        let model = self.mapper.model();
-        let graph = model.graph();
-        // Of a world that is searched lazily, nobody knows the size.
-        !model.is_lazy() && is_inline(graph.n_states() + graph.n_transitions(), self.lookahead, n_observations)
     }
 
     /// Ends the demonstration, which must have `seq` observations, and stores its policy.
@@ -320,6 +296,7 @@ impl Session {
         }
         let stored = etude.stored_observations(&self.id, 0, self.n_received, self.mapper.model());
         let (StoredObservations { texts, .. }, texts_held) = stored.await?;
+        let is_inline = self.ends_inline(&etude.clock);
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let (mapper, wanted) = (Arc::clone(&self.mapper), (self.weights.clone(), self.conditions.clone()));
         let (id, n_committed) = (self.id.clone(), self.n_steps);
@@ -351,7 +328,9 @@ impl Session {
             drop(texts_held);
             Ok(concluded)
         };
-        let (mut steps, policy, row, refinement) = etude.pool.run_in_turn(self.client, job).await??;
+        let concluded =
+            if is_inline { etude.pool.run_here(None, job)? } else { etude.pool.run_in_turn(self.client, job).await? };
+        let (mut steps, policy, row, refinement) = concluded?;
         let is_refined = refinement.is_some();
         let end = SessionEnd { session_id: self.id.clone(), owner: self.owner, policy: row.at(now), refinement };
         etude.store.end_session(end).await??;
@@ -365,21 +344,6 @@ impl Session {
     }
 }
 
-/// Whether so many observations are mapped where they arrive, in a model of `size` states and transitions.
-fn is_inline(size: usize, lookahead: Option<NonZeroU32>, n_observations: usize) -> bool {
-    let n_layers = n_observations.saturating_mul(lookahead.map_or(1, |lookahead| lookahead.get() as usize));
-    n_layers.saturating_mul(size) <= MAX_INLINE_WORK
-}
-
-/// An observation as it was read.
-#[derive(Clone, Debug)]
-pub struct Observation {
-    /// Shape `[n_attributes]`; `None` where an attribute was not observed.
-    pub values: Vec<Option<etude_core::attribute::Value>>,
-    /// Its weight; `None`: what the session was opened with.
-    pub weight: Option<f64>,
-}
-
 /// Observed states as they are stored: before each that came with a weight, that number.
 fn stored_states(states: &[serde_json::Value], observations: &[Observation]) -> serde_json::Result<String> {
     if observations.iter().all(|observation| observation.weight.is_none()) {
@@ -390,6 +354,3 @@ fn stored_states(states: &[serde_json::Value], observations: &[Observation]) -> 
     });
     serde_json::to_string(&stored.collect::<Vec<_>>())
 }
-
-#[cfg(test)]
-mod tests;

@@ -104,8 +104,14 @@ impl OnlineMapping {
     /// The same, in about `max_bytes` at most: an observation that would take more is not taken. The search of a window counts, beyond
     /// [`Mapper::WINDOW_BYTES`].
     #[must_use]
-    pub fn within(self, max_bytes: usize) -> Self {
-        self.spending(Budget { max_bytes, ..Budget::DEFAULT })
+    pub fn within(mut self, max_bytes: usize) -> Self {
+        self.limit(max_bytes);
+        self
+    }
+
+    /// From now on, [within](Self::within) `max_bytes`.
+    pub fn limit(&mut self, max_bytes: usize) {
+        self.budget = Budget { max_bytes, ..Budget::DEFAULT };
     }
 
     /// The same, with this budget.
@@ -188,6 +194,50 @@ impl OnlineMapping {
         observation_weight: Option<f64>,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Vec<CommittedStep>, Halt> {
+        let mut steps = self.take_in(observation, observation_weight, interrupt)?;
+        while self.must_decide() {
+            self.commit_cheapest(&mut steps, interrupt)?;
+        }
+        Ok(steps)
+    }
+
+    /// The first half of [`Self::observe`]: takes the next observation, and commits what all ways share. What its lookahead decides is still to
+    /// be [decided](Self::decide_next).
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::observe`]. There are none where ways are [searched for](Self::searches).
+    pub fn receive(
+        &mut self,
+        observation: &[Option<Value>],
+        observation_weight: Option<f64>,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Vec<CommittedStep>, Stopped> {
+        Ok(self.take_in(observation, observation_weight, interrupt)?)
+    }
+
+    /// The other half of [`Self::observe`], one decision at a time: commits the steps of the next one that a lookahead asks for; `None` if there is
+    /// none.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::observe`]; but where ways are [searched for](Self::searches), the mapping is as before, and may be asked again.
+    pub fn decide_next(&mut self, interrupt: &mut dyn Interrupt) -> Result<Option<Vec<CommittedStep>>, Stopped> {
+        self.must_decide().then(|| self.decide(interrupt)).transpose()
+    }
+
+    /// Whether ways are searched for when a decision is due. Then observations cost nothing, and each decision a search.
+    #[must_use]
+    pub fn searches(&self) -> bool {
+        matches!(self.ahead, Ahead::Windows(_))
+    }
+
+    fn take_in(
+        &mut self,
+        observation: &[Option<Value>],
+        observation_weight: Option<f64>,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Vec<CommittedStep>, Halt> {
         let of_conditions = || self.conditions.observation_weight(self.n_observed as usize);
         let observation_weight = observation_weight.unwrap_or_else(of_conditions);
         let budget = self.budget_left();
@@ -196,9 +246,6 @@ impl OnlineMapping {
         self.n_observed += 1;
         let mut steps = Vec::new();
         self.commit_shared(&mut steps);
-        while self.must_decide() {
-            self.commit_cheapest(&mut steps, interrupt)?;
-        }
         Ok(steps)
     }
 
@@ -208,7 +255,7 @@ impl OnlineMapping {
     ///
     /// # Errors
     ///
-    /// As [`Self::observe`].
+    /// As [`Self::decide_next`].
     pub fn decide(&mut self, interrupt: &mut dyn Interrupt) -> Result<Vec<CommittedStep>, Stopped> {
         let mut steps = Vec::new();
         if self.n_passed() < self.n_observed {
@@ -297,9 +344,10 @@ impl OnlineMapping {
 
     /// Commits the cheapest way to the newest observation, up to its first move that advances, and what all ways share that are left.
     fn commit_cheapest(&mut self, steps: &mut Vec<CommittedStep>, interrupt: &mut dyn Interrupt) -> Result<(), Halt> {
-        self.was_forced = true;
         let budget = self.budget_left();
-        for decided in self.ahead.decide(budget, interrupt)? {
+        let decided = self.ahead.decide(budget, interrupt)?;
+        self.was_forced = true;
+        for decided in decided {
             steps.push(self.commit(&decided, false));
         }
         self.commit_shared(steps);
