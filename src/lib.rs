@@ -42,6 +42,9 @@
 //! compact arrays, with all faults), [`etude_core::model::Model::compile`], and `store::definitions` (its canonical text, in pieces if it
 //! is long) before `store::writer` makes it visible.
 //!
+//! What a model of experience is told passes `service::experience` (its turn), [`etude_core::model::Tally`] (counted in memory, by `service::told`), and
+//! `store::writer`, which gives the model its next hash with the batch. It is made a table when somebody searches it.
+//!
 //! What is large takes its memory from [`memory`] before it begins, and whose turn it is to use a thread is told by `service::pool`. A
 //! model that is not at hand is made ready by `service::compiler`, once, however many ask for it.
 //!

@@ -3,6 +3,7 @@
 mod client;
 mod demo;
 mod drawing;
+mod experience;
 mod experiment;
 mod healthcheck;
 mod input;
@@ -16,6 +17,7 @@ mod render;
 mod serve;
 mod side_by_side;
 mod stream;
+mod written;
 
 use std::error::Error;
 use std::io;

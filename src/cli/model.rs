@@ -1,16 +1,18 @@
 //! `etude model`.
 
 use std::fs::File;
-use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
+use std::io::{self, BufRead, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::CliError;
+use super::experience::Experience;
 use super::inspect::Inspect;
-use super::{CliError, note};
+use super::written::write_model;
 use etude_core::interrupt::Uninterrupted;
-use etude_core::model::{Definition, Edits, ImportError, ImportFile, ImportFormat, Limits, Table, import};
+use etude_core::model::{Definition, Edits, ImportError, ImportFile, ImportFormat, Limits, import};
 
 #[derive(Args, Debug)]
 pub(super) struct ModelCommand {
@@ -24,6 +26,8 @@ enum Command {
     ///
     /// Compressed files (gzip, zstd) are read as they are.
     Import(Import),
+    /// Make a model of what a body was seen to do.
+    Experience(Experience),
     /// Tell what a body comes to, what it cannot undo, how far a stream should look ahead, and what of a demonstration it can never meet.
     Inspect(Inspect),
 }
@@ -57,6 +61,7 @@ impl ModelCommand {
     pub(super) fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
         match &self.command {
             Command::Import(import) => import.run(out),
+            Command::Experience(experience) => experience.run(out),
             Command::Inspect(inspect) => inspect.run(out),
         }
     }
@@ -65,23 +70,7 @@ impl ModelCommand {
 impl Import {
     fn run(&self, out: &mut impl Write) -> Result<(), CliError> {
         let definition = self.read(&self.edits()?)?;
-        match &self.out {
-            None => {
-                definition.write(&mut *out)?;
-                writeln!(out)?;
-            }
-            Some(path) => {
-                let written = File::create(path).and_then(|file| {
-                    let mut file = BufWriter::new(file);
-                    definition.write(&mut file)?;
-                    writeln!(file)?;
-                    file.flush()
-                });
-                written.map_err(|source| CliError::Write { path: path.clone(), source })?;
-                note(&format!("{}: {}", path.display(), summary(&definition)));
-            }
-        }
-        Ok(())
+        write_model(&definition, self.out.as_deref(), out)
     }
 
     fn edits(&self) -> Result<Edits, CliError> {
@@ -158,22 +147,6 @@ fn open(path: &Path, bar: &ProgressBar) -> Result<Box<dyn BufRead>, CliError> {
 fn style() -> ProgressStyle {
     let template = "{bar:40} {bytes} of {total_bytes}, {bytes_per_sec}";
     ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
-}
-
-/// What a model has.
-fn summary(definition: &Definition) -> String {
-    let attributes = definition.schema().len();
-    match definition.dynamics::<Table>() {
-        Some(table) => {
-            let (states, transitions) = (table.n_states(), table.n_transitions());
-            let stochastic = match table.n_stochastic() {
-                0 => String::new(),
-                n => format!(", {n} pairs of a state and an action with several outcomes"),
-            };
-            format!("{states} states of {attributes} attributes, {transitions} transitions{stochastic}")
-        }
-        None => format!("states of {attributes} attributes, found as they are searched"),
-    }
 }
 
 fn parse_format(name: &str) -> Result<ImportFormat, String> {

@@ -45,7 +45,7 @@ pub(super) async fn make_report(
     responses(
         (status = 200, description = "The report, without a demonstration", body = Report),
         (status = 404, description = "`unknown-model`", body = Problem, content_type = "application/problem+json"),
-        (status = 422, description = "`invalid`: not a name", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "`invalid`: not a name; or nothing was experienced yet", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "`busy`, `not-ready`, `stopping`: see `Retry-After`", body = Problem, content_type = "application/problem+json"),
     ),
 )]

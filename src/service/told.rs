@@ -342,3 +342,6 @@ pub(super) fn revision(tally: &Tally) -> Revision {
 fn cancelled(_: Interrupted) -> Cancelled {
     Cancelled
 }
+
+#[cfg(test)]
+mod tests;

@@ -219,3 +219,6 @@ pub(super) async fn remove_some(connection: &mut SqliteConnection, experience: i
     let removed = removed.bind(experience).bind(N_AT_ONCE).bind(MAX_BYTES).execute(connection).await?;
     Ok(removed.rows_affected() > 0)
 }
+
+#[cfg(test)]
+mod tests;

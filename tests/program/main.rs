@@ -8,6 +8,7 @@ mod harness;
 mod command_lines;
 mod commands;
 mod disk;
+mod experience;
 mod imports;
 mod inputs;
 mod inspect;

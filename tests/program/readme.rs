@@ -38,7 +38,9 @@ fn examples_of_maps_streams_and_the_demo_print_what_the_readme_says() {
         let Some((before, command)) = commands[0].split_once(RUN) else { continue };
         let command = command.split(" #").next().unwrap().trim();
         if !language.is_empty()
-            || !["map", "stream", "demo", "model import", "model inspect"].iter().any(|name| command.starts_with(name))
+            || !["map", "stream", "demo", "model import", "model inspect", "model experience"]
+                .iter()
+                .any(|name| command.starts_with(name))
         {
             continue;
         }

@@ -300,6 +300,50 @@ async fn a_session_goes_on_with_the_revision_that_it_was_opened_with_also_once_i
 }
 
 #[tokio::test]
+async fn whoever_follows_while_batches_come_gets_one_of_the_revisions() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/m", &explored(1)).await;
+    let (_, first) = service.post(EXPERIENCE, &batch("a", &walk())).await;
+    let mut hashes = vec![first["hash"].clone()];
+    let telling = async {
+        for n in 0..40 {
+            let far = seen((f64::from(n), "far"), "push", (f64::from(n + 1), "far"), None);
+            let (status, told) = service.post(EXPERIENCE, &batch(&n.to_string(), &[far])).await;
+            assert_eq!(status, 200, "{told}");
+            hashes.push(told["hash"].clone());
+        }
+    };
+    let following = async {
+        let mut policies = Vec::new();
+        for _ in 0..40 {
+            policies.push(follow(&service).await);
+        }
+        policies
+    };
+    let ((), policies) = tokio::join!(telling, following);
+    for (status, policy) in policies {
+        assert_eq!(status, 200, "{policy}");
+        assert!(hashes.contains(&policy["model_hash"]), "{policy}");
+        assert_eq!(policy["cost"]["total"], 4.5);
+    }
+    assert_eq!(follow(&service).await.1["model_hash"], *hashes.last().unwrap());
+}
+
+#[tokio::test]
+async fn a_local_policy_is_refined_with_the_revision_that_it_was_made_with() {
+    let service = Service::start(&[]).await;
+    service.put("/v1/models/m", &explored(1)).await;
+    let (_, told) = service.post(EXPERIENCE, &batch("a", &walk())).await;
+    let long = json!({"model": "m", "demonstration": vec![json!({"x": 0}); 20_000], "lookahead": 3});
+    let (_, policy) = service.post("/v1/policies", &long).await;
+    assert_eq!((&policy["status"], &policy["model_hash"]), (&json!("local"), &told["hash"]), "{}", policy["detail"]);
+    let cheap = seen((0.0, "shut"), "push", (0.0, "open"), 0.0);
+    assert_eq!(service.post(EXPERIENCE, &batch("b", &[cheap])).await.0, 200);
+    let refined = service.refined(policy["id"].as_str().unwrap()).await;
+    assert_eq!(refined["model_hash"], told["hash"]);
+}
+
+#[tokio::test]
 async fn a_large_batch_is_read_off_the_way_of_others_and_bounded_by_the_limit_of_bodies() {
     let service = Service::start(&[]).await;
     service.put("/v1/models/m", &explored(1)).await;
