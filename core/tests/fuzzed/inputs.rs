@@ -3,7 +3,7 @@
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Signal, Uninterrupted};
 use etude_core::mapping::{Mapper, Perception};
-use etude_core::model::{Definition, Edits, ImportFile, ImportFormat, Limits, Model, import};
+use etude_core::model::{Definition, Edits, ImportFile, ImportFormat, Limits, Model, Tally, import};
 use serde_json::{Value, json};
 
 /// As little as a service might allow.
@@ -30,6 +30,34 @@ pub(crate) fn read_rules(bytes: &[u8]) -> bool {
         return false;
     }
     compile(&document)
+}
+
+/// A model of experience and what it is told, as JSON: one a line. How many batches are read; `None` if there is no such model.
+pub(crate) fn read_experience(bytes: &[u8]) -> Option<usize> {
+    let mut documents = bytes.split(|byte| *byte == b'\n').map(serde_json::from_slice::<Value>);
+    let definition = Definition::read(&documents.next()?.ok()?, LIMITS, &mut Uninterrupted).ok()?;
+    let mut tally = Tally::new(&definition)?;
+    let read = |tally: &Tally, document: &Value| {
+        let mut faults = Faults::default();
+        let batch = tally.read_batch(&Place::root(document), &mut faults, &mut Uninterrupted).ok()??;
+        tally.check(&batch, LIMITS, &mut faults);
+        faults.is_empty().then_some(batch)
+    };
+    let mut n_read = 0;
+    for document in documents.filter_map(Result::ok) {
+        let Some(batch) = read(&tally, &document) else { continue };
+        let again: Value = serde_json::from_str(&batch.text).expect("it is JSON");
+        assert_eq!(read(&tally, &again).expect("it is a batch").text, batch.text);
+        tally.add(&batch);
+        n_read += 1;
+    }
+    if let Some(table) = tally.definition(&mut Uninterrupted).ok()? {
+        let model = Model::compile(&table, LIMITS, &mut Uninterrupted).expect("a table compiles");
+        let counts = tally.counts();
+        assert_eq!((model.n_transitions(), model.n_stochastic()), (counts.n_transitions, counts.n_stochastic));
+        assert_eq!((model.graph().n_states(), model.n_unsafe()), (counts.n_states, counts.n_unsafe));
+    }
+    Some(n_read)
 }
 
 /// Expressions, one a line: when a rule applies, what it gives three attributes, what it costs, and where the body must not be; and the same

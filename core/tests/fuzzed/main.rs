@@ -6,7 +6,7 @@ mod inputs;
 
 use std::path::Path;
 
-use inputs::{read_expressions, read_import, read_rules};
+use inputs::{read_experience, read_expressions, read_import, read_rules};
 use peak_alloc::PeakAlloc;
 
 /// Counts what is allocated: by the only test here, as all threads are counted together.
@@ -56,6 +56,9 @@ fn every_input_of_the_corpora_is_read_or_refused_within_a_small_multiple_of_its_
     assert!(n_imported.len() >= 4, "{n_imported:?}");
     let mut n_rules = 0;
     replay("rules", |bytes| n_rules += usize::from(read_rules(bytes)));
+    let mut n_batches = 0;
+    replay("experience", |bytes| n_batches += read_experience(bytes).unwrap_or_default());
+    assert!(n_batches >= 4, "{n_batches}");
     let mut n_expressions = [0; 2];
     replay("expressions", |bytes| {
         let (model, perception) = read_expressions(bytes);

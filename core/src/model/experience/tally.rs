@@ -1,8 +1,7 @@
 //! What was experienced, counted.
 
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
-
-use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::values::DistinctStates;
 use super::{Batch, Experience};
@@ -44,9 +43,9 @@ pub struct Tally {
     states: DistinctStates,
     /// Outcomes of states and actions, by first appearance.
     outcomes: Vec<SeenOutcome>,
-    /// Where an outcome stands. States are numbered here: nobody chooses what is hashed.
-    known: FxHashMap<(StateIdx, ActionIdx, StateIdx), u32>,
-    pairs: FxHashMap<(StateIdx, ActionIdx), Pair>,
+    /// Where an outcome stands. Hashed with a seed, as clients choose what follows what.
+    known: HashMap<(StateIdx, ActionIdx, StateIdx), u32>,
+    pairs: HashMap<(StateIdx, ActionIdx), Pair>,
     n_unsafe: usize,
     /// Of the pairs that were seen often enough: their outcomes, and how many of them have several.
     n_transitions: usize,
@@ -98,8 +97,8 @@ impl Tally {
             states: DistinctStates::new(experience.schema.len()),
             experience,
             outcomes: Vec::new(),
-            known: FxHashMap::default(),
-            pairs: FxHashMap::default(),
+            known: HashMap::new(),
+            pairs: HashMap::new(),
             n_unsafe: 0,
             n_transitions: 0,
             n_stochastic: 0,
@@ -137,7 +136,7 @@ impl Tally {
         let numbers = self.numbers_of(batch);
         let n_new = numbers.iter().filter(|number| number.is_none()).count();
         note(self.states.len() as usize + n_new, limits.max_states, "states");
-        let new: FxHashSet<(StateIdx, ActionIdx, StateIdx)> = batch
+        let new: HashSet<(StateIdx, ActionIdx, StateIdx)> = batch
             .transitions
             .iter()
             .map(|seen| (seen.from, seen.action, seen.to))
