@@ -350,7 +350,7 @@ impl Etude {
     ) -> Result<Option<Arc<Mapper>>, ServiceError> {
         let head = self.store.model_head(name).await?.ok_or_else(|| unknown(name, Some(pointer)))?;
         let asked = match head.experience {
-            Some(id) if head.key.hash == hash || self.store.has_revision(id, hash).await? => {
+            Some(id) if self.store.has_revision(id, hash).await? => {
                 Asked::Exactly(ModelKey { hash: hash.to_owned(), ..head.key })
             }
             None if head.key.hash == hash => Asked::Exactly(head.key),

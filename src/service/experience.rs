@@ -98,6 +98,8 @@ async fn add(
 ) -> Result<(ExperienceAnswer, Option<String>), ServiceError> {
     /// Each time, the model was deleted or replaced just then.
     const MAX_TRIES: usize = 3;
+    // Names that are nobody's take no room from others.
+    experiences.head(&adding.model).await?;
     let mut room = experiences.lock(&adding.model).await;
     let mut reading = None;
     memory.reserve(&mut reading, COPIES * adding.n_bytes)?;

@@ -87,23 +87,32 @@ impl Experiences {
         drop(gone);
     }
 
-    /// What the model called `name` was told up to now: from `room`, which is its own, or from the store.
+    /// The hash of the model called `name`, and under which id its batches are stored.
     ///
     /// # Errors
     ///
-    /// [`ServiceError::Unknown`] if there is no such model, [`ServiceError::Faults`] if it is not one of experience; if it cannot be counted now.
-    pub(super) async fn current(&self, name: &str, room: &mut Option<Told>) -> Result<Told, ServiceError> {
+    /// [`ServiceError::Unknown`] if there is no such model, [`ServiceError::Faults`] if it is not one of experience; if the store failed.
+    pub(super) async fn head(&self, name: &str) -> Result<(String, i64), ServiceError> {
         let head = self.store.model_head(name).await?.ok_or_else(|| unknown(name, None))?;
         let Some(experience) = head.experience else {
             let detail = "this model is not made of experience: the kind of its dynamics is another one";
             return Err(Faults::one("", detail).into());
         };
-        let known = room.take().filter(|told| told.experience == experience && told.hash == head.key.hash);
-        if let Some(told) = known {
-            return Ok(told);
+        Ok((head.key.hash, experience))
+    }
+
+    /// What the model called `name` was told up to now: from `room`, which is its own, or from the store.
+    ///
+    /// # Errors
+    ///
+    /// As [`Self::head`]; if it cannot be counted now.
+    pub(super) async fn current(&self, name: &str, room: &mut Option<Told>) -> Result<Told, ServiceError> {
+        let (hash, experience) = self.head(name).await?;
+        let known = room.take().filter(|told| told.experience == experience && told.hash == hash);
+        match known {
+            Some(told) => Ok(told),
+            None => self.count(name, Wanted::Current).await,
         }
-        let record = self.store.model(name).await?.ok_or_else(|| unknown(name, None))?;
-        self.count(record, Wanted::Current).await?.ok_or_else(|| unknown(name, None))
     }
 
     /// The model called `name` as a table, and the hash of that revision; no table if there is no state to start in.
@@ -116,25 +125,22 @@ impl Experiences {
         name: &str,
         wanted: Wanted<'_>,
     ) -> Result<(String, Option<Definition>), ServiceError> {
-        let mut room = self.lock(name).await;
-        let current = self.current(name, &mut room).await?;
-        match wanted {
-            Wanted::Revision(hash) if hash != current.hash => {
-                // Nobody has to wait for what is not kept.
-                *room = Some(current);
-                drop(room);
-                let record = self.store.model(name).await?.ok_or_else(|| unknown(name, None))?;
-                let told = self.count(record, wanted).await?.ok_or_else(|| unknown(name, None))?;
-                let (table, told) = self.table_of(told).await?;
-                Ok((told.hash, table))
-            }
-            Wanted::Current | Wanted::Revision(_) => {
+        let (hash, _) = self.head(name).await?;
+        let is_it = |hash: &str| wanted == Wanted::Current || wanted == Wanted::Revision(hash);
+        if is_it(&hash) {
+            let mut room = self.lock(name).await;
+            let current = self.current(name, &mut room).await?;
+            if is_it(&current.hash) {
                 let (table, current) = self.table_of(current).await?;
                 let hash = current.hash.clone();
                 *room = Some(current);
-                Ok((hash, table))
+                return Ok((hash, table));
             }
+            *room = Some(current);
         }
+        // An earlier revision is not kept, and nobody has to wait for it.
+        let (table, told) = self.table_of(self.count(name, wanted).await?).await?;
+        Ok((told.hash, table))
     }
 
     async fn table_of(&self, told: Told) -> Result<(Option<Definition>, Told), ServiceError> {
@@ -155,17 +161,22 @@ impl Experiences {
         })
     }
 
-    /// Counts what was told to a model; `None` if it is not one of experience, or never had this revision.
-    async fn count(&self, record: ModelRecord, wanted: Wanted<'_>) -> Result<Option<Told>, ServiceError> {
-        let ModelRecord { summary, definition, experience } = record;
-        let Some(experience) = experience else { return Ok(None) };
+    /// Counts what was told to the model called `name`.
+    ///
+    /// # Errors
+    ///
+    /// [`ServiceError::Unknown`] if there is none, or it never had this revision; if it cannot be counted now.
+    async fn count(&self, name: &str, wanted: Wanted<'_>) -> Result<Told, ServiceError> {
+        let gone = || unknown(name, None);
+        let ModelRecord { summary, definition, experience } = self.store.model(name).await?.ok_or_else(gone)?;
+        let experience = experience.ok_or_else(gone)?;
         let definition_hash = summary.definition_hash().to_owned();
         let wanted = match wanted {
             Wanted::Current => summary.hash.clone(),
             Wanted::Revision(hash) => hash.to_owned(),
         };
-        if wanted != summary.hash && wanted != definition_hash && !self.store.has_revision(experience, &wanted).await? {
-            return Ok(None);
+        if wanted != summary.hash && !self.store.has_revision(experience, &wanted).await? {
+            return Err(gone());
         }
         let mut held = self.memory.try_take(0)?;
         let text = match definition {
@@ -179,9 +190,8 @@ impl Experiences {
                 text
             }
         };
-        let name = summary.name;
-        check_hash(&name, &hash_of(&text), &definition_hash)?;
-        let corrupt = |error: String| corrupt_definition(&name, error.into());
+        check_hash(name, &hash_of(&text), &definition_hash)?;
+        let corrupt = |error: String| corrupt_definition(name, error.into());
         let read = move |interrupt: &mut dyn Interrupt| {
             let definition = Definition::parse(&text, Format::Json, Limits::NONE, interrupt);
             Ok(definition.map(|definition| Tally::new(&definition)))
@@ -193,13 +203,13 @@ impl Experiences {
             let batches = self.store.batches(experience, told.n_batches).await?;
             if batches.is_empty() {
                 // It was deleted meanwhile.
-                return Ok(None);
+                return Err(gone());
             }
             let (this, wanted) = (self.clone(), wanted.clone());
             let fold = move |interrupt: &mut dyn Interrupt| this.fold(told, &batches, &wanted, interrupt);
             told = self.pool.run_in_turn(Client::LOCAL, fold).await??;
         }
-        Ok(Some(told))
+        Ok(told)
     }
 
     /// Counts stored batches, up to the one that gave the model the hash `wanted`.

@@ -113,13 +113,14 @@ impl Store {
         row.as_ref().map(read_accepted).transpose()
     }
 
-    /// Whether a batch has given the model this hash.
+    /// Whether the model has this hash, or had it before it was told more.
     ///
     /// # Errors
     ///
     /// If the database failed.
     pub async fn has_revision(&self, experience: i64, hash: &str) -> Result<bool, StoreError> {
-        let query = "SELECT EXISTS (SELECT 1 FROM batches WHERE hash = $1 AND definition_id = $2)";
+        let query = "SELECT EXISTS (SELECT 1 FROM batches WHERE hash = $1 AND definition_id = $2)
+                     OR EXISTS (SELECT 1 FROM models WHERE definition_hash = $1 AND definition_id = $2)";
         let query = sqlx::query_scalar(query).bind(hash).bind(experience);
         Ok(query.fetch_one(&mut *self.reader().await?).await?)
     }

@@ -23,7 +23,8 @@ async fn open(directory: &std::path::Path, room: u64) -> Etude {
 
 async fn put(etude: &Etude, name: &str) {
     let model = json!({
-        "attributes": [{"name": "x", "kind": "number"}], "actions": [{"name": "on"}], "dynamics": {"kind": "experience"},
+        "attributes": [{"name": "x", "kind": "number"}], "actions": [{"name": "on"}],
+        "dynamics": {"kind": "experience", "start": [[0]]},
     });
     let text = ModelText::Whole(model.to_string().into_bytes());
     etude.put_model(&Name::new(name).unwrap(), text, Format::Json, caller()).await.unwrap();
@@ -45,6 +46,7 @@ async fn a_revision_leaves_the_cache_for_the_next_one_and_is_made_again_if_it_is
     let directory = tempfile::tempdir().unwrap();
     let etude = open(directory.path(), 1 << 30).await;
     put(&etude, "m").await;
+    let (untold, _) = etude.mapper("m", "/model", None, None).await.unwrap();
     let mut hashes = Vec::new();
     for n in 0..5 {
         hashes.push(tell(&etude, "m", &way(&n.to_string(), n..n + 1)).await.unwrap());
@@ -55,6 +57,8 @@ async fn a_revision_leaves_the_cache_for_the_next_one_and_is_made_again_if_it_is
     assert_eq!(hashes.iter().map(is_kept).collect::<Vec<_>>(), [false, false, false, false, true]);
     let earlier = etude.mapper_with_hash(("m", &hashes[1]), "/model", None, None).await.unwrap().unwrap();
     assert_eq!(earlier.model().states().len(), 3);
+    let first = etude.mapper_with_hash(("m", &untold), "/model", None, None).await.unwrap().unwrap();
+    assert_eq!((first.model().states().len(), first.model().n_transitions()), (1, 0));
     let (hash, _) = etude.mapper("m", "/model", None, None).await.unwrap();
     assert_eq!(hash, hashes[4], "it is still the last one that others get");
     assert!(etude.mapper_with_hash(("m", "none"), "/model", None, None).await.unwrap().is_none());
