@@ -26,11 +26,6 @@ impl Definition {
         Self(Arc::new(dynamics))
     }
 
-    /// A definition with these dynamics, which others have as well.
-    pub(super) fn of_shared(dynamics: Arc<impl Dynamics>) -> Self {
-        Self(dynamics)
-    }
-
     /// Reads a model that is in memory as JSON values.
     ///
     /// # Errors

@@ -30,6 +30,7 @@
 mod action;
 mod builder;
 mod compiled;
+mod deadly;
 mod definition;
 mod dynamics;
 mod experience;

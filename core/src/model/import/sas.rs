@@ -8,7 +8,7 @@ use std::collections::{BTreeSet, HashMap};
 use std::io::BufRead;
 use std::sync::Arc;
 
-use super::deadly::unsafe_states;
+use super::deadly::{unsafe_states, wrong};
 use super::lines::{Lines, number};
 use super::words::check_names;
 use super::{Edits, ImportError};
@@ -356,16 +356,21 @@ fn numbered(operators: &[SasOperator]) -> Vec<String> {
 
 /// A table of what the body reaches, if that is little.
 fn as_table_if_small(task: Planning, edits: &Edits, interrupt: &mut dyn Interrupt) -> Result<Definition, ImportError> {
-    let (schema, actions, task) = (task.schema().clone(), task.actions().to_vec(), Arc::new(task));
+    let listed = Arc::new(task.clone());
+    let (schema, actions) = (task.schema().clone(), task.actions().to_vec());
     let limits = Limits { max_states: MAX_TABLE_STATES, ..Limits::DEFAULT };
-    let model = Model::explore(schema, actions, Arc::clone(&task), limits, interrupt)?;
+    let model = Model::explore(schema, actions, listed, limits, interrupt)?;
     if model.is_lazy() {
-        if !edits.unsafe_if.is_empty() {
-            let detail =
-                format!("unsafe: can be said of tasks of up to {MAX_TABLE_STATES} states that the body reaches");
-            return Err(ImportError::Unfit(detail));
-        }
-        return Ok(Definition::of_shared(task));
+        // Of several expressions, one holds.
+        let task = match edits.unsafe_if.as_slice() {
+            [] => task,
+            [text] => task.avoiding(text).map_err(|detail| wrong(text, &detail))?,
+            texts => {
+                let text = texts.iter().map(|text| format!("({text})")).collect::<Vec<_>>().join(" || ");
+                task.avoiding(&text).map_err(|detail| wrong(&text, &detail))?
+            }
+        };
+        return Ok(Definition::of(task));
     }
     let mut edges = Edges::default();
     for (from, way) in model.graph().iter() {

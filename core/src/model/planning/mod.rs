@@ -14,6 +14,7 @@ use self::packed::Layout;
 pub use self::packed::PackedState;
 pub(super) use self::reading::read;
 pub use self::reading::{ConditionalDocument, OperatorDocument, PlanningDocument};
+use super::deadly::Deadly;
 use super::dynamics::{Dynamics, write_definition};
 use super::{Action, ActionIdx, CompileError, Implicit, Limits, Model, Operator, Outcome, StateIdx};
 use crate::attribute::{AttributeDocument, Schema, Value};
@@ -44,6 +45,8 @@ pub struct Planning {
     start: Vec<u32>,
     /// Those of actions that have one, in the order of the actions.
     rules: Vec<(ActionIdx, Rule)>,
+    /// Where the body must never be.
+    deadly: Option<Deadly>,
     layout: Layout,
     /// By attribute and value, indices of rules that need it: each rule once, under that of its needs whose attribute has the most values.
     by_need: Vec<Vec<Vec<u32>>>,
@@ -70,7 +73,23 @@ impl Planning {
             }
         }
         let layout = Layout::new(domains.iter().map(Vec::len));
-        Self { schema, actions, domains, start, rules, layout, by_need, needless }
+        Self { schema, actions, domains, start, rules, deadly: None, layout, by_need, needless }
+    }
+
+    /// The same task, in which no state must be entered for which the expression `text` holds, or has no value.
+    ///
+    /// # Errors
+    ///
+    /// What is wrong with it; or that the body starts in such a state.
+    pub(super) fn avoiding(mut self, text: &str) -> Result<Self, String> {
+        let deadly = Deadly::read(text, &self.schema, &self.domains)?;
+        match deadly.holds(self.start.iter().copied()) {
+            Ok(false) => {}
+            Ok(true) => return Err("the state where the body starts is unsafe".to_owned()),
+            Err(detail) => return Err(format!("in the state where the body starts: {detail}")),
+        }
+        self.deadly = Some(deadly);
+        Ok(self)
     }
 
     /// The attributes of a state.
@@ -199,15 +218,17 @@ impl Implicit for Planning {
 
     fn state_of(&self, row: &[Option<u32>]) -> Option<PackedState> {
         let values = row.iter().copied().collect::<Option<Vec<u32>>>()?;
-        Some(self.layout.pack(values.into_iter()))
+        let state = self.layout.pack(values.into_iter());
+        (!self.is_unsafe(&state)).then_some(state)
     }
 
     fn start_states(&self) -> Vec<PackedState> {
         vec![self.layout.pack(self.start.iter().copied())]
     }
 
-    fn is_unsafe(&self, _: &PackedState) -> bool {
-        false
+    /// A state that cannot be told to be safe is not.
+    fn is_unsafe(&self, state: &PackedState) -> bool {
+        self.deadly.as_ref().is_some_and(|deadly| deadly.holds(self.layout.unpack(state)).unwrap_or(true))
     }
 
     fn successors(&self, state: &PackedState) -> impl Iterator<Item = (ActionIdx, Outcome<PackedState>)> {

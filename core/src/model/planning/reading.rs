@@ -29,7 +29,7 @@ pub(in crate::model) fn read(
     let attributes = model.required("attributes", faults).and_then(|place| Schema::read(&place, faults));
     let actions = model.required("actions", faults);
     let actions = actions.and_then(|place| ReadActions::read(&place, DEFAULT_ACTION_COST, faults));
-    let object = description.dynamics.object(&["kind", "values", "start", "operators"], faults);
+    let object = description.dynamics.object(&["kind", "values", "start", "operators", "unsafe"], faults);
     let attributes = attributes.and_then(|attributes| attributes.into_iter().collect::<Option<Vec<Attribute>>>());
     let (Some(attributes), Some(actions), Some(object)) = (attributes, actions, object) else { return Ok(None) };
     let schema = Schema::of(attributes);
@@ -54,12 +54,24 @@ pub(in crate::model) fn read(
             rules.push((action, rule));
         }
     }
+    let deadly = object.optional("unsafe");
+    let text = deadly.as_ref().and_then(|place| place.string(faults));
     let (Some(start), Some(actions)) = (start, actions.complete()) else { return Ok(None) };
     if faults.count() > n_before {
         return Ok(None);
     }
     let domains = domains.into_iter().map(|domain| domain.values).collect();
-    Ok(Some(Arc::new(Planning::new(schema, actions, domains, start, rules))))
+    let mut task = Planning::new(schema, actions, domains, start, rules);
+    if let (Some(place), Some(text)) = (deadly, text) {
+        task = match task.avoiding(text) {
+            Ok(task) => task,
+            Err(detail) => {
+                faults.note(&place, detail);
+                return Ok(None);
+            }
+        };
+    }
+    Ok(Some(Arc::new(task)))
 }
 
 /// The values of an attribute, and where each stands. Hashed with a seed, as clients choose them.
@@ -177,6 +189,11 @@ pub struct PlanningDocument {
     pub start: ByAttribute<Scalar>,
     /// What actions need and change: at most one for each.
     pub operators: Vec<OperatorDocument>,
+    /// In which states the body must never be: an expression of CEL over the attributes that gives a `bool`. A state for which it has no value
+    /// is not entered either.
+    #[serde(default, rename = "unsafe", skip_serializing_if = "Option::is_none")]
+    #[cfg_attr(feature = "openapi", schema(example = "place == 'there' && door == 'shut'"))]
+    pub unsafe_when: Option<String>,
 }
 
 /// What an action needs, and what it changes.
@@ -222,11 +239,14 @@ impl Serialize for Planning {
             domain.iter().map(|value| self.schema.attributes()[attribute].write_value(value)).collect::<Vec<_>>()
         };
         let start: Values = self.start.iter().copied().enumerate().collect();
-        let mut fields = serializer.serialize_struct("Planning", 4)?;
+        let mut fields = serializer.serialize_struct("Planning", 4 + usize::from(self.deadly.is_some()))?;
         fields.serialize_field("kind", "planning")?;
         fields.serialize_field("values", &self.domains.iter().enumerate().map(values).collect::<Vec<_>>())?;
         fields.serialize_field("start", &named(&self.schema, &start, &write))?;
         fields.serialize_field("operators", &WrittenRules(self))?;
+        if let Some(deadly) = &self.deadly {
+            fields.serialize_field("unsafe", deadly.text())?;
+        }
         fields.end()
     }
 }

@@ -247,6 +247,45 @@ fn a_large_task_stays_a_task_and_is_searched_lazily() {
     assert!(model.is_lazy());
 }
 
+#[cfg(feature = "rules")]
+#[test]
+fn unsafe_states_of_a_task_that_is_searched_lazily_are_never_entered() {
+    let avoiding =
+        |texts: &[&str]| Edits { unsafe_if: texts.iter().map(ToString::to_string).collect(), ..Edits::default() };
+    let text = "b == 'holding(b)' && c != 'ontable(c)' || c == 'on(c, b)' && a == 'ontable(a)'";
+    let table = model(ImportFormat::Sas, "planning/blocksworld-4.sas", &avoiding(&[text]));
+    let request = json!({"model": "m", "demonstration": example("planning/blocksworld-4.json")});
+    let optimum = check_optimal(&table, &request);
+    let free = model(ImportFormat::Sas, "planning/blocksworld-4.sas", &Edits::default());
+    assert!(check_optimal(&free, &request) < optimum);
+    let mut task = planning(&Task::of("planning/blocksworld-4.sas"), &free);
+    task["dynamics"]["unsafe"] = text.into();
+    for limits in [LAZY, Limits::DEFAULT] {
+        let mapped = solve(&mapper_within(limits, &task), &request).cost.total;
+        assert!(close(mapped, optimum), "{mapped} and {optimum}");
+    }
+
+    let import =
+        |texts: &[&str]| imported(ImportFormat::Sas, &example_bytes("planning/blocksworld-8.sas"), &avoiding(texts));
+    let definition = import(&["b == 'on(b, a)'", "h == 'holding(h)' && b == 'ontable(b)'"]).unwrap();
+    let large: Value = serde_json::from_str(&definition.text()).unwrap();
+    assert_eq!(large["dynamics"]["unsafe"], "(b == 'on(b, a)') || (h == 'holding(h)' && b == 'ontable(b)')");
+    let request = json!({"model": "m", "demonstration": example("planning/blocksworld-8.json"), "end_weight": 10});
+    let policy = solve(&mapper_within(LAZY, &large), &request);
+    for step in &policy.steps {
+        let state = serde_json::to_value(&step.state).unwrap();
+        assert!(state["b"] != "on(b, a)" && (state["h"] != "holding(h)" || state["b"] != "ontable(b)"), "{state}");
+    }
+    for (text, expected) in [
+        ("b == 'ontable(b)'", "unsafe \"b == 'ontable(b)'\": the state where the body starts is unsafe"),
+        ("z == 3", "unsafe \"z == 3\": column 1: unknown name \"z\""),
+        ("b", "unsafe \"b\": expected bool, found string"),
+    ] {
+        let told = import(&[text]).unwrap_err().to_string();
+        assert!(told.starts_with(expected), "{told}");
+    }
+}
+
 #[test]
 fn variables_are_called_after_what_they_are_about() {
     let content = example_bytes("planning/blocksworld-4.sas");
