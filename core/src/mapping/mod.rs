@@ -39,10 +39,10 @@
 //! | `completion` | a budget ran out before the last observation | there is always an answer |
 //!
 //! Best first begins with those tables of estimates alone that are small, and makes the others once it has expanded a sixteenth of
-//! their entries, as large tables may take longer than the search (`mapper::by_default`). If extra actions pay less than a quarter of the
-//! distance, estimates are raised after 2,048 expansions, or one for 1,024 nodes if that is more, by a group of attributes that are projected
-//! together (`heuristic::abstraction`). What moves cost is said in `recurrence`,
-//! for all of them.
+//! their entries, as large tables may take longer than the search (`mapper::by_default`). Where it takes long, estimates are raised by a group
+//! of attributes that are projected together (`heuristic::abstraction`): if extra actions pay less than a quarter of the distance, after 2,048
+//! expansions, or one for 1,024 nodes if that is more; else after as many, as soon as a probe for cheaper mappings leaves one that costs twice
+//! as much as all cost at least. What moves cost is said in `recurrence`, for all of them.
 //!
 //! **Ties.** Answers are deterministic. The first path found to a node wins ties: it is replaced only by a cheaper one, by the sums of
 //! floats along the paths. A node's successors are generated in this order: the `skip`, then for each action the `match` and the `extra`.

@@ -14,7 +14,8 @@ mod shares;
 
 use serde::{Deserialize, Serialize};
 
-use abstraction::Abstracted;
+use crate::interrupt::{Interrupted, Meter};
+use abstraction::{Abstracted, KnownCosts};
 use projected::Projected;
 
 /// An estimate of the cost from a node to the end of the demonstration.
@@ -32,16 +33,29 @@ pub(super) trait Heuristic {
     }
 }
 
-/// What guides a best-first search: estimates, raised as it goes on if there is an abstraction.
-#[derive(Debug)]
+/// What guides a best-first search: estimates, and how they are raised if it takes long.
 pub(super) struct Guide<'g, 'p> {
     pub(super) projected: &'g Projected<'p>,
-    pub(super) abstracted: Option<&'g mut Abstracted<'p>>,
+    pub(super) raising: Option<Raising<'g, 'p>>,
 }
+
+/// How estimates are raised.
+pub(super) struct Raising<'g, 'p> {
+    /// After so many expansions,
+    pub(super) after: u64,
+    /// if the cheapest mapping that is known costs so many times what all cost at least. Unless this is 0, that is asked each time after cheaper
+    /// ones were looked for.
+    pub(super) least_excess: f64,
+    /// Makes an abstraction in so many bytes and in this memory, if there is one.
+    pub(super) abstract_in: &'g mut Abstracting<'g, 'p>,
+}
+
+type Abstracting<'g, 'p> =
+    dyn FnMut(usize, &mut KnownCosts, &mut Meter<'_>) -> Result<Option<Abstracted<'p>>, Interrupted> + 'g;
 
 impl<'g, 'p> From<&'g Projected<'p>> for Guide<'g, 'p> {
     fn from(projected: &'g Projected<'p>) -> Self {
-        Self { projected, abstracted: None }
+        Self { projected, raising: None }
     }
 }
 

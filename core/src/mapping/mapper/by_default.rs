@@ -1,19 +1,20 @@
 //! The search of large problems, which gets larger tables, and at last a sweep, the longer it takes.
 
 use super::{Budget, Buffers, Choices, Mapper, Mapping, Settings, conclude, least_start, within};
-use crate::interrupt::{Cancelled, Interrupt, Interrupted, Meter};
+use crate::interrupt::{Cancelled, Interrupt, Meter};
 use crate::mapping::cost::SLACK;
+use crate::mapping::heuristic::abstraction::{AbstractionRoom, KnownCosts};
 use crate::mapping::heuristic::projected::{Projected, TableRoom};
-use crate::mapping::heuristic::{Guide, Heuristic};
+use crate::mapping::heuristic::{Guide, Heuristic, Raising};
 use crate::mapping::search::sweep::{KnownLayer, Swept, sweep};
-use crate::mapping::search::{Found, POLL_EVERY, best_first};
+use crate::mapping::search::{Found, best_first};
 use crate::mapping::{Problem, StoppedBy};
 use crate::model::{Space, StateIdx};
 
 impl Mapper {
-    /// Searches best first, in up to four stages: with the small tables of projections only, then with all of them; where extra actions pay
-    /// little of the distance, with estimates that an [abstraction](crate::mapping::heuristic::abstraction) raises; and once a good part of
-    /// all nodes was expanded, [`sweep`] goes over all nodes instead, which takes a fraction of the time for each.
+    /// Searches best first, in up to four stages: with the small tables of projections only, then with all of them; where single attributes
+    /// tell little, with estimates that an [abstraction](crate::mapping::heuristic::abstraction) raises; and once a good part of all nodes was
+    /// expanded, [`sweep`] goes over all nodes instead, which takes a fraction of the time for each.
     pub(super) fn best_first<S: Space>(
         &self,
         space: &mut S,
@@ -50,23 +51,23 @@ impl Mapper {
                 let may_sweep = may_be_swept && before_sweep.saturating_add(n_nodes) <= max_expansions;
                 if may_sweep { before_sweep } else { u64::MAX }
             };
-            let may_abstract = n_untabled == 0 && self.may_abstract(problem);
             let enough = match n_untabled {
-                0 if may_abstract => patience.before_abstraction(n_nodes),
                 0 => until_sweep(max_expansions),
                 n_untabled => n_untabled / patience.entries_per_expansion,
             };
             let capped = Budget { max_expansions: max_expansions.min(enough), ..budget };
-            let mut found = self.search(space, problem, Guide::from(&projected), capped, most_f, interrupt)?;
-            let mut is_enough = !found.is_complete && enough < max_expansions && found.n_expanded >= enough;
-            if is_enough && may_abstract {
-                let max_expansions = max_expansions - found.n_expanded;
-                let enough = until_sweep(max_expansions);
-                let capped = Budget { max_expansions: max_expansions.min(enough), ..budget };
-                let more = self.search_with_classes(space, problem, &projected, capped, most_f, interrupt)?;
-                is_enough = !more.is_complete && enough < max_expansions && more.n_expanded >= enough;
-                found = joined(found, more);
-            }
+            let (n_tries, least_excess) = patience.abstractions(problem);
+            let max_classes = self.max_classes();
+            let mut abstract_in = |max_bytes: usize, costs: &mut KnownCosts, meter: &mut Meter<'_>| {
+                let room = AbstractionRoom { n_tries, max_classes, max_bytes };
+                self.abstractions.solve(&self.projections, problem, &projected, room, costs, meter)
+            };
+            let after = patience.before_abstraction(n_nodes);
+            let may_raise = n_untabled == 0 && choices.may_turn && self.may_abstract();
+            let raising = may_raise.then_some(Raising { after, least_excess, abstract_in: &mut abstract_in });
+            let guide = Guide { projected: &projected, raising };
+            let mut found = self.search(space, problem, guide, capped, most_f, interrupt)?;
+            let is_enough = !found.is_complete && enough < max_expansions && found.n_expanded >= enough;
             let is_out_of_memory = choices.may_turn && found.stopped_by == Some(StoppedBy::Memory);
             if let Some(before) = found_before {
                 found = joined(before, found);
@@ -108,46 +109,15 @@ impl Mapper {
         conclude(problem, space, &blind, found, interrupt)
     }
 
-    /// Whether estimates for `problem` can be raised by an [abstraction](crate::mapping::heuristic::abstraction) with gain: extra actions pay
-    /// little of the distance, and all states are listed.
-    pub(super) fn may_abstract(&self, problem: &Problem<'_>) -> bool {
-        problem.conditions.extra_weight < self.patience.abstract_below_extra_weight && !self.model.is_lazy()
+    /// Whether estimates can be raised by an [abstraction](crate::mapping::heuristic::abstraction): all states are listed.
+    pub(super) fn may_abstract(&self) -> bool {
+        !self.model.is_lazy()
     }
 
     /// Most classes of a group of attributes: if they were more, one might as well look at the states.
     pub(super) fn max_classes(&self) -> usize {
         const MOST: usize = 1 << 16;
         (self.model.graph().n_states() / self.patience.states_per_class).min(MOST)
-    }
-
-    /// Searches best first, with estimates that are raised by an abstraction, if there is one.
-    fn search_with_classes<S: Space>(
-        &self,
-        space: &mut S,
-        problem: &Problem<'_>,
-        projected: &Projected<'_>,
-        budget: Budget,
-        most_f: f64,
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<Found, Cancelled> {
-        let max_classes = self.max_classes();
-        let (projections, max_bytes) = (&self.projections, budget.max_bytes / 2);
-        let mut meter = Meter::new(interrupt, POLL_EVERY);
-        match self.abstractions.solve(projections, problem, projected, max_classes, max_bytes, &mut meter) {
-            Ok(mut abstracted) => {
-                let guide = Guide { projected, abstracted: abstracted.as_mut() };
-                self.search(space, problem, guide, budget, most_f, interrupt)
-            }
-            Err(Interrupted::OutOfTime) => Ok(Found {
-                paths: Vec::new(),
-                is_complete: false,
-                stopped_by: Some(StoppedBy::Deadline),
-                least_f: 0.0,
-                n_expanded: 0,
-                n_generated: 0,
-            }),
-            Err(Interrupted::Cancelled(cancelled)) => Err(cancelled),
-        }
     }
 
     /// Searches best first, with buffers of searches before.
@@ -214,14 +184,18 @@ pub(super) struct Patience {
     few_entries_per_observation: usize,
     /// How many entries of a table take as long as an expansion.
     entries_per_expansion: u64,
-    /// Estimates are raised by a group of attributes where extra actions pay a smaller part of the distance than this,
-    abstract_below_extra_weight: f64,
-    /// after so many expansions,
+    /// Estimates are raised by a group of attributes after so many expansions,
     min_expansions_before_abstraction: u64,
     /// or one in this many of all nodes, if that is more;
     nodes_per_expansion_before_abstraction: u64,
-    /// unless there are fewer states than this for each class of the group.
+    /// unless there are fewer states than this for each class of the group,
     states_per_class: usize,
+    /// or the cheapest mapping that is known costs fewer times what all cost at least;
+    least_excess: f64,
+    /// whatever it costs, where extra actions pay a smaller part of the distance than this, and then
+    refine_below_extra_weight: f64,
+    /// up to so many groups are tried, each with what the one before it misses.
+    max_groups: usize,
     /// Expansions after which a sweep replaces the search, unless `nodes_per_expansion` allows more.
     min_expansions_before_sweep: u64,
     /// The search may expand one in this many of all nodes before a sweep replaces it.
@@ -234,6 +208,13 @@ impl Patience {
         self.min_expansions_before_abstraction.max(n_nodes / self.nodes_per_expansion_before_abstraction)
     }
 
+    /// How many groups are tried for a problem, and how many times what all mappings cost at least the cheapest that is known must cost for
+    /// that.
+    fn abstractions(self, problem: &Problem<'_>) -> (usize, f64) {
+        let is_refined = problem.conditions.extra_weight < self.refine_below_extra_weight;
+        if is_refined { (self.max_groups, 0.0) } else { (1, self.least_excess) }
+    }
+
     pub(super) const DEFAULT: Self = Self {
         // To make room for as many takes ten microseconds.
         max_layered_nodes: 1 << 16,
@@ -242,13 +223,16 @@ impl Patience {
         // Two microseconds, which is no more than the search is bound to take.
         few_entries_per_observation: 1 << 8,
         entries_per_expansion: 16,
-        // Where they pay more, the searches of most caves end before they would gain by it.
-        abstract_below_extra_weight: 0.25,
         // They take a fifth of a millisecond, and the abstraction more.
         min_expansions_before_abstraction: 1 << 11,
         // A table has as many entries as a quarter of the nodes at most, and to make room for one takes a nanosecond.
         nodes_per_expansion_before_abstraction: 1 << 10,
         states_per_class: 4,
+        // Where it costs less, the searches of most caves end before they would gain by it.
+        least_excess: 2.0,
+        // Where they pay more, to search a larger group takes longer than what it saves.
+        refine_below_extra_weight: 0.25,
+        max_groups: 4,
         // Nodes of fewer expansions are in the caches, where an expansion takes less time.
         min_expansions_before_sweep: 1 << 16,
         // So many are swept in about the time of an expansion, where there are many.

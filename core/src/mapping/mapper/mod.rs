@@ -306,7 +306,7 @@ impl Mapper {
 struct Choices {
     /// As if a search might take so much memory, in bytes.
     max_bytes: usize,
-    /// Whether a search that has used up its memory gives way to one that takes less.
+    /// Whether a search that has used up its memory gives way to one that takes less, and one that takes long takes more if there is some.
     may_turn: bool,
 }
 

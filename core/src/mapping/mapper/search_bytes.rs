@@ -34,7 +34,7 @@ impl Mapper {
             HeuristicName::Default => {
                 let search =
                     best_first::most_bytes(model, n_observations).max(sweep::most_bytes(model, n_observations));
-                let abstracted = if self.may_abstract(problem) {
+                let abstracted = if self.may_abstract() {
                     // It has half of what the tables leave.
                     2 * Abstracted::most_bytes(self.max_classes(), problem)
                 } else {

@@ -25,9 +25,9 @@ use super::seen::{Estimates, Seen, SeenIdx, SeenWay};
 use super::{End, Found, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Interrupted, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
-use crate::mapping::heuristic::Guide;
-use crate::mapping::heuristic::abstraction::Abstracted;
+use crate::mapping::heuristic::abstraction::{Abstracted, KnownCosts};
 use crate::mapping::heuristic::projected::Projected;
+use crate::mapping::heuristic::{Guide, Raising};
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::recurrence::Recurrence;
 use crate::mapping::{Budget, Problem, StoppedBy};
@@ -42,12 +42,22 @@ const PROBE_SHARE: u64 = 16;
 /// How a search ends that the interrupt said to finish.
 const OUT_OF_TIME: End = End::CutShort(StoppedBy::Deadline);
 
+/// How a search ends whose estimates could not be raised.
+fn cut_short(interrupted: Interrupted) -> Result<End, Cancelled> {
+    match interrupted {
+        Interrupted::OutOfTime => Ok(OUT_OF_TIME),
+        Interrupted::Cancelled(cancelled) => Err(cancelled),
+    }
+}
+
 /// Buffers of a search, kept to be used again.
 #[derive(Debug, Default)]
 pub(in crate::mapping) struct SearchBuffers {
     seen: Seen,
     nodes: Nodes,
     open: Open,
+    /// Of an abstraction.
+    costs: KnownCosts,
 }
 
 /// The nodes that are to be expanded next.
@@ -73,7 +83,7 @@ pub(in crate::mapping) fn most_bytes(model: &Model, n_observations: usize) -> us
 impl SearchBuffers {
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
-        self.seen.kept_bytes() + self.nodes.kept_bytes() + self.open.kept_bytes()
+        self.seen.kept_bytes() + self.nodes.kept_bytes() + self.open.kept_bytes() + self.costs.kept_bytes()
     }
 }
 
@@ -99,8 +109,8 @@ pub(in crate::mapping) fn search<S: Space, const ALIKE: bool>(
     buffers: &mut SearchBuffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
-    let Guide { projected, abstracted } = guide;
-    let SearchBuffers { seen, nodes, open } = buffers;
+    let Guide { projected, raising } = guide;
+    let SearchBuffers { seen, nodes, open, costs } = buffers;
     seen.prepare(space, &problem.body, projected);
     nodes.clear(problem.demonstration.len(), problem.recurrence());
     open.buckets.clear();
@@ -108,7 +118,7 @@ pub(in crate::mapping) fn search<S: Space, const ALIKE: bool>(
         problem,
         space,
         projected,
-        abstracted,
+        abstracted: None,
         budget,
         seen,
         nodes,
@@ -132,7 +142,10 @@ pub(in crate::mapping) fn search<S: Space, const ALIKE: bool>(
         end = search.start_in(&others)?;
     }
     if end == End::Done {
-        end = search.expand_best_first(open)?;
+        end = search.expand_best_first(raising, open, costs)?;
+    }
+    if let Some(abstracted) = search.abstracted.take() {
+        *costs = abstracted.into_costs();
     }
     Ok(search.found(end))
 }
@@ -142,8 +155,8 @@ struct Search<'s, 'p, S, const ALIKE: bool> {
     problem: &'s Problem<'s>,
     space: &'s mut S,
     projected: &'s Projected<'p>,
-    /// `None` if moves of all kinds pay alike.
-    abstracted: Option<&'s mut Abstracted<'p>>,
+    /// What raises the estimates, once the search has taken long.
+    abstracted: Option<Abstracted<'p>>,
     budget: Budget,
     seen: &'s mut Seen,
     nodes: &'s mut Nodes,
@@ -169,7 +182,7 @@ struct Search<'s, 'p, S, const ALIKE: bool> {
     meter: Meter<'s>,
 }
 
-impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
+impl<'p, S: Space, const ALIKE: bool> Search<'_, 'p, S, ALIKE> {
     /// Expands the most promising nodes of each observation, `width` of them. What is reached from them by actions that do not
     /// advance counts among those of the observation.
     fn probe(&mut self, width: u64, Open { buckets, probed, ahead }: &mut Open) -> Result<End, Cancelled> {
@@ -233,26 +246,37 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
     }
 
     /// Expands the nodes that may lead to a cheaper mapping than the incumbent, the most promising first.
-    fn expand_best_first(&mut self, open: &mut Open) -> Result<End, Cancelled> {
+    fn expand_best_first(
+        &mut self,
+        raising: Option<Raising<'_, 'p>>,
+        open: &mut Open,
+        costs: &mut KnownCosts,
+    ) -> Result<End, Cancelled> {
+        let mut raising = raising;
         let n_layers = self.problem.last() as u64;
         let probe_at = |width: u64| width.saturating_mul(n_layers).saturating_mul(PROBE_SHARE);
         let mut probe_width = PROBE_WIDENING;
+        let next_look = |raising: &Option<Raising<'_, '_>>, probe_width| {
+            let at_once = raising.as_ref().filter(|raising| raising.least_excess == 0.0);
+            probe_at(probe_width).min(at_once.map_or(u64::MAX, |raising| raising.after))
+        };
+        let mut look_at = next_look(&raising, probe_width);
         let Some(mut bucketed_limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(OUT_OF_TIME) };
-        while let Some(Reached { id, g, f }) = open.buckets.pop() {
+        while let Some(Reached { id, mut g, f }) = open.buckets.pop() {
             // Of a node that was put in more than once, the cheapest way comes out first.
             if self.nodes.is_closed(id) || f >= self.limit {
                 continue;
             }
             let step = self.nodes.step(id);
-            if !ALIKE && self.abstracted.is_some() {
+            if self.abstracted.is_some() {
                 match self.raise(id, f, step) {
-                    Ok(None) => {}
-                    Ok(Some(raised)) => {
+                    // What was put in before the node was raised comes out before what was put in then, which may be a cheaper way to it.
+                    Ok(raised) if raised.f <= f => g = raised.g,
+                    Ok(raised) => {
                         open.buckets.push(raised);
                         continue;
                     }
-                    Err(Interrupted::OutOfTime) => return Ok(OUT_OF_TIME),
-                    Err(Interrupted::Cancelled(cancelled)) => return Err(cancelled),
+                    Err(interrupted) => return cut_short(interrupted),
                 }
             }
             let ways = match self.spend(step.state, &mut open.buckets)? {
@@ -260,7 +284,7 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
                 Err(stopped_by) => return Ok(End::CutShort(stopped_by)),
             };
             self.expand(id, g, step, ways, |found, _| open.buckets.push(found));
-            if self.n_expanded < probe_at(probe_width) && self.limit >= bucketed_limit / 4.0 {
+            if self.n_expanded < look_at && self.limit >= bucketed_limit / 4.0 {
                 continue;
             }
             let is_probe_due = self.n_expanded >= probe_at(probe_width);
@@ -271,6 +295,17 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
                     return Ok(end);
                 }
             }
+            let is_excess = |excess: f64| excess == 0.0 || (is_probe_due && self.limit >= excess * f);
+            let is_raising_due =
+                |raising: &mut Raising<'_, '_>| self.n_expanded >= raising.after && is_excess(raising.least_excess);
+            if let Some(Raising { abstract_in, .. }) = raising.take_if(is_raising_due) {
+                let max_bytes = self.budget.beside(self.size_bytes(&open.buckets)).max_bytes / 2;
+                match abstract_in(max_bytes, costs, &mut self.meter) {
+                    Ok(abstracted) => self.abstracted = abstracted,
+                    Err(interrupted) => return cut_short(interrupted),
+                }
+            }
+            look_at = next_look(&raising, probe_width);
             // What a probe found is not in the buckets, and those for a much higher limit are too wide.
             if is_probe_due || self.limit < bucketed_limit / 4.0 {
                 let Some(limit) = self.fill_buckets(&mut open.buckets)? else { return Ok(OUT_OF_TIME) };
@@ -280,15 +315,17 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
         Ok(End::Done)
     }
 
-    /// Raises the estimate of a node that is about to be expanded as far as the abstraction tells. Gives the node if its `f` has grown.
-    fn raise(&mut self, id: NodeId, f: f64, step: Position) -> Result<Option<Reached>, Interrupted> {
+    /// Raises the estimate of a node that is about to be expanded as far as the abstraction tells. Gives the node as it is then.
+    fn raise(&mut self, id: NodeId, f: f64, step: Position) -> Result<Reached, Interrupted> {
         let Self { nodes, seen, projected, abstracted, space, meter, .. } = self;
-        let Some(abstracted) = abstracted else { return Ok(None) };
-        abstracted.settle(seen.state(step.state), step.observation as usize, f, meter)?;
-        let estimates = Estimates { seen, projected, abstracted: Some(abstracted), space: &**space };
-        nodes.estimate_anew(id, estimates.of(step.state, step.observation));
-        let raised = nodes.get::<ALIKE>(id);
-        Ok((raised.f > f).then_some(raised))
+        if let Some(abstracted) = abstracted.as_mut().filter(|_| !nodes.is_raised(id)) {
+            let (state, observation) = (seen.state(step.state), step.observation as usize);
+            let is_exact = abstracted.settle(state, observation, f, meter)?;
+            let mut estimate = Estimates { seen, projected, space: &**space }.of(step.state, step.observation);
+            estimate.cost_to_go += abstracted.rise(state, observation);
+            nodes.raise(id, estimate, is_exact);
+        }
+        Ok(nodes.get::<ALIKE>(id))
     }
 
     /// Puts all open nodes into the buckets, and gives the limit that these are for; `None` if there is no time for it.
@@ -357,7 +394,7 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
     /// How much memory this takes, in bytes, without the states that were found.
     fn size_bytes(&self, buckets: &Buckets) -> usize {
         let nodes = self.nodes.size_bytes(self.seen.n_states());
-        let abstracted = self.abstracted.as_ref().map_or(0, |abstracted| abstracted.size_bytes());
+        let abstracted = self.abstracted.as_ref().map_or(0, Abstracted::size_bytes);
         nodes + self.seen.size_bytes() + buckets.size_bytes() + abstracted
     }
 
@@ -446,10 +483,8 @@ impl<S: Space, const ALIKE: bool> Search<'_, '_, S, ALIKE> {
     #[inline(always)]
     fn take(&mut self, block: &mut BlockIdx, arrival: Arrival) -> Option<Reached> {
         let observation = arrival.observation;
-        let Self { nodes, seen, projected, abstracted, space, .. } = self;
-        // Told to the compiler, so that nothing is asked where there is none.
-        let abstracted = if ALIKE { None } else { abstracted.as_deref() };
-        let estimates = Estimates { seen, projected, abstracted, space: &**space };
+        let Self { nodes, seen, projected, space, .. } = self;
+        let estimates = Estimates { seen, projected, space: &**space };
         let node = nodes.take::<ALIKE>(block, arrival, &estimates, self.limit)?;
         if observation == self.last && !self.end_at(node.id, node.g, arrival.state) {
             return None;

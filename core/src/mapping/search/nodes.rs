@@ -84,6 +84,8 @@ const CLOSED: u8 = 4;
 const SKIPPED_TO: u8 = 8;
 /// Bit of a node's marks: its path ends with an extra action.
 const LINGERED_TO: u8 = 16;
+/// Bit of a node's marks: its estimate is not raised any more.
+const RAISED: u8 = 32;
 
 /// Blocks of nodes, in the order in which the first node of each was found. `ALIKE` says whether moves of all kinds pay the same part of a
 /// distance, for which there is a search of its own: it is what most problems need.
@@ -150,16 +152,20 @@ impl Nodes {
 
     /// Every node that was not expanded since its way last became cheaper.
     pub(super) fn open<const ALIKE: bool>(&self) -> impl Iterator<Item = Reached> {
-        (0..).zip(&self.marks).flat_map(move |(block, marks)| {
-            let marks = u64::from_le_bytes(*marks);
-            // A bit of each byte.
-            let has = |mark: u8| marks >> mark.trailing_zeros() & u64::from_le_bytes([1; BLOCK_LEN]);
-            let mut left = has(FOUND) & !has(CLOSED);
-            std::iter::from_fn(move || {
-                let in_block = (left != 0).then(|| left.trailing_zeros() / u8::BITS)?;
-                left &= left - 1;
-                Some(self.get::<ALIKE>(block << BLOCK_BITS | in_block))
-            })
+        let mut blocks = (0..).zip(&self.marks);
+        // Of the current block.
+        let (mut number, mut left) = (0, 0);
+        std::iter::from_fn(move || {
+            while left == 0 {
+                let (block, marks) = blocks.next()?;
+                let marks = u64::from_le_bytes(*marks);
+                // A bit of each byte.
+                let has = |mark: u8| marks >> mark.trailing_zeros() & u64::from_le_bytes([1; BLOCK_LEN]);
+                (number, left) = (block, has(FOUND) & !has(CLOSED));
+            }
+            let in_block = left.trailing_zeros() / u8::BITS;
+            left &= left - 1;
+            Some(self.get::<ALIKE>(number << BLOCK_BITS | in_block))
         })
     }
 
@@ -172,10 +178,18 @@ impl Nodes {
         Reached { id, g, f: g + estimate.cost_to_go }
     }
 
-    /// Replaces the estimate of a node.
-    pub(super) fn estimate_anew(&mut self, id: NodeId, estimate: Estimate) {
+    /// Replaces the estimate of a node by one that is higher, and perhaps as high as it will ever be.
+    pub(super) fn raise(&mut self, id: NodeId, estimate: Estimate, is_highest: bool) {
         let (block, in_block) = split(id);
         self.estimates[block][in_block] = estimate;
+        self.marks[block][in_block] |= if is_highest { RAISED } else { 0 };
+    }
+
+    /// Whether the estimate of a node is as high as it will ever be.
+    #[inline]
+    pub(super) fn is_raised(&self, id: NodeId) -> bool {
+        let (block, in_block) = split(id);
+        self.marks[block][in_block] & RAISED != 0
     }
 
     /// Where a node is, and how the way to it ends.
@@ -267,7 +281,7 @@ impl Nodes {
         if reached.f >= limit && *mark & FOUND == 0 {
             return None;
         }
-        *mark = ESTIMATED
+        *mark = *mark & (ESTIMATED | RAISED)
             | FOUND
             | match kind {
                 MoveKind::Skip => SKIPPED_TO,

@@ -5,7 +5,6 @@ use std::ops::Range;
 use rustc_hash::FxHashMap;
 
 use crate::mapping::conditions::Body;
-use crate::mapping::heuristic::abstraction::Abstracted;
 use crate::mapping::heuristic::projected::{CHUNK_LEN, ChangingColumn, Estimate, Projected};
 use crate::model::{ActionIdx, Space, StateIdx, make_room};
 
@@ -215,7 +214,6 @@ impl Bounds {
 pub(super) struct Estimates<'s, 'p, S> {
     pub(super) seen: &'s Seen,
     pub(super) projected: &'s Projected<'p>,
-    pub(super) abstracted: Option<&'s Abstracted<'p>>,
     pub(super) space: &'s S,
 }
 
@@ -224,11 +222,7 @@ impl<S: Space> Estimates<'_, '_, S> {
     #[inline]
     pub(super) fn of(&self, state: SeenIdx, observation: u32) -> Estimate {
         let values = || self.space.row(self.seen.state(state));
-        let mut estimate = self.projected.estimate(observation as usize, self.seen.classes(state), values);
-        if let Some(abstracted) = self.abstracted {
-            abstracted.raise(self.seen.state(state), observation as usize, std::slice::from_mut(&mut estimate));
-        }
-        estimate
+        self.projected.estimate(observation as usize, self.seen.classes(state), values)
     }
 
     /// At the nodes of a state at [`CHUNK_LEN`] observations from `first` on; `None` if an estimate takes more than the tables. Past the
@@ -236,13 +230,6 @@ impl<S: Space> Estimates<'_, '_, S> {
     #[inline]
     pub(super) fn of_all(&self, state: SeenIdx, first: u32) -> Option<[Estimate; CHUNK_LEN]> {
         let classes = self.seen.classes(state);
-        self.projected.are_all_in_columns().then(|| {
-            let mut estimates = self.projected.estimate_chunk(first as usize, classes);
-            if let Some(abstracted) = self.abstracted {
-                let number = self.seen.state(state);
-                abstracted.raise(number, first as usize, &mut estimates);
-            }
-            estimates
-        })
+        self.projected.are_all_in_columns().then(|| self.projected.estimate_chunk(first as usize, classes))
     }
 }

@@ -1,15 +1,16 @@
 //! Bounds from a group of attributes that are projected together.
 //!
 //! The [projections on single attributes](super::projection) do not see that some attributes change at few places only: gold is taken
-//! wherever one stands, for the cost of an action. Where extra actions pay the distance, a search is seldom misled by that. Where they pay
-//! little of it, it looks at all ways that cost a few actions more than the bound. So, if it takes long, attributes are projected together
-//! of which some [change at few values of others](group). States with the same values of these are a *class*. A transition costs a class
+//! wherever one stands, for the cost of an action. Where extra actions pay the distance, a search is seldom misled by that for long: if so, the
+//! cheapest mapping that it has found costs far more than what it has shown that all cost. Where they pay little of it, it looks at all ways
+//! that cost a few actions more than the bound. So, if it takes long, attributes are projected together of which some [change at few values of others](group). States with the same values of these are a *class*. A transition costs a class
 //! what the group's attributes pay of it in their own projections, so the bounds of the others may still be added; and as the classes are
 //! followed exactly, they cost at least the sum of what the group's attributes cost alone.
 //!
 //! To solve this for all classes takes longer than what it saves. It is [searched](solving) instead, from the end back, as far as the
 //! search of the model asks: in turn, each search is guided by the other way's costs (Switchback: Larsen, Burns, Ruml & Holte 2010). The
-//! estimates of the backward search are what single attributes cost [from the start on](forward).
+//! estimates of the backward search are what single attributes cost [from the start on](forward). The search of the model goes on from where
+//! it is; the estimate of a node is raised when its turn comes.
 //!
 //! Attributes that weigh nothing can matter as well: which piece of gold is still there tells how often it can be taken. They are found
 //! where they are missed, on the cheapest way through the classes: if an attribute changes there from a value that it no longer has, it is
@@ -22,14 +23,14 @@ mod solving;
 
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
-use rustc_hash::FxHashMap;
+use rustc_hash::{FxHashMap, FxHashSet};
 
 use super::projected::Projected;
-use super::projection::{ChangeSets, Projections};
+use super::projection::{ChangeSets, Projections, ValueIdx};
 use crate::interrupt::{Interrupted, Meter};
 use crate::mapping::Problem;
 use crate::model::{ActionIdx, Model, OwnCost, Rows, StateIdx};
-pub(in crate::mapping) use solving::Abstracted;
+pub(in crate::mapping) use solving::{Abstracted, KnownCosts};
 
 /// The number of a class.
 type ClassIdx = u32;
@@ -41,30 +42,46 @@ struct Abstraction {
     positions: Vec<usize>,
     /// By state.
     classes: Vec<ClassIdx>,
-    /// A state of each class.
-    members: Vec<StateIdx>,
+    /// The values of each class. Shape `[n_classes, positions.len()]`.
+    values: Vec<ValueIdx>,
     /// Distinct ways to change the class, by the class to which they lead.
     ways: Rows<AbstractWay>,
+    /// The states of one of the transitions of each way.
+    states: Vec<(StateIdx, StateIdx)>,
+    /// The kinds of ways.
+    kinds: Vec<WayKind>,
     /// Distinct sets of [projections](Projections::attributes) that some of these change.
     change_sets: Vec<Vec<u16>>,
 }
 
 /// A way from one class to another.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 struct AbstractWay {
     from: ClassIdx,
+    /// The number of its kind.
+    kind: u32,
+}
+
+/// All that tells what a way costs the group.
+#[derive(Clone, Copy, Debug)]
+struct WayKind {
     change_set: u32,
     action: ActionIdx,
     own_cost: OwnCost,
-    /// The states of one of its transitions.
-    states: (StateIdx, StateIdx),
 }
 
-impl AbstractWay {
-    /// What tells it from other ways to the same class.
-    fn key(&self) -> (ClassIdx, u32, ActionIdx, Option<u64>) {
-        (self.from, self.change_set, self.action, self.own_cost.get().map(f64::to_bits))
+impl WayKind {
+    /// What tells it from other kinds.
+    fn key(&self) -> (u32, ActionIdx, Option<u64>) {
+        (self.change_set, self.action, self.own_cost.get().map(f64::to_bits))
     }
+}
+
+/// A transition that changes the class, from one that is known.
+#[derive(Clone, Copy, Debug)]
+struct ClassChange {
+    way: AbstractWay,
+    states: (StateIdx, StateIdx),
 }
 
 impl Abstraction {
@@ -82,25 +99,28 @@ impl Abstraction {
             return Ok(None);
         }
         let mut numbers: FxHashMap<u64, ClassIdx> = FxHashMap::default();
-        let (mut classes, mut members) = (Vec::with_capacity(states.len() as usize), Vec::new());
+        let (mut classes, mut values) = (Vec::with_capacity(states.len() as usize), Vec::new());
+        let mut n_classes = 0;
         for state in 0..states.len() {
             meter.spend_or_stop(positions.len() as u64)?;
             let row = states.row(state);
             let digits = positions.iter().zip(sizes.clone());
             let key = digits.fold(0, |key, (position, size)| key * size + u64::from(row[*position]));
-            #[expect(clippy::cast_possible_truncation, reason = "no more than there are states")]
-            let next = members.len() as ClassIdx;
-            let class = *numbers.entry(key).or_insert(next);
-            if class == next {
-                if members.len() == max_classes {
+            let class = *numbers.entry(key).or_insert(n_classes);
+            if class == n_classes {
+                if n_classes as usize == max_classes {
                     return Ok(None);
                 }
-                members.push(state);
+                n_classes += 1;
+                values.extend(positions.iter().map(|position| row[*position]));
             }
             classes.push(class);
         }
         let mut change_sets = ChangeSets::default();
-        let mut entries = Vec::new();
+        let mut kinds = Vec::new();
+        let mut numbers: FxHashMap<_, u32> = FxHashMap::default();
+        // Most transitions differ from others in other attributes only.
+        let (mut known, mut entries) = (FxHashSet::default(), Vec::new());
         for from in 0..states.len() {
             let own_costs = graph.own_costs(from);
             for (n, transition) in graph.successors(from).iter().enumerate() {
@@ -112,35 +132,58 @@ impl Abstraction {
                 let (row, row_after) = (states.row(from), states.row(transition.to));
                 let numbered = (0..).zip(&projections.attributes);
                 let changed = numbered.filter(|(_, own)| row[own.position] != row_after[own.position]);
-                let way = AbstractWay {
-                    from: class,
+                let kind = WayKind {
                     change_set: change_sets.number_of(changed.map(|(number, _)| number)),
                     action: transition.action,
                     own_cost: own_costs.get(n).copied().unwrap_or(OwnCost::NONE),
-                    states: (from, transition.to),
                 };
-                entries.push((class_after, way));
+                #[expect(clippy::cast_possible_truncation, reason = "no more than there are transitions")]
+                let next = kinds.len() as u32;
+                let number = *numbers.entry(kind.key()).or_insert(next);
+                if number == next {
+                    kinds.push(kind);
+                }
+                let way = AbstractWay { from: class, kind: number };
+                if known.insert((class_after, way)) {
+                    entries.push((class_after, ClassChange { way, states: (from, transition.to) }));
+                }
             }
         }
-        let mut ways = Rows::try_of_entries(members.len(), entries.iter().copied(), || meter.spend_or_stop(1))?;
-        for class in 0..members.len() {
-            let into = ways.of_mut(class);
+        let n_classes = n_classes as usize;
+        drop(known);
+        let mut changes = Rows::try_of_entries(n_classes, entries.iter().copied(), || meter.spend_or_stop(1))?;
+        for class in 0..n_classes {
+            let into = changes.of_mut(class);
             meter.spend_or_stop(1 + into.len() as u64)?;
-            // Stable: of each kind the first is kept.
-            into.sort_by_key(AbstractWay::key);
+            into.sort_unstable_by_key(|change| change.way);
         }
-        ways.dedup(|way, other| way.key() == other.key());
-        ways.shrink_to_fit();
-        Ok(Some(Self { positions, classes, members, ways, change_sets: change_sets.sets }))
+        let states = changes.items().iter().map(|change| change.states).collect();
+        let (ways, change_sets) = (changes.map(|change| change.way), change_sets.sets);
+        Ok(Some(Self { positions, classes, values, ways, states, kinds, change_sets }))
+    }
+
+    fn n_classes(&self) -> usize {
+        self.ways.n_rows()
     }
 
     fn size_bytes(&self) -> usize {
-        size_of_val(self.classes.as_slice()) + size_of_val(self.members.as_slice()) + self.ways.size_bytes()
+        size_of_val(self.classes.as_slice())
+            + size_of_val(self.values.as_slice())
+            + size_of_val(self.states.as_slice())
+            + self.ways.size_bytes()
     }
 }
 
 /// A group, and its abstraction, if it does not have too many classes.
 type Kept = (Vec<usize>, Option<Arc<Abstraction>>);
+
+/// What an abstraction may take.
+#[derive(Clone, Copy, Debug)]
+pub(in crate::mapping) struct AbstractionRoom {
+    pub(in crate::mapping) n_tries: usize,
+    pub(in crate::mapping) max_classes: usize,
+    pub(in crate::mapping) max_bytes: usize,
+}
 
 /// The abstractions of a model that searches asked for.
 #[derive(Debug, Default)]
@@ -155,11 +198,9 @@ impl Abstractions {
     /// Most that are kept. Few problems of a model differ in which attributes matter.
     const MAX_KEPT: usize = 4;
 
-    /// Most abstractions that are tried for a problem, each with a larger group.
-    const MAX_TRIES: usize = 4;
-
-    /// An abstraction for `problem`, of a listed model, searched as far as to tell what mappings cost at least; `None` if no attributes that
-    /// matter are coupled, or the group of those has more than `max_classes` or would take more than `max_bytes`.
+    /// An abstraction for `problem`, of a listed model; `None` if no attributes that matter are coupled, or the group of those has more than
+    /// `max_classes` or would take more than `max_bytes`. Up to `n_tries` are made, each with a larger group, and all but the last one of
+    /// these searched as far as to tell what mappings cost at least, and which attributes the group misses.
     ///
     /// # Errors
     ///
@@ -169,8 +210,8 @@ impl Abstractions {
         projections: &Projections,
         problem: &'p Problem<'p>,
         projected: &'p Projected<'p>,
-        max_classes: usize,
-        max_bytes: usize,
+        AbstractionRoom { n_tries, max_classes, max_bytes }: AbstractionRoom,
+        costs: &mut KnownCosts,
         meter: &mut Meter<'_>,
     ) -> Result<Option<Abstracted<'p>>, Interrupted> {
         let coupled = if let Some(coupled) = self.coupled.get() {
@@ -180,20 +221,21 @@ impl Abstractions {
             self.coupled.get_or_init(|| found)
         };
         let mut positions = group::of_problem(problem, coupled);
-        let mut solved = None;
-        for _ in 0..Self::MAX_TRIES {
+        let mut solved: Option<Abstracted<'p>> = None;
+        for n_left in (0..n_tries).rev() {
             if positions.len() < 2 {
                 break;
             }
             let Some(abstraction) = self.get(problem.model, projections, &positions, max_classes, meter)? else {
                 break;
             };
-            if Abstracted::bytes_for(abstraction.members.len(), problem) > max_bytes {
+            if Abstracted::bytes_for(abstraction.n_classes(), problem) > max_bytes {
                 break;
             }
-            let mut abstracted = Abstracted::new(abstraction, projections, problem, projected, meter)?;
-            let missed = abstracted.solve_from_start(meter)?;
-            solved = Some(abstracted);
+            let costs = solved.take().map_or_else(|| std::mem::take(costs), Abstracted::into_costs);
+            let abstracted = Abstracted::new(abstraction, projections, problem, projected, costs, meter)?;
+            let abstracted = solved.insert(abstracted);
+            let missed = if n_left > 0 { abstracted.solve_from_start(meter)? } else { Vec::new() };
             if missed.is_empty() {
                 break;
             }

@@ -1,18 +1,20 @@
 //! The backward search of an abstraction, as far as the search of the model asks.
 
+mod known;
 mod missed;
 
 use std::sync::Arc;
 
 use super::forward::{self, CostFromStart};
 use super::open::Open;
-use super::{Abstraction, ClassIdx};
+use super::{Abstraction, WayKind};
 use crate::interrupt::{Interrupted, Meter};
-use crate::mapping::heuristic::projected::{Estimate, Projected, Table};
+use crate::mapping::heuristic::projected::Projected;
 use crate::mapping::heuristic::projection::Projections;
 use crate::mapping::heuristic::shares::SharedWays;
 use crate::mapping::{MoveKind, Problem};
-use crate::model::{Rows, StateIdx};
+use crate::model::StateIdx;
+pub(in crate::mapping) use known::KnownCosts;
 
 /// An abstraction of one problem, partly solved. With `H_i(c)` for what it costs the group to go on from the class c at observation i, `G`
 /// for what it costs to come there at least, and F for the least `G + H` of what is left to be looked at,
@@ -36,10 +38,10 @@ pub(in crate::mapping) struct Abstracted<'p> {
     from_start: Vec<f64>,
     /// Likewise, the terms of the distance.
     terms: Vec<f64>,
-    /// The ways into each class, as far as the body can go them.
-    ways: Rows<CostedWay>,
-    /// By class: `H` of what is closed; of what is open, the least known, negative; minus infinity for the rest.
-    costs: Table<f64>,
+    /// What the group pays of a way, by its kind.
+    kinds: Vec<WayCost>,
+    /// `H` of what is closed; of what is open, the least known, negative; minus infinity for the rest.
+    costs: KnownCosts,
     pub(super) open: Open,
     /// By observation, the least term of the group.
     least_terms: Vec<f64>,
@@ -59,28 +61,21 @@ struct GroupColumn {
     first: usize,
 }
 
-/// A way from a class, as the body can go it.
+/// What the group pays of a way.
 #[derive(Clone, Copy, Debug)]
-struct CostedWay {
-    from: ClassIdx,
-    /// Its number among the abstraction's.
-    number: u32,
-    /// What the group pays of its cost.
+struct WayCost {
+    /// Of its cost; infinite if the body cannot go it.
     cost: f64,
-    /// The part that the group pays of the least distance, if it is an extra action.
+    /// The part that it pays of the least distance, if it is an extra action.
     part: f64,
 }
-
-const UNKNOWN: f64 = f64::NEG_INFINITY;
 
 impl<'p> Abstracted<'p> {
     /// About how much memory it takes at first, in bytes.
     pub(super) fn bytes_for(n_classes: usize, problem: &Problem<'_>) -> usize {
         /// The ways into a class, its values, and its place in the open list.
         const CLASS_BYTES: usize = 256;
-        Table::<f64>::n_entries_for(n_classes, problem.demonstration.len())
-            .saturating_mul(size_of::<f64>())
-            .saturating_add(n_classes * CLASS_BYTES)
+        KnownCosts::bytes_for(n_classes, problem.demonstration.len()).saturating_add(n_classes * CLASS_BYTES)
     }
 
     /// About how much memory it takes at most, in bytes, however far it is solved.
@@ -88,7 +83,8 @@ impl<'p> Abstracted<'p> {
         /// How often a node is open, at different costs.
         const N_TIMES_OPEN: usize = 2;
         let n_nodes = max_classes.saturating_mul(problem.demonstration.len());
-        Self::bytes_for(max_classes, problem).saturating_add(n_nodes.saturating_mul(N_TIMES_OPEN * Open::NODE_BYTES))
+        Self::bytes_for(max_classes, problem)
+            .saturating_add(n_nodes.saturating_mul(N_TIMES_OPEN * Open::NODE_BYTES + KnownCosts::NODE_BYTES))
     }
 
     /// Nothing is closed yet.
@@ -97,6 +93,7 @@ impl<'p> Abstracted<'p> {
         projections: &Projections,
         problem: &'p Problem<'p>,
         projected: &'p Projected<'p>,
+        mut costs: KnownCosts,
         meter: &mut Meter<'_>,
     ) -> Result<Self, Interrupted> {
         let n_observations = problem.demonstration.len();
@@ -145,23 +142,22 @@ impl<'p> Abstracted<'p> {
             if n == 0 { 1.0 } else { f64::from(n_own) / f64::from(n) }
         };
         let parts: Vec<f64> = abstraction.change_sets.iter().map(part).collect();
-        let mut numbers = 0..;
-        let ways = abstraction.ways.filter_map(|way| {
-            let number = numbers.next()?;
-            let cost = problem.body.cost(way.action, Some(&way.own_cost));
-            let part = parts[way.change_set as usize];
-            cost.is_finite().then_some(CostedWay { from: way.from, number, cost: cost * part, part })
-        });
-        let states = problem.model.states();
-        let values_of = |state: &StateIdx| {
-            let row = states.row(*state);
-            #[expect(clippy::cast_possible_truncation, reason = "values are counted in u32")]
-            columns.iter().map(move |own| own.first as u32 + row[own.position])
+        let kind_cost = |kind: &WayKind| {
+            let part = parts[kind.change_set as usize];
+            WayCost { cost: problem.body.cost(kind.action, Some(&kind.own_cost)) * part, part }
         };
-        let values = abstraction.members.iter().flat_map(values_of).collect();
-        let costs = Table::filled_with(UNKNOWN, abstraction.members.len(), n_observations);
+        let kinds: Vec<WayCost> = abstraction.kinds.iter().map(kind_cost).collect();
+        let positions = &abstraction.positions;
+        let places = columns.iter().map(|own| (positions.binary_search(&own.position).unwrap_or_default(), own.first));
+        let places: Vec<(usize, usize)> = places.collect();
+        let mut values = Vec::with_capacity(abstraction.n_classes() * columns.len());
+        for of_class in abstraction.values.chunks(positions.len()) {
+            #[expect(clippy::cast_possible_truncation, reason = "values are counted in u32")]
+            values.extend(places.iter().map(|(place, first)| *first as u32 + of_class[*place]));
+        }
+        costs.prepare(abstraction.n_classes(), n_observations);
         // Where single attributes cost nothing, what the cheapest action costs tells what matters.
-        let costs_of_ways = ways.items().iter().map(|way| way.cost).filter(|cost| *cost > 0.0);
+        let costs_of_ways = kinds.iter().map(|kind| kind.cost).filter(|cost| *cost > 0.0 && cost.is_finite());
         let least = if least_all > 0.0 { Some(least_all) } else { costs_of_ways.reduce(f64::min) };
         let mut new = Self {
             open: Open::new(least.unwrap_or(f64::MIN_POSITIVE)),
@@ -173,7 +169,7 @@ impl<'p> Abstracted<'p> {
             width,
             from_start,
             terms,
-            ways,
+            kinds,
             costs,
             least_terms,
             least_rest,
@@ -187,12 +183,12 @@ impl<'p> Abstracted<'p> {
     fn begin(&mut self, meter: &mut Meter<'_>) -> Result<(), Interrupted> {
         let last = self.problem.last();
         let abstraction = Arc::clone(&self.abstraction);
-        for (class, member) in abstraction.members.iter().enumerate() {
+        for (class, values) in abstraction.values.chunks(abstraction.positions.len()).enumerate() {
             meter.spend_or_stop(1)?;
-            let row = self.problem.model.states().row(*member);
-            let term =
-                |position: &usize| self.problem.end.as_ref().map_or(0.0, |end| end.term(*position, row[*position]));
-            let cost = abstraction.positions.iter().map(term).fold(0.0, |sum, term| sum + term);
+            let cost = self.problem.end.as_ref().map_or(0.0, |end| {
+                let values = abstraction.positions.iter().zip(values);
+                values.fold(0.0, |sum, (position, value)| sum + end.term(*position, *value))
+            });
             if self.cost_from_start(class, last).is_finite() {
                 self.take(class, last, cost);
             }
@@ -225,7 +221,7 @@ impl<'p> Abstracted<'p> {
     /// `H`, if the node is closed.
     #[inline]
     pub(super) fn closed_cost(&self, class: usize, i: usize) -> Option<f64> {
-        let cost = self.costs.at(class, i);
+        let cost = self.costs.at(self.costs.number_of(class, i));
         cost.is_sign_positive().then_some(cost)
     }
 
@@ -233,12 +229,9 @@ impl<'p> Abstracted<'p> {
     #[expect(clippy::inline_always, reason = "it is what the backward search does most")]
     #[inline(always)]
     fn take(&mut self, class: usize, i: usize, cost: f64) {
-        let known = self.costs.at_mut(class, i);
-        if cost < known.abs() {
-            *known = -cost;
-            let f = self.least_rest + cost + self.cost_from_start(class, i);
-            #[expect(clippy::cast_possible_truncation, reason = "tables have fewer than 2^32 entries")]
-            self.open.push(f, (class * self.costs.stride() + i) as u32);
+        let node = self.costs.number_of(class, i);
+        if self.costs.lower(node, cost) {
+            self.open.push(self.least_rest + cost + self.cost_from_start(class, i), node);
         }
     }
 
@@ -256,30 +249,31 @@ impl<'p> Abstracted<'p> {
 
     /// Closes the nodes of the least `f`.
     fn expand_bucket(&mut self, meter: &mut Meter<'_>) -> Result<(), Interrupted> {
-        let (last, stride) = (self.problem.last(), self.costs.stride());
+        let last = self.problem.last();
+        let abstraction = Arc::clone(&self.abstraction);
         // If extra actions pay nothing, a skip after one costs what a match does.
         let needs_matches = self.problem.recurrence().paid(MoveKind::Extra, 1.0) > 0.0;
-        while let Some(id) = self.open.pop() {
-            let (class, i) = (id as usize / stride, id as usize % stride);
-            let known = self.costs.at(class, i);
+        while let Some(node) = self.open.pop() {
+            let (class, i) = self.costs.node_of(node);
+            let known = self.costs.at(node);
             if known.is_sign_positive() {
                 continue;
             }
-            let ways = self.ways.range(class);
+            let ways = abstraction.ways.of(class);
             meter.spend_or_stop(1 + ways.len() as u64)?;
-            *self.costs.at_mut(class, i) = -known;
+            self.costs.close(node);
             let moves = self.moves_to(class, i, -known);
             if let Some(before) = i.checked_sub(1) {
                 self.take(class, before, moves.advanced);
-            }
-            let may_linger = i < last || self.problem.end.is_some();
-            for at in ways {
-                let way = self.ways.items()[at];
-                if let Some(before) = i.checked_sub(1).filter(|_| needs_matches) {
-                    self.take(way.from as usize, before, moves.matched(way));
+                if needs_matches {
+                    for way in ways {
+                        self.take(way.from as usize, before, moves.matched(self.kinds[way.kind as usize]));
+                    }
                 }
-                if may_linger {
-                    self.take(way.from as usize, i, moves.extra(way));
+            }
+            if i < last || self.problem.end.is_some() {
+                for way in ways {
+                    self.take(way.from as usize, i, moves.extra(self.kinds[way.kind as usize]));
                 }
             }
         }
@@ -288,7 +282,7 @@ impl<'p> Abstracted<'p> {
     }
 
     /// Makes the estimate for a state at an observation exact, as far as classes tell; or, if that would take longer, shows that no mapping
-    /// through it costs as little as `f`.
+    /// through it costs as little as `f`. Says whether it is exact.
     ///
     /// # Errors
     ///
@@ -299,30 +293,30 @@ impl<'p> Abstracted<'p> {
         i: usize,
         f: f64,
         meter: &mut Meter<'_>,
-    ) -> Result<(), Interrupted> {
+    ) -> Result<bool, Interrupted> {
         /// So much more at once, so that not every node is looked at again for every bucket.
-        const AHEAD: f64 = 1.0 / 512.0;
+        const AHEAD: f64 = 1.0 / 64.0;
         let (class, f) = (self.abstraction.classes[state as usize] as usize, f * (1.0 + AHEAD));
         while self.closed_cost(class, i).is_none() && self.least_f <= f && !self.open.is_empty() {
             self.expand_bucket(meter)?;
         }
-        Ok(())
+        Ok(self.closed_cost(class, i).is_some())
     }
 
-    /// Raises the estimates for a state at observations from `first` on by what the group costs above the sum of
-    /// what its attributes cost alone.
-    pub(in crate::mapping) fn raise(&self, state: StateIdx, first: usize, estimates: &mut [Estimate]) {
+    /// By what an estimate for a state at an observation rises: what the group costs above the sum of what its attributes cost alone.
+    pub(in crate::mapping) fn rise(&self, state: StateIdx, i: usize) -> f64 {
         let class = self.abstraction.classes[state as usize] as usize;
-        let n_left = self.problem.demonstration.len() - first;
-        for (i, estimate) in (first..).zip(estimates.iter_mut().take(n_left)) {
-            let values = self.columns.iter().zip(self.values(class));
-            let alone = values.fold(0.0, |sum, (own, value)| {
-                sum + self.projected.table.at(own.offset + *value as usize - own.first, i).cost_to_go
-            });
-            let at_least = || self.least_f - self.least_rest - self.cost_from_start(class, i);
-            let cost = self.closed_cost(class, i).unwrap_or_else(at_least);
-            estimate.cost_to_go += (cost - alone).max(0.0);
-        }
+        let values = self.columns.iter().zip(self.values(class));
+        let alone = values.fold(0.0, |sum, (own, value)| {
+            sum + self.projected.table.at(own.offset + *value as usize - own.first, i).cost_to_go
+        });
+        let at_least = || self.least_f - self.least_rest - self.cost_from_start(class, i);
+        (self.closed_cost(class, i).unwrap_or_else(at_least) - alone).max(0.0)
+    }
+
+    /// What was known, to be used again.
+    pub(in crate::mapping) fn into_costs(self) -> KnownCosts {
+        self.costs
     }
 
     /// How much memory it takes, in bytes.
@@ -330,7 +324,6 @@ impl<'p> Abstracted<'p> {
         self.costs.size_bytes()
             + size_of_val(self.from_start.as_slice())
             + size_of_val(self.terms.as_slice())
-            + self.ways.size_bytes()
             + size_of_val(self.values.as_slice())
             + size_of_val(self.least_terms.as_slice())
             + self.open.size_bytes()
@@ -349,12 +342,12 @@ struct MovesTo {
 
 impl MovesTo {
     #[inline]
-    fn matched(self, way: CostedWay) -> f64 {
+    fn matched(self, way: WayCost) -> f64 {
         way.cost + self.advanced
     }
 
     #[inline]
-    fn extra(self, way: CostedWay) -> f64 {
+    fn extra(self, way: WayCost) -> f64 {
         way.cost + way.part * self.least_paid + self.lingered
     }
 }

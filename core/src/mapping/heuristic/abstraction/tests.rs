@@ -9,7 +9,7 @@ use crate::mapping::by_definition::{
     any_conditions, compiled, fitted, least_costs, moves, nodes, optimum, problem, with_conditions,
 };
 use crate::mapping::heuristic::Heuristic as _;
-use crate::mapping::heuristic::projected::{Estimate, TableBuffers, TableRoom};
+use crate::mapping::heuristic::projected::{TableBuffers, TableRoom};
 
 /// A model of up to 12 states and three attributes, of which some weigh nothing, some transitions cost something of their own, and some states
 /// are unsafe; a demonstration, and any conditions.
@@ -53,6 +53,22 @@ fn group() -> impl Strategy<Value = Vec<usize>> {
     prop::sample::select(vec![vec![0, 1], vec![0, 2], vec![1, 2], vec![0, 1, 2]])
 }
 
+/// An abstraction of a problem, in memory in which others were searched before.
+fn abstracted<'p>(
+    abstraction: Abstraction,
+    projections: &Projections,
+    problem: &'p Problem<'p>,
+    projected: &'p Projected<'p>,
+    meter: &mut Meter<'_>,
+) -> Abstracted<'p> {
+    let abstraction = Arc::new(abstraction);
+    let mut make =
+        |costs| Abstracted::new(Arc::clone(&abstraction), projections, problem, projected, costs, meter).unwrap();
+    let mut before = make(KnownCosts::default());
+    before.settle(0, 0, f64::INFINITY, &mut Meter::new(&mut Uninterrupted, 1)).unwrap();
+    make(before.into_costs())
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 600, failure_persistence: None, ..ProptestConfig::default() })]
 
@@ -74,20 +90,18 @@ proptest! {
         let mut interrupt = Uninterrupted;
         let meter = &mut Meter::new(&mut interrupt, 1);
         let abstraction = Abstraction::new(&model, &projections, group, usize::MAX, meter).unwrap().unwrap();
-        let mut abstracted = Abstracted::new(Arc::new(abstraction), &projections, &problem, &projected, meter).unwrap();
+        let mut abstracted = abstracted(abstraction, &projections, &problem, &projected, meter);
         let row = |state| problem.model.states().row(state);
         let is_reached = |(i, state): &(usize, StateIdx)| from_start[*i][*state as usize].is_finite();
         let reached: Vec<(usize, StateIdx)> = nodes(&problem).into_iter().filter(is_reached).collect();
         let estimate = |abstracted: &Abstracted<'_>, i: usize, state: StateIdx| {
-            let mut estimates = [Estimate { distance: 0.0, cost_to_go: projected.cost_to_go(i, row(state)) }];
-            abstracted.raise(state, i, &mut estimates);
-            estimates[0].cost_to_go
+            projected.cost_to_go(i, row(state)) + abstracted.rise(state, i)
         };
         let mut before: Vec<f64> = reached.iter().map(|(i, state)| projected.cost_to_go(*i, row(*state))).collect();
         for (i, state, part) in std::iter::once((0, 0, 0.0)).chain(settled) {
             let (i, state) = (i.min(problem.last()), state % model.states().len());
             let f = part * optimum;
-            abstracted.settle(state, i, f, meter).unwrap();
+            let is_settled = abstracted.settle(state, i, f, meter).unwrap();
             let now: Vec<f64> = reached.iter().map(|(i, state)| estimate(&abstracted, *i, *state)).collect();
             for ((i, state), h) in reached.iter().zip(&now) {
                 prop_assert!(*h <= to_end[*i][*state as usize] + close, "admissible at ({i}, {state})");
@@ -101,8 +115,8 @@ proptest! {
                 // Either it is known exactly, or that it costs more.
                 let whole = from_start[i][state as usize] + estimate(&abstracted, i, state);
                 let class = abstracted.abstraction.classes[state as usize] as usize;
-                let is_closed = abstracted.closed_cost(class, i).is_some();
-                prop_assert!(is_closed || whole + close >= f || abstracted.open.is_empty());
+                prop_assert_eq!(is_settled, abstracted.closed_cost(class, i).is_some());
+                prop_assert!(is_settled || whole + close >= f || abstracted.open.is_empty());
             }
         }
     }
@@ -127,7 +141,7 @@ proptest! {
         let mut interrupt = Uninterrupted;
         let meter = &mut Meter::new(&mut interrupt, 1);
         let abstraction = Abstraction::new(&model, &projections, vec![0, 1, 2], usize::MAX, meter).unwrap().unwrap();
-        let mut abstracted = Abstracted::new(Arc::new(abstraction), &projections, &problem, &projected, meter).unwrap();
+        let mut abstracted = abstracted(abstraction, &projections, &problem, &projected, meter);
         let least = problem.starts.iter(problem.model).map(|(start, row)| {
             abstracted.settle(start, 0, f64::INFINITY, meter).unwrap();
             let class = abstracted.abstraction.classes[start as usize] as usize;
@@ -177,6 +191,10 @@ fn yard(side: usize) -> (Value, Value) {
     (model, json!({"model": "yard", "demonstration": seen.collect::<Value>(), "extra_weight": 0}))
 }
 
+fn room_for(max_classes: usize) -> AbstractionRoom {
+    AbstractionRoom { n_tries: 4, max_classes, max_bytes: usize::MAX }
+}
+
 /// What solving gives, and the names of the group.
 fn solve(model: &Model, request: &Value, max_classes: usize) -> Option<Vec<String>> {
     let projections = Projections::new(model, usize::MAX, &mut Uninterrupted).unwrap();
@@ -187,7 +205,9 @@ fn solve(model: &Model, request: &Value, max_classes: usize) -> Option<Vec<Strin
     let mut interrupt = Uninterrupted;
     let meter = &mut Meter::new(&mut interrupt, 1);
     let abstractions = Abstractions::default();
-    let solved = abstractions.solve(&projections, &problem, &projected, max_classes, usize::MAX, meter).unwrap();
+    let solved = abstractions
+        .solve(&projections, &problem, &projected, room_for(max_classes), &mut KnownCosts::default(), meter)
+        .unwrap();
     assert_eq!(solved.is_some(), abstractions.size_bytes() > 0);
     let name = |position: &usize| model.schema().attributes()[*position].name.clone();
     solved.map(|abstracted| abstracted.abstraction.positions.iter().map(name).collect())
@@ -225,7 +245,9 @@ fn solving_stops_when_it_is_told_to() {
             if left > 0 { Signal::Continue } else { Signal::Finish }
         };
         let meter = &mut Meter::new(&mut interrupt, 64);
-        Abstractions::default().solve(&projections, &problem, &projected, usize::MAX, usize::MAX, meter).map(|_| ())
+        Abstractions::default()
+            .solve(&projections, &problem, &projected, room_for(usize::MAX), &mut KnownCosts::default(), meter)
+            .map(|_| ())
     };
     assert_eq!(solved_within(u64::MAX, &mut n_polls), Ok(()));
     assert!(n_polls > 50, "{n_polls}");

@@ -31,11 +31,6 @@ impl<T: Copy> Table<T> {
         }
     }
 
-    /// How many entries there are for each class.
-    pub(in crate::mapping::heuristic) fn stride(&self) -> usize {
-        self.stride
-    }
-
     /// How many entries a table has, with the room.
     pub(in crate::mapping::heuristic) fn n_entries_for(n_classes: usize, n_observations: usize) -> usize {
         n_classes.saturating_mul(stride_for(n_observations))

@@ -63,10 +63,12 @@ const IMPATIENT: Patience = Patience {
     few_entries: 0,
     few_entries_per_observation: 8,
     entries_per_expansion: 16,
-    abstract_below_extra_weight: 1.0,
     min_expansions_before_abstraction: 10,
     nodes_per_expansion_before_abstraction: u64::MAX,
     states_per_class: 1,
+    least_excess: 0.0,
+    refine_below_extra_weight: 1.0,
+    max_groups: 4,
     min_expansions_before_sweep: 40,
     nodes_per_expansion: u64::MAX,
 };
@@ -231,6 +233,48 @@ fn a_sweep_that_is_cut_short_raises_the_bound_and_counts() {
     assert!(bounds.is_sorted() && bounds[0] < bounds[bounds.len() - 1], "{bounds:?}");
     assert!(bounds.iter().all(|bound| *bound <= optimum.cost.total), "{bounds:?}, of {:?}", optimum.cost);
     assert!(swept.iter().all(|mapping| (mapping.n_expanded - 10) % 600 == 0));
+}
+
+#[test]
+fn a_long_search_whose_mappings_cost_far_more_than_attributes_tell_one_by_one_is_guided_by_attributes_taken_together() {
+    // A yard with tins here and there, and a demonstration that picks up as many on its way through the middle.
+    const SIDE: usize = 16;
+    let places = [(2, 4), (5, 12), (8, 3), (11, 13), (14, 5)];
+    let number = |x: usize, y: usize, tins: usize| (x * SIDE + y) * 32 + tins;
+    let (mut states, mut transitions) = (Vec::new(), Vec::new());
+    for from in 0..SIDE * SIDE * 32 {
+        let (place, tins) = (from / 32, from % 32);
+        let (x, y) = (place / SIDE, place % SIDE);
+        states.push(json!([x, y, tins, tins.count_ones()]));
+        let mut go = |name: &str, to: usize| transitions.push(json!([from, name, to]));
+        (x + 1 < SIDE).then(|| go("east", number(x + 1, y, tins)));
+        (x > 0).then(|| go("west", number(x - 1, y, tins)));
+        (y + 1 < SIDE).then(|| go("north", number(x, y + 1, tins)));
+        (y > 0).then(|| go("south", number(x, y - 1, tins)));
+        let here = places.iter().position(|at| *at == (x, y)).filter(|tin| tins >> tin & 1 == 0);
+        if let Some(tin) = here {
+            go("take", number(x, y, tins | 1 << tin));
+        }
+    }
+    let actions = ["east", "west", "north", "south", "take"].map(|name| json!({"name": name, "cost": 0.3}));
+    let attribute = |name: &str, weight: f64| json!({"name": name, "kind": "number", "weight": weight});
+    let mapper = prepared(&json!({
+        "attributes": [attribute("x", 1.0), attribute("y", 1.0), attribute("which", 0.0), attribute("tins", 9.0)],
+        "actions": actions,
+        "dynamics": {"kind": "table", "start": 0, "states": states, "transitions": transitions},
+    }));
+    let seen = (0..45).map(|i| json!({"x": i / 3, "y": 8, "tins": i / 8}));
+    let request = json!({"model": "yard", "demonstration": seen.collect::<Value>()});
+    let map = |mapper: &Mapper, heuristic| {
+        let settings = Settings { heuristic, ..Settings::default() };
+        mapper.map(&problem(mapper.model(), &request), settings, &mut Uninterrupted).unwrap()
+    };
+    let guided = map(&mapper, HeuristicName::Default);
+    let alone = Patience { least_excess: f64::INFINITY, ..Patience::DEFAULT };
+    let mapper = Mapper { patience: alone, ..mapper };
+    let (alone, without) = (map(&mapper, HeuristicName::Default), map(&mapper, HeuristicName::None));
+    assert!((guided.cost.total - without.cost.total).abs() < 1e-9 && guided.status == Status::Optimal);
+    assert!(guided.n_expanded < alone.n_expanded / 2, "{} and {}", guided.n_expanded, alone.n_expanded);
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Which attributes a group misses.
 
-use super::{Abstracted, CostedWay};
+use super::Abstracted;
 use crate::interrupt::{Interrupted, Meter};
 use crate::mapping::heuristic::abstraction::ClassIdx;
 use crate::model::Rows;
@@ -27,7 +27,7 @@ impl Abstracted<'_> {
         let mut current = row.to_vec();
         let mut missed = Vec::new();
         for number in self.cheapest_way(self.abstraction.classes[start as usize], meter)? {
-            let (from, to) = self.abstraction.ways.items()[number as usize].states;
+            let (from, to) = self.abstraction.states[number];
             let [row, row_after] = [from, to].map(|state| problem.model.states().row(state));
             for position in (0..row.len()).filter(|at| row[*at] != row_after[*at]) {
                 if current[position] != row[position] && self.abstraction.positions.binary_search(&position).is_err() {
@@ -42,11 +42,11 @@ impl Abstracted<'_> {
     }
 
     /// The ways that are gone from a class at the first observation to the end, by their numbers, if that is closed.
-    fn cheapest_way(&self, start: ClassIdx, meter: &mut Meter<'_>) -> Result<Vec<u32>, Interrupted> {
-        let (last, n_classes) = (self.problem.last(), self.abstraction.members.len());
-        let entries =
-            (0..).zip(self.ways.iter()).flat_map(|(to, ways)| ways.iter().map(move |way| (way.from, (to, *way))));
-        let ways_out: Rows<(usize, CostedWay)> = Rows::try_of_entries(n_classes, entries, || meter.spend_or_stop(1))?;
+    fn cheapest_way(&self, start: ClassIdx, meter: &mut Meter<'_>) -> Result<Vec<usize>, Interrupted> {
+        let (last, n_classes, ways) = (self.problem.last(), self.abstraction.n_classes(), &self.abstraction.ways);
+        let ways_into = (0..n_classes).flat_map(|to| ways.range(to).map(move |number| (to, number)));
+        let entries = ways_into.map(|(to, number)| (ways.items()[number].from, (to, number)));
+        let ways_out: Rows<(usize, usize)> = Rows::try_of_entries(n_classes, entries, || meter.spend_or_stop(1))?;
         let (mut class, mut i) = (start as usize, 0);
         let mut gone = Vec::new();
         // Actions without cost could go on for ever.
@@ -59,10 +59,11 @@ impl Abstracted<'_> {
                 continue;
             }
             meter.spend_or_stop(1 + ways_out.of(class).len() as u64)?;
-            let next = ways_out.of(class).iter().find_map(|(to, way)| {
-                let matches = i < last && moves(*to, i + 1).is_some_and(|moves| moves.matched(*way) == cost);
-                let lingers = moves(*to, i).is_some_and(|moves| moves.extra(*way) == cost);
-                (matches || lingers).then_some((*to, i + usize::from(matches), way.number))
+            let next = ways_out.of(class).iter().find_map(|(to, number)| {
+                let way = self.kinds[ways.items()[*number].kind as usize];
+                let matches = i < last && moves(*to, i + 1).is_some_and(|moves| moves.matched(way) == cost);
+                let lingers = moves(*to, i).is_some_and(|moves| moves.extra(way) == cost);
+                (matches || lingers).then_some((*to, i + usize::from(matches), *number))
             });
             let Some((to, next_i, number)) = next else { break };
             gone.push(number);
