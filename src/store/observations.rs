@@ -1,13 +1,13 @@
 //! Observations of sessions: who may add them, and how they come to their table.
 
 use std::collections::HashSet;
-use std::fmt::{self, Display, Formatter, Write};
 use std::time::Duration;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use sqlx::SqliteConnection;
+use sqlx::query_builder::{QueryBuilder, Separated};
+use sqlx::{Sqlite, SqliteConnection};
 
 use super::StoreError;
 
@@ -153,69 +153,61 @@ pub(super) async fn find_open(
     Ok(open.map(|(id, owner, n_observations)| (id, OpenSession { owner: Owner(owner), n_observations })).collect())
 }
 
-/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. At most four
+/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. A few
 /// statements, however many there are: each one costs the driver a change of threads.
 pub(super) async fn add(connection: &mut SqliteConnection, group: &[&Arrived]) -> Result<Vec<bool>, StoreError> {
-    let rows =
-        group.iter().map(|new| json!([new.session_id, new.seq, new.n_states, new.states, new.at.as_millisecond()]));
-    let rows = Value::Array(rows.collect()).to_string();
+    let rows = group.iter().map(|new| json!([new.session_id, new.seq, new.n_states, new.at.as_millisecond()]));
     // Only what comes next, and only once, whatever is retried or raced.
     let updated = sqlx::query_scalar::<_, String>(
         "UPDATE sessions
-         SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 4)
+         SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 3)
          FROM json_each($1) AS new
          WHERE sessions.id = new.value ->> 0 AND status = 'open' AND n_observations = new.value ->> 1
          RETURNING sessions.id",
     )
-    .bind(&rows)
+    .bind(Value::Array(rows.collect()).to_string())
     .fetch_all(&mut *connection)
     .await?;
     let updated: HashSet<String> = updated.into_iter().collect();
     let is_updated: Vec<bool> = group.iter().map(|new| updated.contains(&new.session_id)).collect();
-    let added = || group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated).map(|(new, _)| new);
-    let observed = added().filter(|new| new.n_states > 0).map(|new| {
+    let added = group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated).map(|(new, _)| *new);
+    let added: Vec<&Arrived> = added.collect();
+    let observed: Vec<_> = added.iter().copied().filter(|new| new.n_states > 0).collect();
+    let into = "INSERT INTO observations (session_id, seq, n_states, states, times) ";
+    insert(connection, into, &observed, |mut row, new| {
         let times = (!new.times.is_empty()).then(|| json!(new.times).to_string());
-        json!([new.session_id, new.seq, new.n_states, new.states, times])
-    });
-    let observed: Vec<_> = observed.collect();
-    if !observed.is_empty() {
-        let query = sqlx::query(
-            "INSERT INTO observations (session_id, seq, n_states, states, times)
-             SELECT value ->> 0, value ->> 1, value ->> 2, value ->> 3, value ->> 4 FROM json_each($1)",
-        );
-        query.bind(Value::Array(observed).to_string()).execute(&mut *connection).await?;
-    }
-    let steps = added().flat_map(|new| {
-        let rows = new.steps.iter();
-        rows.map(|NewSteps { first, steps, .. }| json!([new.session_id, first, Hexadecimal(steps).to_string()]))
-    });
+        row.push_bind(&new.session_id).push_bind(new.seq).push_bind(new.n_states);
+        row.push_bind(&new.states).push_bind(times);
+    })
+    .await?;
+    let roots: Vec<_> = added.iter().filter_map(|new| Some((&new.session_id, new.steps.last()?))).collect();
+    insert(connection, "INSERT OR REPLACE INTO roots (session_id, root) ", &roots, |mut row, (id, new)| {
+        row.push_bind(*id).push_bind(&new.root);
+    })
+    .await?;
+    let steps = added.iter().flat_map(|new| new.steps.iter().map(|steps| (&new.session_id, steps)));
     let steps: Vec<_> = steps.collect();
-    if !steps.is_empty() {
-        let roots = added().filter_map(|new| Some((&new.session_id, new.steps.last()?)));
-        let roots = roots.map(|(id, NewSteps { root, .. })| json!([id, Hexadecimal(root).to_string()]));
-        let query = sqlx::query(
-            "INSERT OR REPLACE INTO roots (session_id, root) SELECT value ->> 0, unhex(value ->> 1) FROM json_each($1)",
-        );
-        query.bind(Value::Array(roots.collect()).to_string()).execute(&mut *connection).await?;
-        let query = sqlx::query(
-            "INSERT INTO steps (session_id, first_step, steps)
-             SELECT value ->> 0, value ->> 1, unhex(value ->> 2) FROM json_each($1)",
-        );
-        query.bind(Value::Array(steps).to_string()).execute(connection).await?;
-    }
+    insert(connection, "INSERT INTO steps (session_id, first_step, steps) ", &steps, |mut row, (id, new)| {
+        row.push_bind(*id).push_bind(new.first).push_bind(&new.steps);
+    })
+    .await?;
     Ok(is_updated)
 }
 
-/// Bytes, as two digits each: JSON has none.
-struct Hexadecimal<'b>(&'b [u8]);
-
-impl Display for Hexadecimal<'_> {
-    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
-        const DIGITS: &[u8; 16] = b"0123456789abcdef";
-        for byte in self.0 {
-            let digits = [byte >> 4, byte & 15].map(|digit| char::from(DIGITS[usize::from(digit)]));
-            digits.into_iter().try_for_each(|digit| f.write_char(digit))?;
-        }
-        Ok(())
+/// Inserts rows, many in a statement.
+async fn insert<R>(
+    connection: &mut SqliteConnection,
+    into: &str,
+    rows: &[R],
+    bind: impl Fn(Separated<'_, Sqlite, &'static str>, &R),
+) -> Result<(), StoreError> {
+    /// SQLite takes 32,766 values in a statement.
+    const MAX_ROWS: usize = 1000;
+    for rows in rows.chunks(MAX_ROWS) {
+        let mut query = QueryBuilder::new(into);
+        query.push_values(rows, &bind);
+        // Hardly two are alike.
+        query.build().persistent(false).execute(&mut *connection).await?;
     }
+    Ok(())
 }
