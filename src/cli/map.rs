@@ -8,19 +8,21 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
+use indicatif::ProgressBar;
 use serde_json::{Value, json};
 
 use super::drawing::PictureFlags;
 use super::input::{Cells, Observations, Spot};
+use super::model::open;
 use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags, parse_within};
 use super::{CliError, render};
 use crate::clock::Clock;
 use crate::config::parse_whole;
-use crate::service::hash_of;
-use etude_core::document::{self, Faults, Place};
+use crate::service::hash_of_definition;
+use etude_core::document::{self, Faults, ParseError, Place};
 use etude_core::interrupt::{Interrupted, Signal, Uninterrupted, time_until_finish};
 use etude_core::mapping::{Mapper, Policy, Request, Stamp, Warning};
-use etude_core::model::{CompileError, Definition, Limits, Model};
+use etude_core::model::{CompileError, Definition, Format, Limits, Model, ReadError};
 
 #[derive(Args, Debug)]
 pub(super) struct Map {
@@ -96,7 +98,7 @@ impl Map {
         let stamp = Stamp {
             id: None,
             model: document["model"].as_str().unwrap_or_default().to_owned(),
-            model_hash: hash_of(definition.text()),
+            model_hash: hash_of_definition(&definition)?,
             lookahead: asked.lookahead.map(NonZeroU32::get),
             elapsed_us: as_micros(clock.elapsed(started)),
             warnings: asked.problem.warnings(&document::Path::Member(&document::Path::Root, "demonstration")),
@@ -157,15 +159,24 @@ fn as_micros(duration: Duration) -> u64 {
     u64::try_from(duration.as_micros()).unwrap_or(u64::MAX)
 }
 
-/// Reads and compiles a model. There is no limit to tables but memory: nobody else is served.
+/// Reads and compiles a model, as its file comes, which may be compressed. There is no limit to tables but memory: nobody else is served.
 pub(super) fn read_model(path: &Path) -> Result<(Definition, Model), CliError> {
-    let model_error = |error| match error {
-        CompileError::Faults(faults) => CliError::Faults { what: format!("the model {}", path.display()), faults },
+    let faulty = |faults| CliError::Faults { what: format!("the model {}", path.display()), faults };
+    let content = open(path, &ProgressBar::hidden())?;
+    let definition = Definition::parse_from(content, Format::Json, Limits::NONE, &mut Uninterrupted);
+    let definition = definition.map_err(|error| match error {
+        ReadError::Faults(faults) | ReadError::Parse(ParseError::Faults(faults)) => faulty(faults),
+        ReadError::Cancelled(cancelled) => cancelled.into(),
+        ReadError::OutOfTime => Interrupted::OutOfTime.into(),
+        ReadError::Read(source) => CliError::Read { path: path.to_owned(), source },
+        ReadError::Parse(_) | ReadError::TooLarge(_) => CliError::Faulty(format!("{}: {error}", path.display())),
+    })?;
+    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted);
+    let model = model.map_err(|error| match error {
+        CompileError::Faults(faults) => faulty(faults),
         CompileError::Cancelled(cancelled) => cancelled.into(),
         CompileError::OutOfTime => Interrupted::OutOfTime.into(),
-    };
-    let definition = Definition::read(&read_json(path)?, Limits::NONE, &mut Uninterrupted).map_err(model_error)?;
-    let model = Model::compile(&definition, Limits::DEFAULT, &mut Uninterrupted).map_err(model_error)?;
+    })?;
     Ok((definition, model))
 }
 

@@ -115,7 +115,7 @@ impl Import {
 }
 
 /// Opens the file at `path`, `-` for standard input, decompressed; how far it is read is shown by `bar`.
-fn open(path: &Path, bar: &ProgressBar) -> Result<Box<dyn BufRead>, CliError> {
+pub(super) fn open(path: &Path, bar: &ProgressBar) -> Result<Box<dyn BufRead>, CliError> {
     const XZ: &[u8] = b"\xfd7zXZ\0";
     const BZIP2: &[u8] = b"BZh";
     let read = |source| CliError::Read { path: path.to_owned(), source };

@@ -47,7 +47,7 @@ pub use caller::{Caller, Client};
 pub use definitions::{DefinitionReader, ModelForm, ModelText, OpenText};
 pub use error::{Outage, OutageKind, ServiceError};
 pub use experience::ExperienceAnswer;
-pub use hash::hash_of;
+pub use hash::{hash_of, hash_of_definition};
 pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};
 pub use models::{ModelAnswer, ModelDefinition, Registered};

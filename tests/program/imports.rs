@@ -45,6 +45,29 @@ fn a_file_is_imported_from_disk_or_from_a_pipe_compressed_or_not() {
 }
 
 #[test]
+fn a_model_is_mapped_as_its_file_comes_compressed_or_not_and_a_cut_one_is_told_with_its_line() {
+    let directory = tempfile::tempdir().unwrap();
+    let model = std::fs::read(Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/taxi/no-west.json")).unwrap();
+    let mapped = |content: &[u8]| {
+        let path = directory.path().join("no-west.json");
+        std::fs::write(&path, content).unwrap();
+        let files =
+            ["map", "--model", path.to_str().unwrap(), "--demonstration", "examples/taxi/demonstration.json", "--json"];
+        let done = run(&files);
+        let policy = text(&done.stdout).split("\"elapsed_us\"").next().unwrap().to_owned();
+        (policy, text(&done.stderr).replace(path.to_str().unwrap(), "FILE"))
+    };
+    let (policy, told) = mapped(&model);
+    assert!(policy.contains("\"status\":\"optimal\"") && told.is_empty(), "{policy} {told}");
+    let mut gzip = GzEncoder::new(Vec::new(), Compression::fast());
+    gzip.write_all(&model).unwrap();
+    assert_eq!(mapped(&gzip.finish().unwrap()).0, policy);
+    assert_eq!(mapped(&zstd::bulk::compress(&model, 1).unwrap()).0, policy);
+    let (_, told) = mapped(&model[..model.len() / 2]);
+    assert!(told.starts_with("etude: FILE: ") && told.contains("line "), "{told}");
+}
+
+#[test]
 fn what_is_wrong_with_a_file_or_a_flag_is_told_in_a_line() {
     for (input, flags, expected) in [
         ("[[[[1, 0, 3, false]]]]", &[][..], "cannot import -: /P/0/0: a reward of 3 is no cost; "),

@@ -15,7 +15,7 @@ use super::input::{Cells, Observations, Source, Spot, parse_json};
 use super::map::read_model;
 use super::options::{FlaggedRequest, ReadingFlags, parse_observed, parse_start, parse_weight};
 use super::{CliError, render, runtime};
-use crate::service::hash_of;
+use crate::service::hash_of_definition;
 use etude_core::attribute::AttributeDocument;
 use etude_core::document::{Faults, Place};
 use etude_core::inspection::{Query, Report, inspect};
@@ -109,7 +109,7 @@ impl Inspect {
             faults.check(query).map_err(|faults| asked.request.told_of(&faults, &asked.source, &asked.spots))?;
         let report = inspect(&model, &query, &mut Uninterrupted)?;
         let name = self.model.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
-        Ok((Report { model: name, model_hash: hash_of(definition.text()), ..report }, asked))
+        Ok((Report { model: name, model_hash: hash_of_definition(&definition)?, ..report }, asked))
     }
 
     async fn inspect_at(&self, server: &ServerUrl) -> Result<(Report, Asked), CliError> {
