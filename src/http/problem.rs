@@ -324,9 +324,10 @@ impl From<ServiceError> for Problem {
             ServiceError::UnknownVersion { .. } => Self::new(ProblemKind::UnknownVersion, detail),
             ServiceError::AlreadyRewarded { .. } => Self::new(ProblemKind::AlreadyRewarded, detail),
             ServiceError::TrialFailed { .. } => Self::new(ProblemKind::TrialFailed, detail),
-            ServiceError::Pool(PoolError::Busy) | ServiceError::NoRoom(_) | ServiceError::Compiling { .. } => {
-                Self::new(ProblemKind::Busy, detail)
-            }
+            ServiceError::Pool(PoolError::Busy)
+            | ServiceError::NoRoom(_)
+            | ServiceError::Shortage(_)
+            | ServiceError::Compiling { .. } => Self::new(ProblemKind::Busy, detail),
             ServiceError::Unavailable(Outage { kind: OutageKind::Full, .. }) => {
                 Self::new(ProblemKind::StorageFull, detail)
             }

@@ -7,7 +7,7 @@ use super::{Kind, PoolError};
 use crate::memory::NoRoom;
 use crate::store::{StoreError, Unavailable};
 use etude_core::document::{Faults, ParseError, Quoted};
-use etude_core::mapping::WriteError;
+use etude_core::mapping::{Shortage, WriteError};
 use etude_core::model::NOTHING_YET;
 
 /// Why the service could not do as asked.
@@ -120,6 +120,9 @@ pub enum ServiceError {
     /// There is no memory for it now, or there never is.
     #[error(transparent)]
     NoRoom(#[from] NoRoom),
+    /// There is no memory for what a stream must keep, now or ever.
+    #[error(transparent)]
+    Shortage(#[from] Shortage),
     /// The deadline is over, and the model is still being compiled.
     #[error("model {name:?} is still being compiled; try again shortly")]
     Compiling {

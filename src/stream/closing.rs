@@ -92,6 +92,7 @@ pub(super) fn ends(error: &SessionError) -> Over {
         SessionError::Service(
             ServiceError::Pool(PoolError::Busy)
             | ServiceError::NoRoom(_)
+            | ServiceError::Shortage(_)
             | ServiceError::Compiling { .. }
             | ServiceError::Unavailable(Outage { kind: OutageKind::Slow, .. }),
         ) => Over::because(Closed::Overloaded, StreamProblem::new("overloaded", detail)),

@@ -88,7 +88,7 @@ pub use end::PolicyEnd;
 pub use heuristic::HeuristicName;
 pub use mapper::{Mapper, Mapping, Settings, Status};
 pub(crate) use online::longest_lookahead;
-pub use online::{CommittedMove, CommittedStep, OnlineMapping, PassedStates, Root, Stopped};
+pub use online::{CommittedMove, CommittedStep, OnlineMapping, PassedStates, Root, Shortage, Stopped};
 pub use options::{Options, RequestKind};
 #[cfg(feature = "rules")]
 pub use perception::Perception;

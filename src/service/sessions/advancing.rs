@@ -98,6 +98,12 @@ impl Advance {
             taken.map_err(|_| Stopped::Memory)?;
         }
     }
+
+    /// Why it did not go on in `most_bytes`.
+    fn no_room(&self, most_bytes: u64, memory: &Memory) -> ServiceError {
+        let no_room = NoRoom { wanted: most_bytes, room: memory.room() };
+        self.online.shortage().map_or_else(|| no_room.into(), ServiceError::from)
+    }
 }
 
 impl Session {
@@ -189,11 +195,10 @@ impl Session {
                     Ok(Ok((Turned::Done(advance), is_slow)))
                 }
                 Err(Stopped::Cancelled(cancelled)) => Err(cancelled),
-                Err(Stopped::Memory) => Ok(Err(NoRoom { wanted: most_bytes, room: memory.room() })),
+                Err(Stopped::Memory) => Ok(Err(advance.no_room(most_bytes, &memory))),
             }
         };
-        let turned = etude.pool.run_in_turn(self.client, job).await?;
-        let (turned, is_slow) = turned.map_err(ServiceError::from)?;
+        let (turned, is_slow) = etude.pool.run_in_turn(self.client, job).await??;
         self.is_slow = is_slow;
         Ok(turned)
     }
@@ -214,7 +219,7 @@ impl Session {
                 self.is_slow = true;
                 self.take_note(advance).map(Received::Waiting)
             }
-            Err(_) => Err(ServiceError::from(NoRoom { wanted: most_bytes, room: etude.memory.room() }).into()),
+            Err(_) => Err(advance.no_room(most_bytes, &etude.memory).into()),
         }
     }
 

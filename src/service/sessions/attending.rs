@@ -79,6 +79,7 @@ impl Etude {
             SessionError::Service(
                 ServiceError::Pool(PoolError::Busy)
                     | ServiceError::NoRoom(_)
+                    | ServiceError::Shortage(_)
                     | ServiceError::Compiling { .. }
                     | ServiceError::Unavailable(_)
             )

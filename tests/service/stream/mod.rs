@@ -737,3 +737,38 @@ async fn pings_are_answered_while_the_service_searches() {
     assert_eq!(other.0, 201);
     within("the end of the service", service.stop()).await;
 }
+
+/// Two loops of as many states each; which of them is entered cannot be told apart by what is observed.
+fn two_loops(n_each: usize) -> Value {
+    let on = |first: usize| (0..n_each).map(move |n| json!([first + n, "on", first + (n + 1) % n_each]));
+    let entries = [json!([0, "left", 1]), json!([0, "right", 1 + n_each])];
+    let states = std::iter::once(json!([0])).chain((0..2 * n_each).map(|n| json!([1 + n % n_each])));
+    json!({
+        "attributes": [{"name": "x", "kind": "number"}],
+        "actions": [{"name": "left"}, {"name": "right"}, {"name": "on"}],
+        "dynamics": {
+            "kind": "table", "states": states.collect::<Vec<_>>(),
+            "transitions": entries.into_iter().chain(on(1)).chain(on(1 + n_each)).collect::<Vec<_>>(), "start": 0,
+        },
+    })
+}
+
+#[tokio::test]
+async fn a_stream_of_which_nothing_is_proven_is_told_what_does_not_fit_and_to_set_a_lookahead() {
+    // Of which 64 MiB are not for requests.
+    let max_memory = (64 << 20) + (6 << 20);
+    let directory = tempfile::tempdir().unwrap();
+    let service = Service::start_set_up(directory, &[], |config| config.max_memory = Some(max_memory)).await;
+    assert_eq!(service.put("/v1/models/loops", &two_loops(2_000)).await.0, 201);
+    let mut client = Client::connect(&service).await;
+    client.open(json!({"type": "open", "model": "loops", "lookahead": null})).await;
+    let states: Vec<Value> = (0..2000).map(|n| json!([1 + n])).collect();
+    client.send(json!({"type": "observe", "seq": 0, "states": states})).await;
+    let problem = client.receive_until_error().await["problem"].clone();
+    assert_eq!(problem["type"], "/problems/overloaded");
+    let detail = problem["detail"].as_str().unwrap();
+    for part in ["all 4001 states", "observations since the last proven step", "bytes", "a lookahead, such as 8"] {
+        assert!(detail.contains(part), "{detail}");
+    }
+    assert_eq!(client.closed().await, 1013);
+}

@@ -51,7 +51,7 @@ pub enum Stopped {
     /// The caller lost interest.
     #[error(transparent)]
     Cancelled(#[from] Cancelled),
-    /// It would take more memory than the mapping may.
+    /// It would take more memory than the mapping may: see [`OnlineMapping::shortage`](super::OnlineMapping::shortage).
     #[error("what may still turn out to be the cheapest mapping takes more memory than there is for it")]
     Memory,
 }
@@ -63,6 +63,26 @@ impl From<Halt> for Stopped {
             Halt::Cancelled | Halt::OutOf(StoppedBy::Deadline | StoppedBy::MaxExpansions) => Self::Cancelled(Cancelled),
         }
     }
+}
+
+/// The ways to all states, with those through another observation, do not fit into the memory that a mapping may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "the cheapest ways to all {n_states} states, through {n_observations} observations since the last proven step, take {taken_bytes} bytes; \
+     another observation takes {layer_bytes}, and there are {max_bytes} in all now: with a lookahead, such as 8, an observation takes no \
+     more than a search of its window"
+)]
+pub struct Shortage {
+    /// How many states the model has.
+    pub n_states: u32,
+    /// How many observations are kept, from that of the last committed step on.
+    pub n_observations: usize,
+    /// What the mapping takes with them, in bytes.
+    pub taken_bytes: usize,
+    /// What the next observation takes, in bytes; the first with all that is made once.
+    pub layer_bytes: usize,
+    /// What the mapping may take, in bytes.
+    pub max_bytes: usize,
 }
 
 /// The committed steps.

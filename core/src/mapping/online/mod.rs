@@ -40,7 +40,7 @@ use crate::interrupt::{Cancelled, Interrupt, Uninterrupted};
 use crate::model::{Model, States};
 use ahead::{Ahead, keeps_layers};
 use committed::Committed;
-pub use committed::{CommittedMove, CommittedStep, Stopped};
+pub use committed::{CommittedMove, CommittedStep, Shortage, Stopped};
 pub(in crate::mapping) use decided::Halt;
 use decided::{Decided, Rest};
 pub(in crate::mapping) use layers::SharedWaysIn;
@@ -224,6 +224,14 @@ impl OnlineMapping {
     /// As [`Self::observe`]; but where ways are [searched for](Self::searches), the mapping is as before, and may be asked again.
     pub fn decide_next(&mut self, interrupt: &mut dyn Interrupt) -> Result<Option<Vec<CommittedStep>>, Stopped> {
         self.must_decide().then(|| self.decide(interrupt)).transpose()
+    }
+
+    /// What does not fit, if the ways to all states are kept and those through another observation do not.
+    #[must_use]
+    pub fn shortage(&self) -> Option<Shortage> {
+        let Ahead::Layers(layers) = &self.ahead else { return None };
+        let shortage = layers.shortage(self.size_bytes(), self.budget.max_bytes);
+        Some(shortage).filter(|shortage| shortage.taken_bytes.saturating_add(shortage.layer_bytes) > shortage.max_bytes)
     }
 
     /// Whether ways are searched for when a decision is due. Then observations cost nothing, and each decision a search.

@@ -6,6 +6,7 @@ use super::layer::Nodes;
 use super::sweep::STATE_BYTES;
 use super::ways_in::most_bytes as ways_in_bytes;
 use super::{Layer, Layers};
+use crate::mapping::online::committed::Shortage;
 use crate::mapping::online::decided::Halt;
 use crate::mapping::open_list::CheapestFirst;
 use crate::mapping::{Budget, StoppedBy};
@@ -33,10 +34,23 @@ impl Layers {
         }
     }
 
-    /// How much memory the next layer takes, in bytes.
+    /// How much memory the next layer takes, in bytes; before the first, with all that is made once.
     pub(super) fn next_layer_bytes(&self) -> usize {
         let observed = self.n_terms * size_of::<f64>() + self.weights.as_slice().len() * OBSERVED_BYTES;
-        self.tree.layer_bytes(self.model.graph().n_states(), &self.sweep.ways_in) + observed
+        let n_states = self.model().graph().n_states();
+        let once = if self.sweep.is_ready() { 0 } else { ways_in_bytes(self.model()) + n_states * STATE_BYTES };
+        self.tree.layer_bytes(n_states, &self.sweep.ways_in) + observed + once
+    }
+
+    /// What does not fit, if the mapping takes so many bytes and may take so many.
+    pub(in crate::mapping::online) fn shortage(&self, taken_bytes: usize, max_bytes: usize) -> Shortage {
+        Shortage {
+            n_states: self.model().states().len(),
+            n_observations: self.tree.n_layers_of_observations(),
+            taken_bytes,
+            layer_bytes: self.next_layer_bytes(),
+            max_bytes,
+        }
     }
 }
 

@@ -44,6 +44,7 @@ use std::sync::Arc;
 use super::decided::{Decided, Halt, Rest, RootNode, Work};
 use crate::attribute::{Value, Weights};
 use crate::interrupt::{Interrupt, Signal};
+use crate::mapping::conditions::Body;
 use crate::mapping::distances::{EndDistances, ObservedDistances};
 use crate::mapping::problem::Starts;
 use crate::mapping::{Budget, Conditions, Mapper, MoveKind, PolicyEnd, StoppedBy};
@@ -59,8 +60,10 @@ pub(in crate::mapping) use ways_in::SharedWaysIn;
 /// The ways to every state.
 #[derive(Debug)]
 pub(in crate::mapping) struct Layers {
-    model: Arc<Model>,
+    mapper: Arc<Mapper>,
     weights: Weights,
+    /// What the ways are that this body has.
+    body: Body,
     /// The listed start states.
     starts: Option<Vec<Origin>>,
     end_weight: f64,
@@ -78,21 +81,26 @@ pub(in crate::mapping) struct Layers {
 
 impl Layers {
     /// Nothing was observed yet.
-    pub(super) fn new(mapper: &Mapper, weights: Weights, conditions: &Conditions) -> Self {
-        let model = mapper.shared_model();
+    pub(super) fn new(mapper: &Arc<Mapper>, weights: Weights, conditions: &Conditions) -> Self {
+        let model = mapper.model();
         assert!(!model.is_lazy(), "each layer needs all states");
         Self {
-            n_terms: n_terms(&model, |position| weights.as_slice()[position] > 0.0),
-            sweep: Sweep::new(mapper.shared_ways_in().of(&model, &conditions.body(&model)), &model, conditions),
+            n_terms: n_terms(model, |position| weights.as_slice()[position] > 0.0),
+            sweep: Sweep::new(conditions),
+            body: conditions.body(model),
             tree: Tree::new(model.states().len()),
             starts: conditions.starts.clone(),
             end_weight: conditions.end_weight,
             newest: Vec::new(),
             root_cost: 0.0,
             work: Work::default(),
-            model,
+            mapper: Arc::clone(mapper),
             weights,
         }
+    }
+
+    fn model(&self) -> &Model {
+        self.mapper.model()
     }
 
     /// Goes on from `root`, when nothing was observed yet.
@@ -111,7 +119,11 @@ impl Layers {
         interrupt: &mut dyn Interrupt,
     ) -> Result<(), Halt> {
         self.check_memory(self.next_layer_bytes(), budget)?;
-        let model = &*Arc::clone(&self.model);
+        let mapper = Arc::clone(&self.mapper);
+        let model = mapper.model();
+        if !self.sweep.is_ready() {
+            self.sweep.make_ready(mapper.shared_ways_in().of(model, &self.body), model.graph().n_states());
+        }
         let observed = ObservedDistances::new(model, observation, &self.weights, observation_weight);
         self.newest.clear();
         self.newest.extend_from_slice(observation);
@@ -134,7 +146,7 @@ impl Layers {
 
     /// The next step, if all survivors share it.
     pub(super) fn shared(&mut self) -> Option<Decided> {
-        let child = self.tree.only_child(&self.model, &self.sweep.ways_in)?;
+        let child = self.tree.only_child(self.model(), &self.sweep.ways_in)?;
         let decided = self.decided(child);
         self.go_on(&decided, child);
         Some(decided)
@@ -162,7 +174,7 @@ impl Layers {
 
     /// The cheapest way to the end.
     pub(super) fn rest(&self) -> Option<Rest> {
-        let (schema, states) = (self.model.schema(), self.model.states());
+        let (schema, states) = (self.model().schema(), self.model().states());
         let end = (self.end_weight > 0.0)
             .then(|| EndDistances::new(schema, states, &self.newest, &self.weights, self.end_weight));
         let end_cost = |state| end.as_ref().map_or(0.0, |end| end.cost(states.row(state)));
@@ -171,7 +183,7 @@ impl Layers {
         Some(Rest {
             steps: path.into_iter().map(|place| self.decided(place)).collect(),
             end_cost: end_cost(survivor),
-            end: PolicyEnd::at(&self.model, states.row(survivor), &self.newest, &self.weights),
+            end: PolicyEnd::at(self.model(), states.row(survivor), &self.newest, &self.weights),
             stopped_by: None,
             lower_bound: f64::INFINITY,
             work: Work::default(),
@@ -195,15 +207,15 @@ impl Layers {
 
     /// How much a layer looks at.
     fn layer_work(&self) -> Work {
-        let graph = self.model.graph();
+        let graph = self.model().graph();
         Work { n_expanded: graph.n_states() as u64, n_generated: graph.n_transitions() as u64 }
     }
 
     /// The step that leads to a node.
     fn decided(&self, place: NodePlace) -> Decided {
-        let (step, action_cost) = self.tree.step(&self.model, &self.sweep.ways_in, place);
+        let (step, action_cost) = self.tree.step(self.model(), &self.sweep.ways_in, place);
         let observed = &self.tree.layers[place.0].observed;
-        Decided { step, action_cost, terms: observed.terms(&self.model, step.state).collect(), row: None }
+        Decided { step, action_cost, terms: observed.terms(self.model(), step.state).collect(), row: None }
     }
 
     /// Adds what a step costs to what the root does.
@@ -221,7 +233,8 @@ impl Layers {
 
     /// Finds the ways from the root anew.
     fn restore(&mut self, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<(), Halt> {
-        let model = &*Arc::clone(&self.model);
+        let mapper = Arc::clone(&self.mapper);
+        let model = mapper.model();
         let root = self.tree.root;
         let mut observed = self.tree.clear().into_iter();
         if let Some(mut first) = observed.next() {
@@ -245,7 +258,8 @@ impl Layers {
         budget: Budget,
     ) -> Result<(), Halt> {
         self.spend(budget)?;
-        let Self { model, tree, sweep, .. } = self;
+        let Self { mapper, tree, sweep, .. } = self;
+        let model = mapper.model();
         let nodes = tree.nodes(model.graph().n_states(), usize::MAX, &sweep.ways_in);
         let layer = sweep.begin(model, first.iter().copied(), link, &mut tree.reached, observed, nodes);
         tree.begin(layer, &sweep.ways_in);
@@ -264,10 +278,11 @@ impl Layers {
             Signal::Finish => return Err(Halt::OutOf(StoppedBy::Deadline)),
             Signal::Cancel => return Err(Halt::Cancelled),
         }
-        let n_states = self.model.graph().n_states();
+        let n_states = self.model().graph().n_states();
         self.check_memory(self.tree.layer_bytes(n_states, &self.sweep.ways_in), budget)?;
         self.spend(budget)?;
-        let Self { model, tree, sweep, .. } = self;
+        let Self { mapper, tree, sweep, .. } = self;
+        let model = mapper.model();
         let nodes = tree.nodes(n_states, tree.reached.len(), &sweep.ways_in);
         let reached = std::mem::take(&mut tree.reached);
         let layer = sweep.follow(model, tree.newest(), &reached, observed, nodes);

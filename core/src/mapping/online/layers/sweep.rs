@@ -39,21 +39,35 @@ pub(super) struct Sweep {
 const WITHIN: u32 = 1 << 31;
 
 impl Sweep {
-    pub(super) fn new(ways_in: Arc<WaysIn>, model: &Model, conditions: &Conditions) -> Self {
-        let n_states = model.graph().n_states();
+    pub(super) fn new(conditions: &Conditions) -> Self {
         Self {
-            ways_in,
+            ways_in: Arc::default(),
             recurrence: conditions.recurrence(),
-            costs: vec![f64::INFINITY; n_states],
-            before: vec![f64::INFINITY; n_states],
-            distances: vec![0.0; n_states],
-            sources: vec![0; n_states],
+            costs: Vec::new(),
+            before: Vec::new(),
+            distances: Vec::new(),
+            sources: Vec::new(),
             open: BinaryHeap::new(),
             by_extras: Vec::new(),
             late: Vec::new(),
-            are_late: vec![false; n_states],
+            are_late: Vec::new(),
             childless: Vec::new(),
         }
+    }
+
+    /// Whether [`Self::make_ready`] was called.
+    pub(super) fn is_ready(&self) -> bool {
+        !self.costs.is_empty()
+    }
+
+    /// Makes what all layers are made with, by these ways into each of the states: before the first layer.
+    pub(super) fn make_ready(&mut self, ways_in: Arc<WaysIn>, n_states: usize) {
+        self.ways_in = ways_in;
+        self.costs = vec![f64::INFINITY; n_states];
+        self.before = vec![f64::INFINITY; n_states];
+        self.distances = vec![0.0; n_states];
+        self.sources = vec![0; n_states];
+        self.are_late = vec![false; n_states];
     }
 
     /// Approximate size in memory, in bytes.
@@ -147,30 +161,34 @@ impl Sweep {
             self.sources[at] = source;
             nodes[at] = Node { link, n_children: 0 }.into();
         }
-        // Each extra makes a way dearer, so that the cheapest of several sources is not a matter of the order in which they are looked at.
-        let has_order = most + self.ways_in.least_cost > most;
-        if has_order {
-            self.guess_extras();
-        }
+        let ways_in = Arc::clone(&self.ways_in);
         let before = std::mem::take(&mut self.before);
-        if recurrence.pays_alike() {
-            let is_lower = |state: StateIdx, cost: f64| cost < before[state as usize];
-            for state in reached.iter().copied() {
-                let cost = self.costs[state as usize];
-                if !is_lower(state, cost) {
-                    continue;
+        let is_lower = |state: StateIdx, cost: f64| !recurrence.pays_alike() || cost < before[state as usize];
+        // Each extra makes a way dearer, so that the cheapest of several sources is not a matter of the order in which they are looked at.
+        let has_order = most + ways_in.least_cost > most;
+        if has_order {
+            // They lead mostly where they led in the layer before. What this leaves out, is found afterwards.
+            let by_extras = std::mem::take(&mut self.by_extras);
+            for state in by_extras.iter().copied() {
+                self.come_by_extra(&ways_in, state);
+            }
+            self.by_extras = by_extras;
+        }
+        for state in reached.iter().copied() {
+            let cost = self.costs[state as usize];
+            if has_order && !recurrence.pays_alike() {
+                if self.come_by_extra(&ways_in, state) {
+                    self.open.push(CheapestFirst { cost: self.costs[state as usize], id: state });
                 }
+            } else if is_lower(state, cost) {
                 if has_order {
-                    self.extras(model, state, has_order, is_lower);
+                    self.extras(model, &ways_in, state, has_order, is_lower);
                 } else {
                     self.open.push(CheapestFirst { cost, id: state });
                 }
             }
-            self.follow_extras(model, has_order, is_lower);
-        } else {
-            self.open_where_extras_improve(reached);
-            self.follow_extras(model, has_order, |_, _| true);
         }
+        self.follow_extras(model, has_order, is_lower);
         self.before = before;
         self.link_extras(|to, link| nodes[to as usize] = Node { link, n_children: 0 }.into());
         for state in reached {
@@ -183,20 +201,20 @@ impl Sweep {
         self.childless.extend(childless);
     }
 
-    /// Takes extras to the states to which they led in the layer before, which are mostly the same. What this leaves out, is found afterwards.
-    fn guess_extras(&mut self) {
-        for to in self.by_extras.iter().copied() {
-            let (mut cost, mut source) = (self.costs[to as usize], self.sources[to as usize]);
-            let distance = self.distances[to as usize];
-            for (from, way_cost) in self.ways_in.of(to) {
-                let before = self.costs[from as usize] + way_cost;
-                let by_way = self.recurrence.arrive(MoveKind::Extra, before, distance);
-                if by_way < cost || (by_way == cost && self.is_earlier(from, source)) {
-                    (cost, source) = (by_way, from | WITHIN);
-                }
+    /// Takes the cheapest extra to a state, if it is cheaper than what is known, or as cheap from a cheaper source. Says whether it is cheaper.
+    #[inline]
+    fn come_by_extra(&mut self, ways_in: &WaysIn, to: StateIdx) -> bool {
+        let (known, mut source) = (self.costs[to as usize], self.sources[to as usize]);
+        let (mut cost, distance) = (known, self.distances[to as usize]);
+        for (from, way_cost) in ways_in.of(to) {
+            let before = self.costs[from as usize] + way_cost;
+            let by_way = self.recurrence.arrive(MoveKind::Extra, before, distance);
+            if by_way < cost || (by_way == cost && self.is_earlier(from, source)) {
+                (cost, source) = (by_way, from | WITHIN);
             }
-            (self.costs[to as usize], self.sources[to as usize]) = (cost, source);
         }
+        (self.costs[to as usize], self.sources[to as usize]) = (cost, source);
+        cost < known
     }
 
     /// Whether a state is the cheaper source than another in the same layer, the lower of equals. Matches and skips come before all.
@@ -206,35 +224,29 @@ impl Sweep {
         source & WITHIN != 0 && (costs[0], state) < (costs[1], other)
     }
 
-    /// Opens the states from which an extra leads to another more cheaply. No extra from others ever does: costs only fall where one leads.
-    fn open_where_extras_improve(&mut self, reached: &[StateIdx]) {
-        for state in reached.iter().copied() {
-            let (cost, distance) = (self.costs[state as usize], self.distances[state as usize]);
-            for (from, way_cost) in self.ways_in.of(state) {
-                let before = self.costs[from as usize];
-                if self.recurrence.arrive(MoveKind::Extra, before + way_cost, distance) < cost {
-                    self.open.push(CheapestFirst { cost: before, id: from });
-                }
-            }
-        }
-    }
-
     /// Takes extras from the states that are open, the cheapest first, and from those to which they lead more cheaply if that `leads_on`.
     fn follow_extras(&mut self, model: &Model, has_order: bool, leads_on: impl Fn(StateIdx, f64) -> bool + Copy) {
+        let ways_in = Arc::clone(&self.ways_in);
         while let Some(CheapestFirst { cost, id: state }) = self.open.pop() {
             if cost <= self.costs[state as usize] {
                 if self.sources[state as usize] & WITHIN != 0 {
                     self.late.push(state);
                 }
-                self.extras(model, state, has_order, leads_on);
+                self.extras(model, &ways_in, state, has_order, leads_on);
             }
         }
     }
 
     /// Takes extras from a state.
-    fn extras(&mut self, model: &Model, from: StateIdx, has_order: bool, leads_on: impl Fn(StateIdx, f64) -> bool) {
+    fn extras(
+        &mut self,
+        model: &Model,
+        ways_in: &WaysIn,
+        from: StateIdx,
+        has_order: bool,
+        leads_on: impl Fn(StateIdx, f64) -> bool,
+    ) {
         let from_cost = self.costs[from as usize];
-        let ways_in = Arc::clone(&self.ways_in);
         for (transition, action_cost) in ways_in.body.ways(&model.whole(), from) {
             let to = transition.to as usize;
             let cost = from_cost + action_cost;

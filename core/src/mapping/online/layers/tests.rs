@@ -8,7 +8,7 @@ use crate::interrupt::Uninterrupted;
 use crate::mapping::by_definition::{any_conditions, fitted, least_costs, prepared, problem, with_conditions};
 use crate::mapping::online::ahead::Ahead;
 use crate::mapping::{
-    CommittedStep, Demonstration, HeuristicName, Mapper, OnlineMapping, Problem, Settings, Status, Stopped,
+    CommittedStep, Demonstration, HeuristicName, Mapper, OnlineMapping, Problem, Settings, Shortage, Status, Stopped,
 };
 
 /// States on a line, in any order, with any transitions, of which the cheapest cost so much.
@@ -92,6 +92,11 @@ fn an_observation_that_would_take_more_memory_than_there_is_is_not_taken_and_wha
                 stopped
             });
             assert_eq!(stopped, Some(Stopped::Memory), "{max_bytes} of {most}");
+            let shortage = online.shortage().unwrap();
+            let Shortage { n_states, n_observations, taken_bytes, layer_bytes, max_bytes: told } = shortage;
+            assert_eq!((n_states, told), (301, max_bytes));
+            assert!(taken_bytes + layer_bytes > max_bytes, "{shortage}");
+            assert!(n_observations <= 300 && shortage.to_string().contains("a lookahead, such as 8"), "{shortage}");
             let n_observed = online.n_observed();
             assert_eq!(n_observed > 0, max_bytes > 10_000, "{n_observed} in {max_bytes} of {most}");
         }

@@ -6,7 +6,7 @@ use crate::mapping::conditions::Body;
 use crate::model::{Model, Rows, StateIdx};
 
 /// The ways of a body into each state: from each other state the cheapest; from lower states first.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub(in crate::mapping) struct WaysIn {
     /// By state, those that they come from.
     sources: Rows<StateIdx>,
