@@ -21,7 +21,9 @@ pub(super) enum Ahead {
 }
 
 /// Most nodes, states times layers, of windows for which the ways to all states are kept. To find all of these anew, as a decision may ask
-/// for, takes about as long as to search such a window; and it tells which steps are proven, and commits those early.
+/// for, takes about as long as to search such a window; and it tells which steps are proven, and commits those early. With more nodes it
+/// depends on how soon steps are proven: figure 4 with layers takes 3.9 times as long at a lookahead of 4, 3.1 times at 8, and 0.15 times at
+/// 16, where hardly anything is left to be decided; a cave of 1,008 states takes 10.7 times as long at 4.
 const MAX_KEPT: u64 = 1 << 9;
 
 /// Whether all ways are kept, and not searched for.
