@@ -20,8 +20,8 @@ pub(crate) fn measure() {
     println!("rules: ms, and multiples of the table's time, of {N_ROUNDS} rounds and {N_SEEDS} demonstrations");
     compare("a rover that turns, fills up and goes round walls", &rover(), &|seed| watched(50, seed));
     let cave = worlds::cave(20, 5, 50, 1).model;
-    let mut cave = Definition::read(&cave, Limits::NONE, &mut Uninterrupted).expect("a cave").text().to_string();
-    let mut cave: Value = serde_json::from_str(&std::mem::take(&mut cave)).expect("JSON");
+    let cave = Definition::read(&cave, Limits::NONE, &mut Uninterrupted).expect("a cave");
+    let mut cave: Value = serde_json::from_str(&cave.text()).expect("JSON");
     cave["dynamics"]["start"] = json!({"x": 0, "y": 0, "heading": "east"});
     cave["dynamics"]["arrows"] = json!(1);
     for list in ["pits", "wumpi", "gold"] {
