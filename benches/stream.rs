@@ -96,7 +96,11 @@ impl Service {
     fn start_in(directory: Arc<tempfile::TempDir>) -> Result<Self, Failure> {
         let mut command = Command::new(env!("CARGO_BIN_EXE_etude"));
         command.args(["serve", "--listen", "127.0.0.1:0", "--log-format", "text", "--database"]);
-        command.arg(directory.path().join("bench.db")).stderr(Stdio::piped());
+        // One client, as all are here, may have half of the streams.
+        command
+            .arg(directory.path().join("bench.db"))
+            .args(["--max-streams", "16384", "--max-connections", "16384"])
+            .stderr(Stdio::piped());
         let mut child = command.spawn()?;
         let mut lines = BufReader::new(child.stderr.take().ok_or("no log")?).lines().map_while(Result::ok);
         let listening = lines.find(|line| line.contains("listening on http://")).ok_or("it did not start")?;
