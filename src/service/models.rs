@@ -108,8 +108,9 @@ impl Etude {
         self.replace_model(name, text, format.into(), Replaces::Nothing, caller).await
     }
 
-    /// Registers the model in `text` under `name`, at once in the place of a model that it `replaces`. What that was told goes with it. Sessions that run go on with the model
-    /// that they were opened with, and policies keep its hash; a session that is resumed and a policy that is to be refined do not find
+    /// Registers the model in `text` under `name`, at once in the place of a model that it `replaces`. Batches of experience that the replaced
+    /// one was told are deleted with it. Sessions that run go on with the model that they were opened with, and policies keep its hash; a
+    /// session that is resumed and a policy that is to be refined do not find
     /// it any more, as if it were deleted.
     ///
     /// # Errors
