@@ -25,9 +25,14 @@ HERE = Path(__file__).parent
 VARIABLES = ["x", "lane", "open"]
 
 
-def build(slip):
+def corridor(slip):
     program = stormpy.parse_prism_program(str(HERE / "corridor.prism"))
     program, _ = io.instantiate_constants(program, {"slip": slip})
+    return build(program)
+
+
+def build(program):
+    """The model of a program, with all that can be told of it."""
     options = stormpy.BuilderOptions()
     options.set_build_state_valuations()
     options.set_build_choice_labels()
@@ -88,7 +93,7 @@ def main():
     out = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     for name, slip in {"corridor": 0.0, "slippery": 0.1}.items():
-        model = build(slip)
+        model = corridor(slip)
         io.export_to_drn(model, str(out / f"{name}.drn"))
         io.export_to_umb(model, str(out / f"{name}.umb"))
         described = describe(model)

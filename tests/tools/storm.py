@@ -15,22 +15,16 @@ import stormpy
 from stormpy import io
 from stormpy.examples import files
 
+# As the models of the examples are built.
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples/verification"))
+from make import build
+
 PROGRAMS = """
 dtmc/brp-16-2.pm dtmc/crowds-5-5.pm dtmc/die.pm dtmc/leader-3-5.pm dtmc/nand-5-2.pm dtmc/negativevals.pm dtmc/test_conditional.pm
 mdp/SmallPrismTest.nm mdp/SmallPrismTest2.nm mdp/coin2-2.nm mdp/csma2-2.nm mdp/die_c1.nm mdp/die_selection.nm mdp/firewire3-0.5.nm mdp/leader3.nm
 mdp/leader4.nm mdp/maze_2.nm mdp/maze_2_multigoal.nm mdp/multiobjective1.nm mdp/multiobjective2.nm mdp/scheduler_generation.nm mdp/slipgrid.nm
 mdp/tiny_rewards.nm mdp/two_dice.nm mdp/wlan0-2-2.nm pomdp/3x3grid.prism pomdp/maze-concise.prism
 """
-
-
-def build(path):
-    program = stormpy.parse_prism_program(path)
-    options = stormpy.BuilderOptions()
-    options.set_build_state_valuations()
-    options.set_build_choice_labels()
-    options.set_build_all_labels()
-    options.set_build_all_reward_models()
-    return stormpy.build_model(program, options=options)
 
 
 def describe(model):
@@ -97,7 +91,7 @@ def main():
     if what == "explicit":
         return explicit(Path(rest[0]), out / "explicit")
     for program in PROGRAMS.split():
-        model = build(files._path(*program.split("/")))
+        model = build(stormpy.parse_prism_program(files._path(*program.split("/"))))
         stem = out / Path(program).stem
         io.export_to_drn(model, f"{stem}.drn")
         io.export_to_umb(model, f"{stem}.umb")
