@@ -60,7 +60,8 @@ pub use pool::{Admission, PoolError, PoolSettings, SearchPool};
 use sessions::Left;
 pub(crate) use sessions::Waits;
 pub use sessions::{
-    CommittedSteps, Ended, Observation, Received, Resumed, RewardState, Session, SessionError, SessionPolicy, ShortStep,
+    Coming, CommittedSteps, Ended, Observation, Received, ReceivedFrame, Resumed, RewardState, Session, SessionError,
+    SessionPolicy, ShortStep,
 };
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;

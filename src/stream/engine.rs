@@ -7,17 +7,17 @@ use tokio::sync::SetOnce;
 use tokio_util::sync::CancellationToken;
 
 use super::closing::{Closed, Over, ends, not_allowed};
-use super::frames::{ClientFrame, HelloLimits, ServerFrame, WriteError};
+use super::frames::{ClientFrame, HelloLimits, ServerFrame};
 use super::limits::Limits;
 use super::messages::{Incoming, Outgoing, read_frame, text_of};
+use super::outlet::Outlet;
 use super::problem::StreamProblem;
-use super::queue::{Gone, Receiver, Sender, Weighed};
+use super::queue::{Queued, Receiver, Sender, Weighed};
 use super::room::{SMALL_FRAME_BYTES, Taken};
 use crate::service::{
-    AcceptedReward, Caller, Client, Ended, Etude, Received, Resumed, RewardState, ServiceError, Session, SessionError,
+    AcceptedReward, Caller, Client, Ended, Etude, Resumed, RewardState, ServiceError, Session, SessionError,
 };
-use etude_core::document::{self, Place};
-use etude_core::mapping::{CommittedStep, PassedStates};
+use etude_core::mapping::PassedStates;
 
 /// The protocol's name; also the websocket subprotocol.
 pub const PROTOCOL: &str = "etude.v1+json";
@@ -45,8 +45,17 @@ pub async fn run(
     lost: impl Future<Output = Closed>,
 ) -> Closed {
     let taken_over = SetOnce::new();
-    let mut connection =
-        Connection { etude, client, limits, outgoing, session: None, taken_over: &taken_over, is_reward_told: false };
+    let outlet = Outlet { outgoing, limits };
+    let mut connection = Connection {
+        etude,
+        client,
+        limits,
+        outlet,
+        session: None,
+        next: None,
+        taken_over: &taken_over,
+        is_reward_told: false,
+    };
     let (ended, is_lost) = tokio::select! {
         biased;
         () = stopping.cancelled() => {
@@ -68,7 +77,7 @@ pub async fn run(
     let goodbye = async {
         if let Some(problem) = problem {
             // Where this does not get through, the close code says it too.
-            let _ = connection.send(&ServerFrame::Error { problem }).await;
+            let _ = outlet.send(&ServerFrame::Error { problem }).await;
         }
         // A client that is stuck does not hear this.
         let _ = outgoing.send(Outgoing::Close(closed)).await;
@@ -79,12 +88,14 @@ pub async fn run(
     closed
 }
 
-struct Connection<'c> {
-    etude: &'c Etude,
+pub(super) struct Connection<'c> {
+    pub(super) etude: &'c Etude,
     client: Client,
     limits: Limits,
-    outgoing: &'c Sender<Outgoing>,
-    session: Option<Session>,
+    pub(super) outlet: Outlet<'c>,
+    pub(super) session: Option<Session>,
+    /// What was taken out of the queue, and is answered next.
+    pub(super) next: Option<Queued<Incoming>>,
     /// Tells when another connection takes the session over, once there is one.
     taken_over: &'c SetOnce<CancellationToken>,
     /// Whether the client was told here that its reward is accepted.
@@ -93,20 +104,28 @@ struct Connection<'c> {
 
 impl Connection<'_> {
     async fn speak(&mut self, incoming: &mut Receiver<Incoming>) -> Result<Closed, Over> {
-        self.send(&ServerFrame::Hello {
-            protocol: PROTOCOL,
-            server: env!("CARGO_PKG_VERSION"),
-            limits: HelloLimits::from(self.limits),
-        })
-        .await?;
-        let mut n_bytes = 0;
+        self.outlet
+            .send(&ServerFrame::Hello {
+                protocol: PROTOCOL,
+                server: env!("CARGO_PKG_VERSION"),
+                limits: HelloLimits::from(self.limits),
+            })
+            .await?;
+        let mut n_bytes_in_a_row = 0;
         loop {
-            if n_bytes >= BYTES_IN_A_ROW {
-                n_bytes = 0;
+            if n_bytes_in_a_row >= BYTES_IN_A_ROW {
+                n_bytes_in_a_row = 0;
                 tokio::task::yield_now().await;
             }
             let came = {
-                let mut coming = pin!(tokio::time::timeout(self.limits.idle_after, incoming.recv()));
+                let next = self.next.take();
+                let coming = async {
+                    match next {
+                        Some(next) => Some(next),
+                        None => incoming.recv().await,
+                    }
+                };
+                let mut coming = pin!(tokio::time::timeout(self.limits.idle_after, coming));
                 loop {
                     tokio::select! {
                         // What has come by the time that a step is due decides, not what waits to be received.
@@ -120,10 +139,11 @@ impl Connection<'_> {
                 return Err(Over::because(Closed::NotAllowed, StreamProblem::new("idle", "nothing came for too long")));
             };
             let Some(came) = came else { return Ok(Closed::ByClient) };
-            n_bytes += came.item.n_bytes().max(MIN_FRAME_BYTES);
+            let n_bytes = came.item.n_bytes();
+            n_bytes_in_a_row += n_bytes.max(MIN_FRAME_BYTES);
             // Its room in the queue is given back once it is answered.
             let (frame, memory) = self.read(came.item).await?;
-            if let Some(closed) = self.answer(frame, memory).await? {
+            if let Some(closed) = self.answer(frame, memory, n_bytes, incoming).await? {
                 return Ok(closed);
             }
         }
@@ -141,7 +161,7 @@ impl Connection<'_> {
     async fn decide(&mut self) -> Result<(), Over> {
         let Some(session) = &mut self.session else { return Ok(()) };
         let steps = session.decide(self.etude).await.map_err(|error| ends(&error))?;
-        self.send_steps(&steps).await
+        self.outlet.send_steps(&steps).await
     }
 
     /// Reads what came: a large frame off the threads that serve others. Gives its memory along.
@@ -154,8 +174,14 @@ impl Connection<'_> {
         Ok((reading.await.map_err(|error| ends(&error.into()))??, memory))
     }
 
-    /// Answers a frame, whose memory is `memory`. Gives how the connection ends, if it does.
-    async fn answer(&mut self, frame: ClientFrame, memory: Option<Taken>) -> Result<Option<Closed>, Over> {
+    /// Answers a frame of `n_bytes`, whose memory is `memory`. Gives how the connection ends, if it does.
+    async fn answer(
+        &mut self,
+        frame: ClientFrame,
+        memory: Option<Taken>,
+        n_bytes: usize,
+        incoming: &mut Receiver<Incoming>,
+    ) -> Result<Option<Closed>, Over> {
         let (clock, client) = (self.etude.clock(), self.client);
         let caller = Caller { client, arrived: clock.instant(), now: clock.now() };
         let now = caller.now;
@@ -177,13 +203,13 @@ impl Connection<'_> {
                 for (number, kept) in (0..).zip(&kept) {
                     kept.pass(&mut passed);
                     if number >= step {
-                        self.send(&ServerFrame::Step((&kept.written(number, &passed)).into())).await?;
+                        self.outlet.send(&ServerFrame::Step((&kept.written(number, &passed)).into())).await?;
                     }
                 }
                 let n_kept = kept.len();
-                self.send_steps(steps.get((step as usize).saturating_sub(n_kept)..).unwrap_or_default()).await?;
+                self.outlet.send_steps(steps.get((step as usize).saturating_sub(n_kept)..).unwrap_or_default()).await?;
                 let Some(policy) = policy else { return Ok(None) };
-                self.send(&ServerFrame::from(&policy)).await?;
+                self.outlet.send(&ServerFrame::from(&policy)).await?;
                 self.done().await
             }
             (ClientFrame::Observe { .. } | ClientFrame::End { .. }, None) => {
@@ -195,7 +221,9 @@ impl Connection<'_> {
                     Ok(rewarded) => {
                         let trial = rewarded.trial;
                         let order = trial.reward.as_ref().map(|reward| reward.reward_order);
-                        self.send(&ServerFrame::Rewarded { trial: &trial.id, reward, reward_order: order }).await?;
+                        self.outlet
+                            .send(&ServerFrame::Rewarded { trial: &trial.id, reward, reward_order: order })
+                            .await?;
                         self.is_reward_told = true;
                         Ok(has_ended.then_some(Closed::Done))
                     }
@@ -203,36 +231,13 @@ impl Connection<'_> {
                 }
             }
             (ClientFrame::Reward { .. }, _) => Err(not_allowed("only an exploring session takes a reward")),
-            (ClientFrame::Observe { seq, frame }, Some(session)) => {
-                let root = Place::root(&frame);
-                let states = Place { value: &frame["states"], path: document::Path::Member(&root.path, "states") };
-                let weights = root.value.get("observation_weights").filter(|weights| !weights.is_null());
-                let weights = weights.map(|value| {
-                    let path = document::Path::Member(&root.path, "observation_weights");
-                    Place { value, path }
-                });
-                let received = match session.receive(self.etude, seq, &states, weights.as_ref(), now).await {
-                    Ok(received) => received,
-                    Err(error) => return self.go_on_or_end(&error).await,
-                };
-                // Nobody waits for a search with what it does not need.
-                drop((frame, memory));
-                let warnings = session.news(seq);
-                let frame = ServerFrame::Received { seq: session.n_received(), warnings: &warnings };
-                send(self.outgoing, self.limits, &frame).await?;
-                let steps = match received {
-                    Received::Mapped(steps) => steps,
-                    Received::Waiting(observations) => {
-                        session.advance(self.etude, observations).await.map_err(|error| ends(&error))?
-                    }
-                };
-                self.send_steps(&steps).await?;
-                Ok(None)
+            (ClientFrame::Observe { seq, frame }, Some(_)) => {
+                self.observe(seq, (frame, memory), n_bytes, incoming, now).await
             }
             (ClientFrame::End { seq }, Some(session)) => match session.end(self.etude, seq, now).await {
                 Ok(Ended { steps, policy }) => {
-                    self.send_steps(&steps).await?;
-                    self.send(&ServerFrame::from(&policy)).await?;
+                    self.outlet.send_steps(&steps).await?;
+                    self.outlet.send(&ServerFrame::from(&policy)).await?;
                     self.done().await
                 }
                 Err(error) => self.go_on_or_end(&error).await,
@@ -251,7 +256,7 @@ impl Connection<'_> {
                 if !self.is_reward_told {
                     let AcceptedReward { reward, reward_order } = reward;
                     let frame = ServerFrame::Rewarded { trial: &trial, reward, reward_order: Some(reward_order) };
-                    self.send(&frame).await?;
+                    self.outlet.send(&frame).await?;
                 }
                 Ok(Some(Closed::Done))
             }
@@ -270,18 +275,11 @@ impl Connection<'_> {
             received: session.n_received(),
             steps: session.n_steps(),
         };
-        send(self.outgoing, self.limits, &frame).await
-    }
-
-    async fn send_steps(&self, steps: &[CommittedStep]) -> Result<(), Over> {
-        for step in steps {
-            self.send(&ServerFrame::Step(step.into())).await?;
-        }
-        Ok(())
+        self.outlet.send(&frame).await
     }
 
     /// Tells the client of an error after which the session goes on, or ends the connection.
-    async fn go_on_or_end(&self, error: &SessionError) -> Result<Option<Closed>, Over> {
+    pub(super) async fn go_on_or_end(&self, error: &SessionError) -> Result<Option<Closed>, Over> {
         let problem = match error {
             SessionError::Gap { .. } => StreamProblem::new("gap", error.to_string()),
             SessionError::TooMany => StreamProblem::new("too-many-observations", error.to_string()),
@@ -304,31 +302,7 @@ impl Connection<'_> {
             | SessionError::TooManySteps(_)
             | SessionError::Service(_) => return Err(ends(error)),
         };
-        self.send(&ServerFrame::Error { problem }).await?;
+        self.outlet.send(&ServerFrame::Error { problem }).await?;
         Ok(None)
-    }
-
-    async fn send(&self, frame: &ServerFrame<'_>) -> Result<(), Over> {
-        send(self.outgoing, self.limits, frame).await
-    }
-}
-
-/// Puts a frame into the queue, which a client that does not read keeps full.
-async fn send(outgoing: &Sender<Outgoing>, limits: Limits, frame: &ServerFrame<'_>) -> Result<(), Over> {
-    let text = frame.text_within(limits.message_bytes()).map_err(|error| match error {
-        WriteError::TooLong => {
-            let detail = format!(
-                "the server's next frame takes more than the {} bytes that a message may have, as the states of this model do: ask for a \
-                 policy instead",
-                limits.message_bytes()
-            );
-            Over::because(Closed::TooLarge, StreamProblem::new("too-large", detail))
-        }
-        WriteError::Json(error) => ends(&SessionError::Service(ServiceError::Write(error))),
-    })?;
-    match tokio::time::timeout(limits.slow_after, outgoing.send(Outgoing::Frame(text))).await {
-        Ok(Ok(())) => Ok(()),
-        Ok(Err(Gone)) => Err(Over { closed: Closed::ByClient, problem: None }),
-        Err(_) => Err(Over { closed: Closed::Overloaded, problem: None }),
     }
 }

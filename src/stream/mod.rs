@@ -16,6 +16,8 @@ mod engine;
 pub mod frames;
 mod limits;
 mod messages;
+mod observing;
+mod outlet;
 pub mod problem;
 mod queue;
 mod room;

@@ -19,7 +19,7 @@ use etude_core::mapping::{Mapper, OnlineMapping, Stopped};
 
 /// How long is searched where observations arrive. What takes longer is searched in the pool, and so are the session's next windows until they
 /// take less.
-const HERE: Duration = Duration::from_micros(500);
+pub(super) const HERE: Duration = Duration::from_micros(500);
 
 /// How often a search asks whether to go on that takes less, at most. However late it is, one that asks so seldom has not been at work for long.
 const FEW_QUESTIONS: u32 = 8;

@@ -30,6 +30,11 @@ impl CommittedSteps {
         Ok(())
     }
 
+    /// How much memory they take, roughly, in bytes.
+    pub(super) fn n_bytes(&self) -> usize {
+        self.n_bytes
+    }
+
     /// Gives back `n_bytes` of what was taken more.
     pub(super) fn give_back(&mut self, n_bytes: usize) {
         self.n_bytes -= n_bytes;

@@ -1,6 +1,8 @@
 //! Observations on their way into a session.
 
+use super::SessionError;
 use super::committed::CommittedSteps;
+use etude_core::mapping::Warning;
 
 /// An observation as it was read.
 #[derive(Clone, Debug)]
@@ -9,6 +11,35 @@ pub struct Observation {
     pub values: Vec<Option<etude_core::attribute::Value>>,
     /// Its weight; `None`: what the session was opened with.
     pub weight: Option<f64>,
+}
+
+/// Frames of observations that come one after the other and are received together, by one commit.
+#[derive(Debug, Default)]
+pub struct Coming {
+    pub(super) frames: Vec<ComingFrame>,
+    /// Their observations as they are stored: an array in JSON, without its last bracket.
+    pub(super) stored: String,
+}
+
+/// What is new of a frame.
+#[derive(Debug)]
+pub(super) struct ComingFrame {
+    /// Index of the first of its states, which may have been received before.
+    pub(super) seq: u32,
+    /// How many observations there are with it.
+    pub(super) n_received: u32,
+    pub(super) observations: Vec<Observation>,
+}
+
+/// A frame of observations that are durable.
+#[derive(Debug)]
+pub struct ReceivedFrame {
+    /// How many observations were received with it.
+    pub n_received: u32,
+    /// What there is to warn of for the first time.
+    pub warnings: Vec<Warning>,
+    /// What became of its observations besides. After an error the session is to be dropped.
+    pub mapped: Result<Received, SessionError>,
 }
 
 /// What was received and is not mapped yet, or not in full.

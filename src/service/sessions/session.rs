@@ -2,30 +2,24 @@
 
 use std::num::NonZeroU32;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use jiff::Timestamp;
 use tokio_util::sync::CancellationToken;
 
 use super::SessionError;
-use super::committed::CommittedSteps;
 use super::ending::{Ended, conclude, take_for_end, written_bytes};
 use super::kept::Unwritten;
 use super::left::Leaving;
-use super::received::{Observation, Received};
 use super::waits::Waits;
 use crate::memory::{Held, SMALL_BYTES};
 use crate::service::owners::Ownership;
-use crate::service::requests::STATES;
 use crate::service::search::take_beyond_small;
 use crate::service::{Client, Etude, ServiceError};
-use crate::store::{AcceptedReward, NewObservations, Owner, SessionEnd, StoredObservations, TrialRecord};
+use crate::store::{AcceptedReward, Owner, SessionEnd, StoredObservations, TrialRecord};
 use etude_core::attribute::{ByAttribute, Weights};
-use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Interrupt;
-use etude_core::mapping::{
-    Conditions, Demonstration, Mapper, OnlineMapping, Options, Perception, Policy, Stamp, Warning, Watch,
-};
+use etude_core::mapping::{Conditions, Mapper, OnlineMapping, Perception, Stamp, Watch};
 
 /// An open session, and the right to drive it.
 #[derive(Debug)]
@@ -175,110 +169,6 @@ impl Session {
         })
     }
 
-    /// Takes the states from `seq` on, of which those received before are ignored: they are durable when this returns. What
-    /// takes less time than the disk is mapped while that writes. `observation_weights` gives the weight of each of them, if not what the
-    /// session was opened with.
-    ///
-    /// # Errors
-    ///
-    /// If something is wrong with them; then none was taken. After [`SessionError::NotOpen`] and
-    /// [`SessionError::Service`] the session is to be dropped.
-    pub async fn receive(
-        &mut self,
-        etude: &Etude,
-        seq: u32,
-        states: &Place<'_, '_>,
-        observation_weights: Option<&Place<'_, '_>>,
-        now: Timestamp,
-    ) -> Result<Received, SessionError> {
-        if self.has_ended() {
-            return Err(SessionError::Ended);
-        }
-        if seq > self.n_received {
-            return Err(SessionError::Gap { expected: self.n_received });
-        }
-        let mut faults = Faults::default();
-        let Some(items) = states.array(&mut faults) else { return Err(faults.into()) };
-        let n_known = (self.n_received - seq) as usize;
-        let new = items.get(n_known..).unwrap_or_default();
-        if new.is_empty() {
-            etude.store.touch_session(&self.id, self.owner, now).await??;
-            return Ok(Received::Mapped(CommittedSteps::default()));
-        }
-        if self.n_received as usize + new.len() > Demonstration::MAX_OBSERVATIONS {
-            return Err(SessionError::TooMany);
-        }
-        let n_observations = self.n_received as usize + new.len();
-        if !Policy::check_size(self.mapper.model(), n_observations, states, &mut faults) {
-            return Err(faults.into());
-        }
-        let schema = self.mapper.model().schema();
-        let observed = match &self.perception {
-            None => None,
-            Some(perception) => {
-                let states = new.iter().enumerate().map(|(n, state)| states.item(n_known + n, state));
-                let observed = perception.observe_each(states, &mut faults);
-                Some(faults.clone().check(observed)?)
-            }
-        };
-        let new = observed.as_deref().unwrap_or(new);
-        let states = *states;
-        let places = new.iter().enumerate().map(|(n, state)| states.item(n_known + n, state));
-        let read = Demonstration::read_observations(schema, places, &mut faults);
-        let weights = match observation_weights {
-            Some(place) => {
-                let weights = Options::read_observation_weights(place, &mut faults);
-                if let Some(weights) = weights.as_ref().filter(|weights| weights.len() != items.len()) {
-                    let detail =
-                        format!("expected one for each of the {} states, found {}", items.len(), weights.len());
-                    faults.note(place, detail);
-                }
-                weights
-            }
-            None => Some(Vec::new()),
-        };
-        let (observations, weights) = faults.check(read.zip(weights))?;
-        let mut weights = weights.into_iter().skip(n_known);
-        let observations: Vec<Observation> =
-            observations.into_iter().map(|values| Observation { values, weight: weights.next().flatten() }).collect();
-        #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
-        let n_states = new.len() as u32;
-        let steps = match &self.online {
-            Some(online) if self.unwritten.are_enough(self.is_inline(1)) => {
-                Some(self.unwritten.take(online, &self.watch, self.n_received)?)
-            }
-            _ => None,
-        };
-        for (index, observation) in (self.n_received as usize..).zip(&observations) {
-            self.watch.observe(self.mapper.model(), index, &observation.values);
-        }
-        self.n_sent = self.n_received + n_states;
-        if let Some(waits) = &mut self.waits {
-            waits.came(self.n_received, Duration::ZERO, etude.clock.instant());
-        }
-        let appending = etude.store.append_observations(NewObservations {
-            session_id: self.id.clone(),
-            owner: self.owner,
-            seq: self.n_received,
-            n_states,
-            states: stored_states(new, &observations).map_err(ServiceError::Write)?,
-            at: now,
-            service_time: self.waits.as_ref().map(|_| etude.store.service_time(now)),
-            steps,
-        });
-        let mapping = async { self.map_here(etude, observations.into(), 0) };
-        // In this order: the disk is at work before the mapping begins.
-        let (appended, mapped) = tokio::join!(biased; appending, mapping);
-        appended??;
-        self.n_received = self.n_sent;
-        mapped
-    }
-
-    /// What there is to warn of since the last time that this was asked; the frame that was received begins with the state `seq`.
-    pub fn news(&mut self, seq: u32) -> Vec<Warning> {
-        self.watch.news(self.mapper.model(), seq as usize, &STATES)
-    }
-
     /// Ends the demonstration, which must have `seq` observations, and stores its policy.
     ///
     /// # Errors
@@ -342,15 +232,4 @@ impl Session {
         steps.give_back(written_bytes(self.n_steps, self.mapper.model()));
         Ok(Ended { steps, policy })
     }
-}
-
-/// Observed states as they are stored: before each that came with a weight, that number.
-fn stored_states(states: &[serde_json::Value], observations: &[Observation]) -> serde_json::Result<String> {
-    if observations.iter().all(|observation| observation.weight.is_none()) {
-        return serde_json::to_string(states);
-    }
-    let stored = states.iter().zip(observations).flat_map(|(state, observation)| {
-        observation.weight.map(serde_json::Value::from).into_iter().chain([state.clone()])
-    });
-    serde_json::to_string(&stored.collect::<Vec<_>>())
 }

@@ -28,6 +28,19 @@ async fn open(directory: &std::path::Path, time_limits: TimeLimits, tasks: &Task
     Etude::open(&settings, tasks, CancellationToken::new()).await.unwrap()
 }
 
+/// Receives the states from `seq` on.
+pub(super) async fn receive(
+    etude: &Etude,
+    session: &mut Session,
+    seq: u32,
+    states: &Value,
+    now: Timestamp,
+) -> Received {
+    let mut coming = Coming::default();
+    session.take_in(&mut coming, seq, &Place::root(states), None).unwrap();
+    session.receive(etude, coming, now).await.unwrap().pop().unwrap().mapped.unwrap()
+}
+
 /// A service with a model of 256 attributes, and a session that has observed nothing of them 1200 times.
 async fn observed(directory: &std::path::Path, tasks: &TaskTracker) -> (Etude, Session) {
     let attribute = |n: usize| json!({"name": format!("{n}"), "kind": "number"});
@@ -41,10 +54,8 @@ async fn observed(directory: &std::path::Path, tasks: &TaskTracker) -> (Etude, S
     let mut session = etude.open_session(&json!({"type": "open", "model": "wide"}), caller()).await.unwrap();
     let states = json!(vec![json!({}); 300]);
     for n in 0..4 {
-        if let Received::Waiting(states) =
-            session.receive(&etude, 300 * n, &Place::root(&states), None, NOW).await.unwrap()
-        {
-            session.advance(&etude, states).await.unwrap();
+        if let Received::Waiting(waiting) = receive(&etude, &mut session, 300 * n, &states, NOW).await {
+            session.advance(&etude, waiting).await.unwrap();
         }
     }
     (etude, session)

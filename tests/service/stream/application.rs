@@ -4,11 +4,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use etude::clock::{Clock, Ids};
-use etude::service::{Caller, Etude};
+use etude::service::{Caller, Coming, Etude, Session};
 use etude::stream::{Closed, Incoming, Outgoing, Receiver, Sender, queue};
 use etude_core::document::Place;
 use jiff::Timestamp;
 use serde_json::{Value, json};
+use sqlx::ConnectOptions;
 use tempfile::TempDir;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -34,6 +35,13 @@ async fn by_clock(service: Service, abort: &CancellationToken, clock: Clock) -> 
     (Etude::open(&flags.settings(clock, Ids::random()), &TaskTracker::new(), abort.clone()).await.unwrap(), directory)
 }
 
+/// Receives the states from `seq` on.
+async fn receive(etude: &Etude, session: &mut Session, seq: u32, states: &Place<'_, '_>, now: Timestamp) {
+    let mut coming = Coming::default();
+    session.take_in(&mut coming, seq, states, None).unwrap();
+    session.receive(etude, coming, now).await.unwrap();
+}
+
 #[tokio::test]
 async fn resuming_and_repeating_keep_a_session_from_expiring() {
     let (service, demonstration) = figure_4().await;
@@ -46,16 +54,16 @@ async fn resuming_and_repeating_keep_a_session_from_expiring() {
     let mut session = etude.open_session(&open, caller(0)).await.unwrap();
     let id = session.id().to_owned();
     let active_at = async || etude.session(&id).await.unwrap().active_at;
-    session.receive(&etude, 0, &states, None, at(1)).await.unwrap();
+    receive(&etude, &mut session, 0, &states, at(1)).await;
     assert_eq!(active_at().await, at(1));
-    session.receive(&etude, 0, &states, None, at(2)).await.unwrap();
+    receive(&etude, &mut session, 0, &states, at(2)).await;
     assert_eq!(active_at().await, at(2));
     drop(session);
     let mut resumed = etude.resume_session(&id, caller(3)).await.unwrap();
     assert_eq!((active_at().await, resumed.session.n_received()), (at(3), 16));
     // What is not settled yet came before.
     let more = json!([demonstration[0]]);
-    resumed.session.receive(&etude, 16, &Place::root(&more), None, at(4)).await.unwrap();
+    receive(&etude, &mut resumed.session, 16, &Place::root(&more), at(4)).await;
     drop(resumed);
     assert_eq!(etude.resume_session(&id, caller(5)).await.unwrap().session.n_received(), 17);
     assert_eq!(active_at().await, at(5));
@@ -148,14 +156,92 @@ impl Wire {
 
     async fn receive_until(&mut self, kind: &str) -> Value {
         loop {
-            let came = within("a frame", self.from_server.recv()).await;
-            let Some(Outgoing::Frame(text)) = came.map(|queued| queued.item) else { panic!("an end before {kind}") };
-            let frame: Value = serde_json::from_str(&text).unwrap();
+            let frame = self.receive().await;
             if frame["type"] == kind {
                 return frame;
             }
         }
     }
+
+    async fn receive(&mut self) -> Value {
+        let came = within("a frame", self.from_server.recv()).await;
+        let Some(Outgoing::Frame(text)) = came.map(|queued| queued.item) else { panic!("an end") };
+        serde_json::from_str(&text).unwrap()
+    }
+}
+
+/// What is sent of a demonstration, with all that may be wrong with it on the way.
+fn script(demonstration: &[Value]) -> Vec<Value> {
+    let observe = |seq: usize, n: usize| json!({"type": "observe", "seq": seq, "states": demonstration[seq..seq + n]});
+    let mut weighted = observe(5, 2);
+    weighted["observation_weights"] = json!([2.0, null]);
+    let unknown = json!({"type": "observe", "seq": 7, "states": [demonstration[7], {"z": 1}]});
+    let mut script = vec![observe(0, 1), observe(1, 3), observe(2, 2), observe(9, 1), observe(3, 2), weighted, unknown];
+    script.push(json!({"type": "end", "seq": 6}));
+    script.extend((7..demonstration.len()).map(|seq| observe(seq, 1)));
+    script.push(json!({"type": "observe", "seq": demonstration.len(), "states": [{"x": -1000}]}));
+    script.push(json!({"type": "observe", "seq": 3, "states": []}));
+    script
+}
+
+/// How many commits have added observations since they were last settled.
+async fn n_commits(directory: &TempDir) -> i64 {
+    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(directory.path().join("etude.db"));
+    let mut connection = options.connect().await.unwrap();
+    sqlx::query_scalar("SELECT COUNT(*) FROM arrivals").fetch_one(&mut connection).await.unwrap()
+}
+
+#[tokio::test]
+async fn frames_that_wait_one_behind_the_other_are_answered_as_they_are_one_by_one() {
+    let (service, demonstration) = figure_4().await;
+    let (etude, _directory) = without_service(service, &CancellationToken::new()).await;
+    let (etude, stopping) = (Arc::new(etude), CancellationToken::new());
+    let script = script(&demonstration);
+    for lookahead in [json!(1), json!(8), json!(null)] {
+        let mut answers = Vec::new();
+        for are_sent_together in [false, true] {
+            let mut wire = Wire::connect(&etude, &stopping);
+            wire.send(json!({"type": "open", "model": "figure-4", "lookahead": lookahead})).await;
+            wire.receive_until("opened").await;
+            let mut came = Vec::new();
+            for sent in &script {
+                wire.send(sent.clone()).await;
+                let mut is_answered = are_sent_together;
+                while !is_answered {
+                    came.push(wire.receive().await);
+                    is_answered = came.last().unwrap()["type"] != "step";
+                }
+            }
+            wire.send(json!({"type": "end", "seq": demonstration.len() + 1})).await;
+            while came.last().is_none_or(|last| last["type"] != "done") {
+                came.push(wire.receive().await);
+            }
+            came.last_mut().unwrap()["policy_id"].take();
+            answers.push(came);
+        }
+        let n_warned = answers[0].iter().filter(|frame| frame["warnings"].is_array()).count();
+        assert!(n_warned >= 1, "{answers:?}");
+        assert_eq!(answers[0], answers[1]);
+    }
+    etude.close().await;
+}
+
+#[tokio::test]
+async fn frames_that_wait_one_behind_the_other_take_one_commit() {
+    let (service, demonstration) = figure_4().await;
+    let (etude, directory) = without_service(service, &CancellationToken::new()).await;
+    let (etude, stopping) = (Arc::new(etude), CancellationToken::new());
+    let mut wire = Wire::connect(&etude, &stopping);
+    wire.send(json!({"type": "open", "model": "figure-4"})).await;
+    wire.receive_until("opened").await;
+    for (seq, state) in demonstration.iter().enumerate() {
+        wire.send(json!({"type": "observe", "seq": seq, "states": [state]})).await;
+    }
+    for seq in 1..=demonstration.len() {
+        assert_eq!(wire.receive_until("received").await["seq"], seq);
+    }
+    assert_eq!(n_commits(&directory).await, 1);
+    etude.close().await;
 }
 
 #[tokio::test]

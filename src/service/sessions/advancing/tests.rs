@@ -3,6 +3,7 @@ use serde_json::{Value, json};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use super::super::tests::receive;
 use super::*;
 use crate::service::{Caller, Client, ModelText, Name, Settings};
 use etude_core::document::{Faults, Place};
@@ -68,7 +69,7 @@ async fn slow(directory: &std::path::Path) -> (Etude, Session, Waiting) {
     let open = json!({"type": "open", "model": "ring", "lookahead": 12});
     let mut session = etude.open_session(&open, caller).await.unwrap();
     session.is_slow = true;
-    let received = session.receive(&etude, 0, &Place::root(&seen.into()), None, caller.now).await.unwrap();
+    let received = receive(&etude, &mut session, 0, &seen.into(), caller.now).await;
     let Received::Waiting(waiting) = received else { panic!("it is slow") };
     (etude, session, waiting)
 }
@@ -122,7 +123,7 @@ async fn what_takes_long_goes_on_in_the_pool_with_the_same_steps() {
     for (frame, states) in seen.chunks(100).enumerate() {
         let seq = u32::try_from(100 * frame).unwrap();
         let states = Value::from(states);
-        let received = session.receive(&etude, seq, &Place::root(&states), None, caller.now).await.unwrap();
+        let received = receive(&etude, &mut session, seq, &states, caller.now).await;
         let steps = match received {
             Received::Mapped(steps) => steps,
             Received::Waiting(waiting) => {

@@ -10,11 +10,11 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::super::kept::Kept;
+use super::super::tests::receive;
 use super::super::{Received, Resumed, Session};
 use super::*;
 use crate::clock::Clock;
 use crate::service::{Caller, Client, Etude, ModelText, Name, Settings};
-use etude_core::document::Place;
 use etude_core::mapping::{CommittedStep, PassedStates};
 use etude_core::model::{Format, Limits};
 
@@ -65,7 +65,7 @@ impl Service {
 
     async fn observe(&self, session: &mut Session, states: &[serde_json::Value]) -> Vec<CommittedStep> {
         let (seq, states) = (session.n_received(), json!(states));
-        let received = session.receive(&self.etude, seq, &Place::root(&states), None, self.clock.now()).await.unwrap();
+        let received = receive(&self.etude, session, seq, &states, self.clock.now()).await;
         match received {
             Received::Mapped(steps) => steps.to_vec(),
             Received::Waiting(observations) => session.advance(&self.etude, observations).await.unwrap().to_vec(),

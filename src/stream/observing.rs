@@ -1,0 +1,87 @@
+//! How observations are answered: those that wait one behind the other are received together, by one commit.
+
+use jiff::Timestamp;
+use serde_json::Value;
+
+use super::closing::{Closed, Over, ends, not_allowed};
+use super::engine::Connection;
+use super::frames::{ClientFrame, ServerFrame};
+use super::messages::{Incoming, read_frame};
+use super::queue::{Receiver, Weighed};
+use super::room::Taken;
+use crate::service::{Coming, Received, ReceivedFrame, Session, SessionError};
+use etude_core::document::{Path, Place};
+
+/// Frames that are received together have so many bytes at most: what is larger is written after what is small.
+const BYTES_TOGETHER: usize = 4 << 10;
+
+impl Connection<'_> {
+    /// Receives what is observed from `seq` on in a frame of `n_bytes`, together with the frames of observations that wait behind it, and
+    /// answers each of them.
+    pub(super) async fn observe(
+        &mut self,
+        seq: u32,
+        (frame, memory): (Value, Option<Taken>),
+        mut n_bytes: usize,
+        incoming: &mut Receiver<Incoming>,
+        now: Timestamp,
+    ) -> Result<Option<Closed>, Over> {
+        let outlet = self.outlet;
+        let Some(session) = &mut self.session else { return Err(not_allowed("open or resume a session first")) };
+        let mut coming = Coming::default();
+        if let Err(error) = take_in(session, &mut coming, seq, &frame) {
+            return self.go_on_or_end(&error).await;
+        }
+        // Nobody waits for a search with what it does not need.
+        drop((frame, memory));
+        // Their room in the queue is given back once they are answered.
+        let mut others = Vec::new();
+        while n_bytes < BYTES_TOGETHER
+            && let Some(next) = incoming.try_recv()
+        {
+            n_bytes += next.item.n_bytes();
+            if n_bytes > BYTES_TOGETHER || !take_in_next(session, &mut coming, &next.item) {
+                self.next = Some(next);
+                break;
+            }
+            others.push(next);
+        }
+        let received = match session.receive(self.etude, coming, now).await {
+            Ok(received) => received,
+            Err(error) => return self.go_on_or_end(&error).await,
+        };
+        for ReceivedFrame { n_received, warnings, mapped } in received {
+            let mapped = match mapped {
+                Ok(mapped) => mapped,
+                Err(error) => return self.go_on_or_end(&error).await,
+            };
+            outlet.send(&ServerFrame::Received { seq: n_received, warnings: &warnings }).await?;
+            let steps = match mapped {
+                Received::Mapped(steps) => steps,
+                Received::Waiting(waiting) => {
+                    // Others have their turn.
+                    tokio::task::yield_now().await;
+                    session.advance(self.etude, waiting).await.map_err(|error| ends(&error))?
+                }
+            };
+            outlet.send_steps(&steps).await?;
+        }
+        Ok(None)
+    }
+}
+
+/// Takes in a frame that waits, if it is one of observations with which nothing is wrong. Says whether it was taken; whatever else it is, it is
+/// to be answered by itself.
+fn take_in_next(session: &Session, coming: &mut Coming, next: &Incoming) -> bool {
+    let Incoming::Frame { text, .. } = next else { return false };
+    let Ok(ClientFrame::Observe { seq, frame }) = read_frame(text) else { return false };
+    take_in(session, coming, seq, &frame).is_ok()
+}
+
+fn take_in(session: &Session, coming: &mut Coming, seq: u32, frame: &Value) -> Result<(), SessionError> {
+    let root = Place::root(frame);
+    let states = Place { value: &frame["states"], path: Path::Member(&root.path, "states") };
+    let weights = root.value.get("observation_weights").filter(|weights| !weights.is_null());
+    let weights = weights.map(|value| Place { value, path: Path::Member(&root.path, "observation_weights") });
+    session.take_in(coming, seq, &states, weights.as_ref())
+}
