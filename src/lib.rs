@@ -11,13 +11,14 @@
 //! used without the rest. This one is the service and the program around it. Each module uses only those to its left, which a test holds:
 //!
 //! ```text
-//! etude_core <- clock, memory, telemetry, picture <- experiment <- store <- service <- stream <- http <- config <- server <- cli
+//! etude_core <- clock, compressed, memory, telemetry, picture <- experiment <- store <- service <- stream <- http <- config <- server <- cli
 //! ```
 //!
 //! | module | is |
 //! |---|---|
 //! | [`etude_core`] | the core, with an architecture of its own |
 //! | [`clock`] | what time it is, and new ids, as the server hands them in |
+//! | `compressed` | data that was compressed, read as it comes |
 //! | [`memory`] | the one budget of memory |
 //! | [`picture`] | paths and timelines of policies, as SVG |
 //! | [`experiment`] | the paper's figures |
@@ -54,6 +55,7 @@
 
 pub mod cli;
 pub mod clock;
+mod compressed;
 pub mod config;
 pub mod experiment;
 pub mod http;

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::CliError;
-use super::map::read_json;
+use super::opened::read_json;
 use super::written::write_model;
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;

@@ -11,7 +11,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::client::{Client, ServerUrl};
-use super::map::read_json;
+use super::opened::read_json;
 use super::{CliError, runtime, write_file};
 use crate::clock::{Clock, Ids};
 use crate::config::parse_database;

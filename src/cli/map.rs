@@ -1,7 +1,6 @@
 //! `etude map`.
 
-use std::fs;
-use std::io::{self, Read, Write};
+use std::io::{self, Write};
 use std::num::NonZeroU32;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -13,7 +12,7 @@ use serde_json::{Value, json};
 
 use super::drawing::PictureFlags;
 use super::input::{Cells, Observations, Spot};
-use super::model::open;
+use super::opened::open;
 use super::options::{FlaggedRequest, Lookahead, OptionFlags, ReadingFlags, parse_within};
 use super::{CliError, render};
 use crate::clock::Clock;
@@ -178,15 +177,4 @@ pub(super) fn read_model(path: &Path) -> Result<(Definition, Model), CliError> {
         CompileError::OutOfTime => Interrupted::OutOfTime.into(),
     })?;
     Ok((definition, model))
-}
-
-pub(super) fn read_json(path: &Path) -> Result<Value, CliError> {
-    let read = if path == Path::new("-") {
-        let mut text = Vec::new();
-        io::stdin().lock().read_to_end(&mut text).map(|_| text)
-    } else {
-        fs::read(path)
-    };
-    let text = read.map_err(|source| CliError::Read { path: path.to_owned(), source })?;
-    document::parse(&text).map_err(|source| CliError::Faulty(format!("{}: {source}", path.display())))
 }

@@ -12,6 +12,7 @@ mod learner;
 mod map;
 mod model;
 mod openapi;
+mod opened;
 mod options;
 mod render;
 mod serve;

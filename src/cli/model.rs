@@ -1,8 +1,7 @@
 //! `etude model`.
 
-use std::fs::File;
-use std::io::{self, BufRead, BufReader, Read, Write};
-use std::path::{Path, PathBuf};
+use std::io::{BufRead, Write};
+use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -10,6 +9,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use super::CliError;
 use super::experience::Experience;
 use super::inspect::Inspect;
+use super::opened::open;
 use super::written::write_model;
 use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Definition, Edits, ImportError, ImportFile, ImportFormat, Limits, import};
@@ -92,6 +92,9 @@ impl Import {
         let name = self.file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
         let head = content.fill_buf().map_err(|error| failed(error.into()))?;
         let Some(format) = self.of.or_else(|| ImportFormat::of(&name, head)) else {
+            if head.is_empty() {
+                return Err(failed(ImportError::Unfit("the file is empty".to_owned())));
+            }
             let known = ImportFormat::ALL.map(ImportFormat::name).join(", ");
             let detail = format!("this is of no format that is known here: {known}. Say which by --format");
             return Err(failed(ImportError::Unfit(detail)));
@@ -112,36 +115,6 @@ impl Import {
         bar.finish_and_clear();
         read.map_err(failed)
     }
-}
-
-/// Opens the file at `path`, `-` for standard input, decompressed; how far it is read is shown by `bar`.
-pub(super) fn open(path: &Path, bar: &ProgressBar) -> Result<Box<dyn BufRead>, CliError> {
-    const XZ: &[u8] = b"\xfd7zXZ\0";
-    const BZIP2: &[u8] = b"BZh";
-    let read = |source| CliError::Read { path: path.to_owned(), source };
-    let input: Box<dyn Read> = if path == Path::new("-") {
-        Box::new(io::stdin())
-    } else {
-        let file = File::open(path).map_err(read)?;
-        bar.set_length(file.metadata().map_err(read)?.len());
-        Box::new(file)
-    };
-    let mut input = BufReader::with_capacity(1 << 16, bar.wrap_read(input));
-    let head = input.fill_buf().map_err(read)?;
-    if head.starts_with(&[0x1f, 0x8b]) {
-        return Ok(Box::new(BufReader::with_capacity(1 << 16, flate2::bufread::MultiGzDecoder::new(input))));
-    }
-    if head.starts_with(&[0x28, 0xb5, 0x2f, 0xfd]) {
-        let decoder = zstd::stream::read::Decoder::with_buffer(input).map_err(read)?;
-        return Ok(Box::new(BufReader::with_capacity(1 << 16, decoder)));
-    }
-    for (magic, by) in [(XZ, "xz"), (BZIP2, "bzip2")] {
-        if head.starts_with(magic) {
-            let detail = format!("{}: compressed by {by}; decompress it first", path.display());
-            return Err(CliError::Faulty(detail));
-        }
-    }
-    Ok(Box::new(input))
 }
 
 fn style() -> ProgressStyle {

@@ -5,6 +5,7 @@ use std::io::{self, BufRead, BufReader, Read};
 use axum::http::HeaderMap;
 use axum::http::header::CONTENT_ENCODING;
 
+use crate::compressed::Decompressed;
 use crate::memory::NoRoom;
 
 /// How a body was compressed.
@@ -50,12 +51,8 @@ impl Encoding {
             Self::Identity => {
                 return Ok(Box::new(BufReader::new(Limited { inner: body, n_left: limit.n_bytes, limit })));
             }
-            Self::Gzip => Box::new(flate2::bufread::MultiGzDecoder::new(body)),
-            Self::Zstd => {
-                let mut decoder = zstd::stream::read::Decoder::with_buffer(body)?;
-                decoder.window_log_max(Self::MAX_WINDOW_LOG)?;
-                Box::new(decoder)
-            }
+            Self::Gzip => Box::new(Decompressed::gzip(body)),
+            Self::Zstd => Box::new(Decompressed::zstd(body, Some(Self::MAX_WINDOW_LOG))?),
         };
         Ok(Box::new(BufReader::with_capacity(1 << 16, Limited { inner: decoded, n_left: limit.n_bytes, limit })))
     }

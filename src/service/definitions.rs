@@ -8,6 +8,7 @@ use tokio::sync::mpsc;
 use super::hash::hex;
 use super::search::MAX_INLINE_BYTES;
 use super::{Etude, Kind, ServiceError};
+use crate::compressed::{Decompressed, GZIP};
 use crate::memory::{Held, Memory, SMALL_BYTES};
 use crate::store::{ModelSummary, PIECE_BYTES, Store};
 use etude_core::interrupt::Interrupt;
@@ -76,9 +77,6 @@ pub enum ModelText {
 /// Opens a text, on the thread that will read it, as opening already reads its beginning.
 pub type OpenText = Box<dyn FnOnce() -> io::Result<Box<dyn BufRead + Send>> + Send>;
 
-/// How what is compressed by gzip begins.
-const GZIP: &[u8] = &[0x1f, 0x8b];
-
 /// What the text of a model is.
 #[derive(Clone, Debug)]
 pub enum ModelForm {
@@ -113,7 +111,7 @@ impl ModelText {
                 };
                 // Archives are compressed by what makes them, and have their limit as they are read.
                 if *format == ImportFormat::Umb && content.fill_buf()?.starts_with(GZIP) {
-                    content = Box::new(io::BufReader::new(flate2::bufread::MultiGzDecoder::new(content)));
+                    content = Box::new(io::BufReader::new(Decompressed::gzip(content)));
                 }
                 let file = ImportFile { name: String::new(), content };
                 Ok(import(*format, vec![file], edits, limits, interrupt)?)

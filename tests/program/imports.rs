@@ -39,7 +39,8 @@ fn a_file_is_imported_from_disk_or_from_a_pipe_compressed_or_not() {
         assert_eq!(imported(input, &["--cost", "dropoff=1"]), (written.clone(), String::new()));
     }
     let (_, told) = imported(&gzip[..gzip.len() / 2], &["--cost", "dropoff=1"]);
-    assert!(told.starts_with("etude: cannot import -: cannot be decompressed: "), "{told}");
+    let expected = format!("compressed data ends early, at byte {}\n", gzip.len() / 2);
+    assert_eq!(told, format!("etude: cannot import -: cannot be decompressed: {expected}"));
     let (_, told) = imported(b"\xfd7zXZ\0..", &[]);
     assert_eq!(told, "etude: -: compressed by xz; decompress it first\n");
 }
@@ -63,8 +64,39 @@ fn a_model_is_mapped_as_its_file_comes_compressed_or_not_and_a_cut_one_is_told_w
     gzip.write_all(&model).unwrap();
     assert_eq!(mapped(&gzip.finish().unwrap()).0, policy);
     assert_eq!(mapped(&zstd::bulk::compress(&model, 1).unwrap()).0, policy);
+    let zstd = zstd::bulk::compress(&model, 1).unwrap();
+    let (_, told) = mapped(&zstd[..1000]);
+    assert_eq!(told, "etude: cannot read FILE: compressed data ends early, at byte 1000\n");
     let (_, told) = mapped(&model[..model.len() / 2]);
     assert!(told.starts_with("etude: FILE: ") && told.contains("line "), "{told}");
+}
+
+#[test]
+fn a_demonstration_may_be_compressed_too_whatever_its_form() {
+    let directory = tempfile::tempdir().unwrap();
+    let example = |file: &str| Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/way-points").join(file);
+    let mapped = |demonstration: &Path| {
+        let model = example("model.json");
+        let files = ["--model", model.to_str().unwrap(), "--demonstration", demonstration.to_str().unwrap()];
+        let done = run(&[&["map", "--column", "x=km*1000"], &files[..]].concat());
+        let policy = text(&done.stdout).split("search").next().unwrap().to_owned();
+        (policy, text(&done.stderr).replace(directory.path().to_str().unwrap(), "DIR"))
+    };
+    let plain = mapped(&example("demonstration.csv"));
+    assert!(plain.0.contains("optimal"), "{plain:?}");
+    let csv = std::fs::read(example("demonstration.csv")).unwrap();
+    let mut gzip = GzEncoder::new(Vec::new(), Compression::fast());
+    gzip.write_all(&csv).unwrap();
+    let gzip = gzip.finish().unwrap();
+    for (name, content) in [("d.csv.gz", &gzip), ("d.csv.zst", &zstd::bulk::compress(&csv, 1).unwrap())] {
+        std::fs::write(directory.path().join(name), content).unwrap();
+        assert_eq!(mapped(&directory.path().join(name)).0, plain.0);
+    }
+    let cut = directory.path().join("cut.csv.gz");
+    std::fs::write(&cut, &gzip[..20]).unwrap();
+    let (_, told) = mapped(&cut);
+    let expected = "etude: cannot read DIR/cut.csv.gz: compressed data ends early, at byte 20\n";
+    assert!(told.ends_with(expected), "{told}");
 }
 
 #[test]
@@ -72,6 +104,7 @@ fn what_is_wrong_with_a_file_or_a_flag_is_told_in_a_line() {
     for (input, flags, expected) in [
         ("[[[[1, 0, 3, false]]]]", &[][..], "cannot import -: /P/0/0: a reward of 3 is no cost; "),
         ("{\n\"P\": [[[[1, 0,", &[], "cannot import -: line 2: column 14: EOF while parsing a value"),
+        ("", &[], "cannot import -: the file is empty"),
         ("hello", &[], "cannot import -: this is of no format that is known here: gymnasium"),
         ("[[[[1, 0, 0, false]]]]", &["--without", "slide *"], "cannot import -: without: no action is called like"),
         ("[[[[1, 0, 0, false]]]]", &["--cost", "0=-1"], "--cost 0=-1: expected ACTION=COST, with a cost from 0"),

@@ -285,6 +285,9 @@ async fn a_body_that_cannot_be_decompressed_is_refused() {
             let (status, problem) = put(&service, "m", JSON, Some(encoding), body).await;
             assert_eq!((status, &problem["type"]), (400, &json!("/problems/broken-encoding")), "{problem}");
         }
+        let (_, problem) = put(&service, "m", JSON, Some(encoding), whole[..whole.len() / 2].to_vec()).await;
+        let expected = format!("compressed data ends early, at byte {}", whole.len() / 2);
+        assert_eq!(problem["detail"], expected);
     }
     // Of gzip, the last bytes are a checksum.
     let mut flipped = gzip(text.as_bytes());

@@ -7,7 +7,7 @@
 //! | JSON: an array of observations | `[` and then `{`, `[` or `]` |
 //! | JSON: a request, with its `demonstration` and options | an object that goes on after the first line, or has a `demonstration` |
 //!
-//! Rows and lines are read as they come, so that a pipe can be followed while it is written. Values are not checked here: each
+//! A file may be compressed (gzip, zstd). Rows and lines are read as they come, so that a pipe can be followed while it is written. Values are not checked here: each
 //! observation comes with its [`Spot`], the place in the file that a fault is reported at.
 
 mod column;
@@ -17,11 +17,10 @@ mod spot;
 mod table;
 
 use std::ffi::OsStr;
-use std::fs::File;
-use std::io::{self, BufReader};
 use std::path::Path;
 use std::sync::Arc;
 
+use indicatif::ProgressBar;
 use serde_json::{Map as Members, Value};
 use tokio::sync::mpsc;
 
@@ -34,6 +33,7 @@ pub(super) use self::spot::{Source, Spot};
 pub(super) use self::table::Cells;
 use self::table::Table;
 use super::CliError;
+use super::opened::open;
 
 /// Most observations that are read before a service has acknowledged them.
 pub(super) const MAX_READ_AHEAD: usize = 64;
@@ -62,13 +62,7 @@ enum Form {
 impl Observations {
     /// Opens the file at `path`; `-` is standard input. `columns` rename and scale columns; `cells` says how cells of a table become values.
     pub(super) fn open(path: &Path, columns: &[Column], cells: &Cells) -> Result<Self, CliError> {
-        let read = |source| CliError::Read { path: path.to_owned(), source };
-        let input: Input = if path == Path::new("-") {
-            Box::new(BufReader::new(io::stdin()))
-        } else {
-            Box::new(BufReader::new(File::open(path).map_err(read)?))
-        };
-        Self::read(path, input, columns, cells)
+        Self::read(path, open(path, &ProgressBar::hidden())?, columns, cells)
     }
 
     fn read(path: &Path, input: Input, columns: &[Column], cells: &Cells) -> Result<Self, CliError> {
@@ -168,7 +162,9 @@ enum FormName {
 
 /// The form of what begins with the line `head`, the first that is not blank.
 fn form_of(path: &Path, head: &[u8]) -> FormName {
-    let extension = path.extension().map(OsStr::to_ascii_lowercase);
+    let is_packed = path.extension().is_some_and(|extension| extension == "gz" || extension == "zst");
+    let inner = if is_packed { path.with_extension("") } else { path.to_owned() };
+    let extension = inner.extension().map(OsStr::to_ascii_lowercase);
     let is_called = |names: &[&str]| names.iter().any(|name| extension.as_deref() == Some(name.as_ref()));
     let head = head.trim_ascii();
     match head.first() {
