@@ -63,6 +63,19 @@ CREATE TABLE batches (
 
 CREATE INDEX batches_by_hash ON batches (hash);
 
+-- What models of experience were told up to some batch, counted, in pieces: so that these need not be counted again. All of it follows
+-- from the batches, and any of it may be missing; it counts if all of its pieces are there.
+CREATE TABLE tallies (
+    definition_id  INTEGER NOT NULL,
+    seq            INTEGER NOT NULL, -- of the last batch that is counted
+    piece          INTEGER NOT NULL, -- from 0
+    n_pieces       INTEGER NOT NULL,
+    hash           TEXT    NOT NULL, -- of the model with that batch
+    checksum       INTEGER NOT NULL, -- CRC-32 of the whole, before it was compressed
+    content        BLOB    NOT NULL, -- the whole (postcard), compressed (zstd) and cut
+    PRIMARY KEY (definition_id, seq, piece)
+) STRICT;
+
 -- Policies, in the order in which they became durable. A policy outlives its model.
 CREATE TABLE policies (
     sequence       INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT,

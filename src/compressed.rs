@@ -13,7 +13,7 @@ pub(crate) const ZSTD: &[u8] = &[0x28, 0xb5, 0x2f, 0xfd];
 /// A reader of what is compressed in another.
 pub(crate) enum Decompressed<R: BufRead> {
     /// By gzip; several members, one after the other, are one text.
-    Gzip(MultiGzDecoder<Counted<R>>),
+    Gzip(Box<MultiGzDecoder<Counted<R>>>),
     /// By zstd; likewise several frames.
     Zstd(Decoder<'static, Counted<R>>),
 }
@@ -21,7 +21,7 @@ pub(crate) enum Decompressed<R: BufRead> {
 impl<R: BufRead> Decompressed<R> {
     /// Reads what gzip has compressed.
     pub(crate) fn gzip(compressed: R) -> Self {
-        Self::Gzip(MultiGzDecoder::new(Counted::new(compressed)))
+        Self::Gzip(Box::new(MultiGzDecoder::new(Counted::new(compressed))))
     }
 
     /// Reads what zstd has compressed, with a window of `2^max_window_log` bytes at most; as many as zstd allows by itself if `None`.

@@ -86,7 +86,7 @@ impl Asked {
 impl Compiler {
     pub(super) fn new(store: Arc<Store>, pool: SearchPool, settings: &Settings, tasks: TaskTracker) -> Self {
         Self {
-            experiences: Experiences::new(Arc::clone(&store), pool.clone(), settings.memory.clone()),
+            experiences: Experiences::new(Arc::clone(&store), pool.clone(), settings.memory.clone(), tasks.clone()),
             store,
             pool,
             clock: settings.clock.clone(),
@@ -350,7 +350,7 @@ impl Etude {
     ) -> Result<Option<Arc<Mapper>>, ServiceError> {
         let head = self.store.model_head(name).await?.ok_or_else(|| unknown(name, Some(pointer)))?;
         let asked = match head.experience {
-            Some(id) if self.store.has_revision(id, hash).await? => {
+            Some(id) if self.store.revision(id, hash).await?.is_some() => {
                 Asked::Exactly(ModelKey { hash: hash.to_owned(), ..head.key })
             }
             None if head.key.hash == hash => Asked::Exactly(head.key),

@@ -157,7 +157,7 @@ async fn add(
         // If this fails, nobody knows whether it is stored: then it is counted anew.
         if store.add_batch(new).await? {
             let answer = answer(&told, &batch_id, &told.hash, revision);
-            *room = Some(told);
+            *room = Some(experiences.store_tally(told).await);
             return Ok((answer, Some(outdated)));
         }
     }

@@ -1,12 +1,16 @@
 //! What models of experience were told, counted in memory: of as many models as there is room for.
 //!
-//! What is not in memory is counted anew from the batches of the store.
+//! What is not in memory is counted anew from the batches of the store. So that this does not take longer and longer, what was counted is
+//! stored from time to time, and only what came since is counted again.
+
+mod stored;
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use sha2::{Digest, Sha256};
 use tokio::sync::OwnedMutexGuard;
+use tokio_util::task::TaskTracker;
 
 use super::definitions::{DefinitionReader, check_hash, corrupt_definition, unknown};
 use super::hash::{hash_of, hex};
@@ -23,6 +27,7 @@ pub(super) struct Experiences {
     store: Arc<Store>,
     pool: SearchPool,
     memory: Memory,
+    tasks: TaskTracker,
     rooms: Arc<Mutex<Rooms>>,
 }
 
@@ -45,6 +50,8 @@ pub(super) struct Told {
     pub(super) hash: String,
     n_batches: i64,
     pub(super) tally: Tally,
+    /// How many transitions, and batches as so many each, came after what is stored of the tally.
+    n_since_stored: usize,
     held: Held,
 }
 
@@ -61,8 +68,8 @@ impl Experiences {
     /// Most models of which it is kept.
     const MAX_KEPT: usize = 64;
 
-    pub(super) fn new(store: Arc<Store>, pool: SearchPool, memory: Memory) -> Self {
-        Self { store, pool, memory, rooms: Arc::default() }
+    pub(super) fn new(store: Arc<Store>, pool: SearchPool, memory: Memory, tasks: TaskTracker) -> Self {
+        Self { store, pool, memory, tasks, rooms: Arc::default() }
     }
 
     fn rooms(&self) -> MutexGuard<'_, Rooms> {
@@ -111,7 +118,8 @@ impl Experiences {
         let known = room.take().filter(|told| told.experience == experience && told.hash == hash);
         match known {
             Some(told) => Ok(told),
-            None => self.count(name, Wanted::Current).await,
+            // It may have taken long.
+            None => Ok(self.store_tally(self.count(name, Wanted::Current).await?).await),
         }
     }
 
@@ -153,6 +161,14 @@ impl Experiences {
         Ok(self.pool.run_in_turn(Client::LOCAL, job).await?)
     }
 
+    /// Takes memory until `held` holds `n_bytes`, likewise.
+    fn grow(&self, held: &mut Held, n_bytes: u64) -> Result<(), NoRoom> {
+        held.grow_to(n_bytes).or_else(|no_room| {
+            self.make_room();
+            held.grow_to(n_bytes).map_err(|_| no_room)
+        })
+    }
+
     /// Takes memory, if need be from what nobody works with now.
     fn try_take(&self, n_bytes: u64) -> Result<Held, NoRoom> {
         self.memory.try_take(n_bytes).or_else(|_| {
@@ -175,9 +191,7 @@ impl Experiences {
             Wanted::Current => summary.hash.clone(),
             Wanted::Revision(hash) => hash.to_owned(),
         };
-        if wanted != summary.hash && !self.store.has_revision(experience, &wanted).await? {
-            return Err(gone());
-        }
+        let last = self.store.revision(experience, &wanted).await?.ok_or_else(gone)?;
         let mut held = self.memory.try_take(0)?;
         let text = match definition {
             StoredDefinition::Text(text) => text.into_bytes(),
@@ -198,7 +212,15 @@ impl Experiences {
         };
         let tally = self.pool.run_in_turn(Client::LOCAL, read).await?.map_err(|error| corrupt(error.to_string()))?;
         let tally = tally.ok_or_else(|| corrupt("it is not a model of experience".to_owned()))?;
-        let mut told = Told { experience, hash: definition_hash, n_batches: 0, tally, held };
+        let mut told = Told { experience, hash: definition_hash, n_batches: 0, tally, n_since_stored: 0, held };
+        // About what is read of it.
+        let n_known = summary.size.map_or(0, |size| size.n_states + size.n_transitions);
+        self.grow(&mut told.held, 32 * n_known)?;
+        if let Some(stored) = self.store.tally(experience, last).await? {
+            self.grow(&mut told.held, RESTORED_BYTES * stored.content.len() as u64)?;
+            let restore = move |_: &mut dyn Interrupt| Ok(told.with(&stored));
+            told = self.pool.run_in_turn(Client::LOCAL, restore).await?;
+        }
         while told.hash != wanted {
             let batches = self.store.batches(experience, told.n_batches).await?;
             if batches.is_empty() {
@@ -288,13 +310,11 @@ impl Experiences {
 
     fn add(&self, told: &mut Told, batch: &Batch) -> Result<(), NoRoom> {
         let needed = (told.tally.size_bytes() + Tally::growth_bytes(batch)) as u64;
-        if let Err(no_room) = told.held.grow_to(needed) {
-            self.make_room();
-            told.held.grow_to(needed).map_err(|_| no_room)?;
-        }
+        self.grow(&mut told.held, needed)?;
         told.hash = told.hash_with(batch);
         told.n_batches += 1;
         told.tally.add(batch);
+        told.n_since_stored += BATCH_AS_TRANSITIONS + batch.len();
         told.held.shrink_to(told.tally.size_bytes() as u64);
         Ok(())
     }
@@ -337,6 +357,12 @@ impl Told {
         revision(&self.tally)
     }
 }
+
+/// A batch takes as long to count as so many of its transitions.
+const BATCH_AS_TRANSITIONS: usize = 16;
+
+/// What a tally takes, and what is read of it before, for each byte of what is stored.
+const RESTORED_BYTES: u64 = 24;
 
 /// How much there is of what was experienced.
 pub(super) fn revision(tally: &Tally) -> Revision {

@@ -113,16 +113,16 @@ impl Store {
         row.as_ref().map(read_accepted).transpose()
     }
 
-    /// Whether the model has this hash, or had it before it was told more.
+    /// The last batch that the model was told when it had this hash, 0 if that was before the first; `None` if it never had it.
     ///
     /// # Errors
     ///
     /// If the database failed.
-    pub async fn has_revision(&self, experience: i64, hash: &str) -> Result<bool, StoreError> {
-        let query = "SELECT EXISTS (SELECT 1 FROM batches WHERE hash = $1 AND definition_id = $2)
-                     OR EXISTS (SELECT 1 FROM models WHERE definition_hash = $1 AND definition_id = $2)";
+    pub async fn revision(&self, experience: i64, hash: &str) -> Result<Option<i64>, StoreError> {
+        let query = "SELECT seq FROM batches WHERE hash = $1 AND definition_id = $2
+                     UNION ALL SELECT 0 FROM models WHERE definition_hash = $1 AND definition_id = $2";
         let query = sqlx::query_scalar(query).bind(hash).bind(experience);
-        Ok(query.fetch_one(&mut *self.reader().await?).await?)
+        Ok(query.fetch_optional(&mut *self.reader().await?).await?)
     }
 
     /// Some of the batches after the first `n_before`, in order; none if there are no more.

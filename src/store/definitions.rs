@@ -252,7 +252,10 @@ impl Verb for SweepDefinition {
                  (SELECT seq FROM definition_pieces WHERE definition_id = $1 ORDER BY seq DESC LIMIT $2)",
         );
         let removed = removed.bind(id).bind(N_SWEPT_AT_ONCE).execute(&mut *writing.connection).await?;
-        if removed.rows_affected() > 0 || super::batches::remove_some(&mut *writing.connection, id).await? {
+        if removed.rows_affected() > 0
+            || super::batches::remove_some(&mut *writing.connection, id).await?
+            || super::tallies::remove_some(&mut *writing.connection, id).await?
+        {
             return Ok(Swept::Some);
         }
         sqlx::query("DELETE FROM definitions WHERE id = $1").bind(id).execute(&mut *writing.connection).await?;

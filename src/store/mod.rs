@@ -27,6 +27,7 @@ mod refinements;
 mod request_keys;
 mod schema;
 mod sessions;
+mod tallies;
 mod trials;
 mod writer;
 
@@ -62,6 +63,7 @@ pub use sessions::{
 
 use sqlx::Sqlite;
 use sqlx::pool::PoolConnection;
+pub use tallies::StoredTally;
 use tokio_util::task::TaskTracker;
 use trials::TrialNumbers;
 pub use trials::{

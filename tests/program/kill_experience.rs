@@ -12,13 +12,16 @@ use tokio::sync::{Mutex, Notify};
 
 const FLAGS: [&str; 2] = ["--listen", "127.0.0.1:0"];
 
-/// A way that is taken once a batch, and in other batches costs something else.
+/// A way that is taken once a batch, and in other batches costs something else; and so much besides that what was counted is stored from time
+/// to time.
 fn batch(n: usize) -> Value {
     let cost = u32::try_from(n * n % 1009).unwrap();
-    json!({"batch": format!("b{n}"), "transitions": [
-        {"state": [0], "action": "on", "next": [1], "cost": cost},
-        {"state": [n + 1], "action": "on", "next": [n + 2], "count": 1 + n % 3},
-    ]})
+    let mut transitions = vec![
+        json!({"state": [0], "action": "on", "next": [1], "cost": cost}),
+        json!({"state": [n + 1], "action": "on", "next": [n + 2], "count": 1 + n % 3}),
+    ];
+    transitions.resize(800, json!({"state": [0], "action": "wait", "next": [0]}));
+    json!({"batch": format!("b{n}"), "transitions": transitions})
 }
 
 /// What clients know when the service is gone.
@@ -70,7 +73,7 @@ async fn every_batch_counts_once_after_thirty_kills() {
         let model = format!("http://{}/v1/models/m", process.address);
         if kill == 0 {
             let definition = json!({
-                "attributes": [{"name": "x", "kind": "number"}], "actions": [{"name": "on"}], "dynamics": {"kind": "experience", "start": [[0]]},
+                "attributes": [{"name": "x", "kind": "number"}], "actions": [{"name": "on"}, {"name": "wait"}], "dynamics": {"kind": "experience", "start": [[0]]},
             });
             assert_eq!(client.put(&model).json(&definition).send().await.unwrap().status(), 201);
         }
@@ -131,4 +134,7 @@ async fn every_batch_counts_once_after_thirty_kills() {
     let mean = costs.iter().sum::<f64>() / f64::from(u32::try_from(n_batches).unwrap());
     assert_eq!(policy["steps"][1]["action_cost"].as_f64().unwrap().to_bits(), mean.to_bits(), "{policy}");
     process.kill();
+    let stored = sqlx::SqlitePool::connect(database.to_str().unwrap()).await.unwrap();
+    let counted: Option<i64> = sqlx::query_scalar("SELECT max(seq) FROM tallies").fetch_one(&stored).await.unwrap();
+    assert!(counted.is_some_and(|counted| counted > 0), "what was counted was stored");
 }

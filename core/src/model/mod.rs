@@ -60,7 +60,8 @@ pub use builder::ModelBuilder;
 pub use compiled::Model;
 pub use definition::{Definition, DefinitionDocument};
 pub use experience::{
-    Batch, Experience, ExperienceCounts, ExperienceDocument, NOTHING_YET, SeenStateDocument, SeenStatesDocument, Tally,
+    Batch, Experience, ExperienceCounts, ExperienceDocument, KeptTally, NOTHING_YET, SeenStateDocument,
+    SeenStatesDocument, Tally,
 };
 pub use graph::{Graph, OwnCost, Transition};
 pub use implicit::{Implicit, Outcome};

@@ -129,3 +129,76 @@ async fn what_is_stored_and_is_not_what_was_told_is_noticed() {
     let error = tell(&etude, "m", &way("second", 0..2)).await.unwrap_err();
     assert!(matches!(error, ServiceError::Unreadable { table: "batches", .. }), "{error:?}");
 }
+
+/// Waits until the tally that is stored has counted up to `expected`.
+async fn until_stored_is(etude: &Etude, expected: i64) {
+    let (_, experience) = etude.compiler.experiences.head("m").await.unwrap();
+    let reached = async {
+        while etude.store.tally(experience, i64::MAX).await.unwrap().map_or(0, |stored| stored.seq) != expected {
+            tokio::task::yield_now().await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(30), reached).await.unwrap();
+}
+
+async fn execute(path: &std::path::Path, sql: &'static str) {
+    let database = sqlx::SqlitePool::connect(path.join("etude.db").to_str().unwrap()).await.unwrap();
+    sqlx::query(sql).execute(&database).await.unwrap();
+}
+
+#[tokio::test]
+async fn what_was_counted_is_stored_from_time_to_time_and_only_what_came_since_is_counted_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path();
+    let etude = open(path, 256 << 20).await;
+    put(&etude, "m").await;
+    let first = tell(&etude, "m", &way("first", 0..10)).await.unwrap();
+    tell(&etude, "m", &way("second", 0..20_000)).await.unwrap();
+    until_stored_is(&etude, 2).await;
+    let third = tell(&etude, "m", &way("third", 5..15)).await.unwrap();
+    let experiences = &etude.compiler.experiences;
+    let (hash, table) = experiences.table("m", Wanted::Current).await.unwrap();
+    let expected = table.unwrap().text();
+    assert_eq!(hash, third);
+    // Nobody reads what came before.
+    execute(path, "UPDATE batches SET content = x'00' WHERE seq <= 2").await;
+    experiences.make_room();
+    let (hash, table) = etude.compiler.experiences.table("m", Wanted::Current).await.unwrap();
+    assert_eq!((&hash, table.unwrap().text()), (&third, expected));
+    // The next one takes its place.
+    tell(&etude, "m", &way("fourth", 0..20_000)).await.unwrap();
+    until_stored_is(&etude, 4).await;
+    // An earlier revision needs them.
+    let unknown = etude.compiler.experiences.table("m", Wanted::Revision(&hash_of("none"))).await;
+    assert!(matches!(unknown, Err(ServiceError::Unknown { .. })));
+    let earlier = etude.compiler.experiences.table("m", Wanted::Revision(&first)).await;
+    assert!(matches!(earlier, Err(ServiceError::Unreadable { table: "batches", .. })));
+}
+
+#[tokio::test]
+async fn a_tally_that_is_damaged_or_not_there_in_full_is_counted_again() {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path();
+    let etude = open(path, 256 << 20).await;
+    put(&etude, "m").await;
+    tell(&etude, "m", &way("first", 0..20_000)).await.unwrap();
+    until_stored_is(&etude, 1).await;
+    let second = tell(&etude, "m", &way("second", 0..10)).await.unwrap();
+    let (_, table) = etude.compiler.experiences.table("m", Wanted::Current).await.unwrap();
+    let expected = table.unwrap().text();
+    for damage in [
+        "UPDATE tallies SET content = x'28b52ffd'",
+        "UPDATE tallies SET checksum = checksum + 1",
+        "UPDATE tallies SET hash = 'another'",
+        "UPDATE tallies SET seq = 2",
+        "UPDATE tallies SET n_pieces = n_pieces + 1",
+        "DELETE FROM tallies WHERE piece = 0",
+    ] {
+        execute(path, damage).await;
+        etude.compiler.experiences.make_room();
+        let (hash, table) = etude.compiler.experiences.table("m", Wanted::Current).await.unwrap();
+        assert!((&hash, table.unwrap().text()) == (&second, expected.clone()), "{damage}");
+        // As counting took long.
+        until_stored_is(&etude, 2).await;
+    }
+}

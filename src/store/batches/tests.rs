@@ -75,8 +75,8 @@ async fn a_batch_is_added_to_the_revision_that_it_was_made_for_and_to_no_other()
     let accepted = store.accepted_batch(id, "batch of b").await.unwrap().unwrap();
     assert_eq!((accepted.content_hash.as_str(), accepted.hash.as_str()), ("content of b", "b"));
     assert_eq!(store.accepted_batch(id, "batch of c").await.unwrap(), None);
-    for (hash, is_known) in [("a", true), ("b", true), ("c", false)] {
-        assert_eq!(store.has_revision(id, hash).await.unwrap(), is_known, "{hash}");
+    for (hash, seq) in [("a", Some(0)), ("b", Some(1)), ("c", None)] {
+        assert_eq!(store.revision(id, hash).await.unwrap(), seq, "{hash}");
     }
     // The definition is what is compared.
     let again = store.register_model(model("a", Replaces::Any)).await.unwrap();

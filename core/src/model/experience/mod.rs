@@ -11,6 +11,7 @@
 
 mod batch;
 mod document;
+mod kept;
 mod reading;
 mod tally;
 mod values;
@@ -23,6 +24,7 @@ use serde::Serialize;
 
 pub use batch::Batch;
 pub use document::{ExperienceDocument, SeenStateDocument, SeenStatesDocument};
+pub use kept::KeptTally;
 pub(super) use reading::read;
 pub use tally::{ExperienceCounts, Tally};
 

@@ -3,6 +3,8 @@
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
+use serde::{Deserialize, Serialize};
+
 use super::values::DistinctStates;
 use super::{Batch, Experience};
 use crate::attribute::{Schema, Value};
@@ -38,35 +40,35 @@ use crate::model::{Action, ActionIdx, Limits, Outcome, Start, StateIdx};
 /// ```
 #[derive(Clone, Debug)]
 pub struct Tally {
-    experience: Arc<Experience>,
+    pub(super) experience: Arc<Experience>,
     /// By first appearance.
-    states: DistinctStates,
+    pub(super) states: DistinctStates,
     /// Outcomes of states and actions, by first appearance.
-    outcomes: Vec<SeenOutcome>,
+    pub(super) outcomes: Vec<SeenOutcome>,
     /// Where an outcome stands. Hashed with a seed, as clients choose what follows what.
     known: HashMap<(StateIdx, ActionIdx, StateIdx), u32>,
     pairs: HashMap<(StateIdx, ActionIdx), Pair>,
-    n_unsafe: usize,
+    pub(super) n_unsafe: usize,
     /// Of the pairs that were seen often enough: their outcomes, and how many of them have several.
     n_transitions: usize,
     n_stochastic: usize,
 }
 
 /// An outcome that was seen.
-#[derive(Clone, Copy, Debug)]
-struct SeenOutcome {
-    from: StateIdx,
-    action: ActionIdx,
-    to: StateIdx,
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+pub(super) struct SeenOutcome {
+    pub(super) from: StateIdx,
+    pub(super) action: ActionIdx,
+    pub(super) to: StateIdx,
     /// How often, at least once.
-    count: u64,
+    pub(super) count: u64,
     /// How often its cost was told.
-    n_costs: u64,
+    pub(super) n_costs: u64,
     /// What it cost first, and in all when it was told.
-    cost: f64,
-    cost_sum: f64,
+    pub(super) cost: f64,
+    pub(super) cost_sum: f64,
     /// Whether it cost the same each time.
-    is_same: bool,
+    pub(super) is_same: bool,
 }
 
 /// A state and an action that were seen.
@@ -217,7 +219,21 @@ impl Tally {
             outcome.cost_sum += float(count) * cost;
             outcome.is_same &= outcome.cost.to_bits() == cost.to_bits();
         }
-        let pair = self.pairs.entry((from, action)).or_default();
+        self.count_pair((from, action), count, is_new);
+    }
+
+    /// Notes the outcome at `at` among the states and actions, to which it is new; says whether it is.
+    pub(super) fn note_outcome(&mut self, at: usize) -> bool {
+        let SeenOutcome { from, action, to, count, .. } = self.outcomes[at];
+        #[expect(clippy::cast_possible_truncation, reason = "limits keep transitions below 2^32")]
+        let is_new = self.known.insert((from, action, to), at as u32).is_none();
+        self.count_pair((from, action), count, is_new);
+        is_new
+    }
+
+    /// Counts a state and an action, with an outcome that may be new.
+    fn count_pair(&mut self, pair: (StateIdx, ActionIdx), count: u64, is_new: bool) {
+        let pair = self.pairs.entry(pair).or_default();
         let before = pair.present(self.experience.min_count);
         pair.count = pair.count.saturating_add(count);
         pair.n_outcomes += usize::from(is_new);
@@ -282,6 +298,12 @@ impl Tally {
             _ => Start::Candidates(start),
         };
         Ok(Some(Table::new(schema.clone(), actions.clone(), states.into_states(), edges, start, unsafe_states)))
+    }
+
+    /// How many outcomes of states and actions were seen, whether often enough or not.
+    #[must_use]
+    pub fn n_outcomes(&self) -> usize {
+        self.outcomes.len()
     }
 
     /// About how much memory it takes, in bytes.

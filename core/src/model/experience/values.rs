@@ -100,6 +100,29 @@ impl DistinctStates {
         state
     }
 
+    /// By attribute, the distinct values; and of each state, which of these it has: shape `[n_states, n_attributes]`.
+    pub(super) fn parts(&self) -> (&[Vec<Value>], &[u32]) {
+        (&self.domains, &self.rows)
+    }
+
+    /// The states with these parts, of so many attributes; `None` if there are none such.
+    pub(super) fn of_parts(domains: &[Vec<Value>], rows: &[u32], n_attributes: usize) -> Option<Self> {
+        if domains.len() != n_attributes || !rows.len().is_multiple_of(n_attributes.max(1)) {
+            return None;
+        }
+        let mut states = Self::new(n_attributes);
+        for row in rows.chunks_exact(n_attributes.max(1)) {
+            let n_before = states.len();
+            let values: Option<Vec<&Value>> =
+                domains.iter().zip(row).map(|(domain, value)| domain.get(*value as usize)).collect();
+            states.number_of(values?.into_iter().cloned());
+            if states.len() == n_before {
+                return None;
+            }
+        }
+        Some(states)
+    }
+
     /// The states, as a model has them.
     pub(super) fn into_states(self) -> States {
         States::new(self.domains, self.rows)

@@ -2,6 +2,8 @@
 
 #![expect(clippy::cast_precision_loss, clippy::cast_sign_loss, reason = "numbers here are small")]
 
+mod kept;
+
 use std::collections::BTreeMap;
 
 use proptest::prelude::*;
@@ -365,16 +367,11 @@ fn a_model_of_which_nothing_is_known_has_nowhere_to_start() {
     assert_eq!((model.states().len(), model.n_transitions()), (2, 0));
     // All that was seen must not be entered.
     let mut tally = tally(&definition(&json!({"kind": "experience", "unsafe": [[0, 0, "shut"]]})));
-    add(
-        &mut tally,
-        &json!({"batch": "a", "transitions": [{"state": [0, 0, "shut"], "action": "on", "next": [0, 0, "shut"]}]}),
-    );
+    let seen = |next: u8| json!({"batch": "a", "transitions": [{"state": [0, 0, "shut"], "action": "on", "next": [next, 0, "shut"]}]});
+    add(&mut tally, &seen(0));
     assert_eq!((tally.counts().n_states, tally.counts().n_unsafe), (1, 1));
     assert!(tally.definition(&mut Uninterrupted).unwrap().is_none());
-    add(
-        &mut tally,
-        &json!({"batch": "b", "transitions": [{"state": [0, 0, "shut"], "action": "on", "next": [1, 0, "shut"]}]}),
-    );
+    add(&mut tally, &seen(1));
     let model = compiled(&tally);
     assert_eq!((model.n_unsafe(), model.is_unsafe(0), model.is_unsafe(1)), (1, true, false));
 }
