@@ -135,7 +135,7 @@ impl Map {
         request.insert("demonstration", states.into());
         if request.members().get("model").is_none_or(Value::is_null) {
             let stem = self.model.file_stem().map(|stem| stem.to_string_lossy().into_owned());
-            request.insert("model", stem.unwrap_or_default().into());
+            request.set(&format!("--model {}", self.model.display()), &["model"], stem.unwrap_or_default().into())?;
         }
         self.options.add_to(&mut request)?;
         for (attribute, within) in &self.collapse {

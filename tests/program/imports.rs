@@ -103,7 +103,7 @@ fn a_demonstration_may_be_compressed_too_whatever_its_form() {
 fn what_is_wrong_with_a_file_or_a_flag_is_told_in_a_line() {
     for (input, flags, expected) in [
         ("[[[[1, 0, 3, false]]]]", &[][..], "cannot import -: /P/0/0: a reward of 3 is no cost; "),
-        ("{\n\"P\": [[[[1, 0,", &[], "cannot import -: line 2: column 14: EOF while parsing a value"),
+        ("{\n\"P\": [[[[1, 0,", &[], "cannot import -: line 2, column 14: EOF while parsing a value"),
         ("", &[], "cannot import -: the file is empty"),
         ("hello", &[], "cannot import -: this is of no format that is known here: gymnasium"),
         ("[[[[1, 0, 0, false]]]]", &["--without", "slide *"], "cannot import -: without: no action is called like"),

@@ -48,7 +48,8 @@ impl Choices {
         }
         if names.len() > 1 {
             let known = list_known(names);
-            self.undecided = Some((spot, format!("there are several rewards, {known}: name the one that is the cost")));
+            self.undecided =
+                Some((spot, format!("there are several rewards, {known}, of which none is named by `cost`")));
         }
         Ok((names.len() == 1).then_some(0))
     }

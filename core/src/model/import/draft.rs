@@ -309,8 +309,8 @@ impl Draft {
             }
             let fixed = edits.cost(name);
             if let (None, Some((spot, detail))) = (fixed, refused) {
-                let say = format!("say what the action costs: {}", Quoted(&format!("{name}=1")));
-                return Err(ImportError::at(*spot, format!("{detail}; {say}, or \"*=1\" for all")));
+                let say = format!("say by `cost` what the action costs, {}", Quoted(&format!("{name}=1")));
+                return Err(ImportError::at(*spot, format!("{detail}; {say}, or what all cost, \"*=1\"")));
             }
             let cost = fixed.or(most.map(|(cost, _)| cost)).unwrap_or(DEFAULT_COST);
             Ok(Some((Action { name: normal(edits.renamed(name)).into(), cost }, fixed.is_some())))

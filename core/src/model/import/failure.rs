@@ -14,6 +14,8 @@ pub enum Spot {
     Whole,
     /// A line, from 1.
     Line(u64),
+    /// A line and a column, from 1.
+    Column(u64, u64),
     /// A byte, from 0.
     Byte(u64),
     /// What follows on an action in a state, in a table `P` of Gymnasium.
@@ -80,9 +82,12 @@ impl From<ImportError> for ReadError {
         match error {
             ImportError::Malformed { file, spot, detail } => {
                 let mut faults = Faults::default();
-                let line = if let Spot::Line(line) = spot { Path::Line(line) } else { Path::Root };
+                let line =
+                    if let Spot::Line(line) | Spot::Column(line, _) = spot { Path::Line(line) } else { Path::Root };
                 let detail = match spot {
                     Spot::Whole | Spot::Byte(_) => format!("{}{detail}", Told(&file, spot)),
+                    Spot::Column(_, column) if file.is_empty() => format!("column {column}: {detail}"),
+                    Spot::Column(_, column) => format!("{file}: column {column}: {detail}"),
                     Spot::Line(_) | Spot::Pair(..) if file.is_empty() => detail,
                     Spot::Line(_) | Spot::Pair(..) => format!("{file}: {detail}"),
                 };
@@ -117,6 +122,7 @@ impl fmt::Display for Told<'_> {
             Spot::Whole if file.is_empty() => Ok(()),
             Spot::Whole => write!(f, "{file}: "),
             Spot::Line(line) => write!(f, "line {line}{of}{file}: "),
+            Spot::Column(line, column) => write!(f, "line {line}, column {column}{of}{file}: "),
             Spot::Byte(byte) => write!(f, "byte {byte}{of}{file}: "),
             Spot::Pair(state, action) => write!(f, "/P/{state}/{action}{of}{file}: "),
         }

@@ -76,13 +76,13 @@ fn read<R: BufRead>(
     }
     let mut rewards = Rewards::default();
     if let Some((name, reader)) = state_rewards {
-        rewards.read_states(Lines::new(reader)).map_err(|error| error.in_file(&name))?;
+        rewards.read_states(&name, Lines::new(reader)).map_err(|error| error.in_file(&name))?;
     }
     if let Some((name, reader)) = transition_rewards {
-        rewards.read_transitions(Lines::new(reader)).map_err(|error| error.in_file(&name))?;
+        rewards.read_transitions(&name, Lines::new(reader)).map_err(|error| error.in_file(&name))?;
     }
     let finish = || {
-        let n_states = read_transitions(Lines::new(transitions), &mut choices, &rewards)?;
+        let n_states = read_transitions(Lines::new(transitions), &mut choices, &mut rewards)?;
         if choices.draft.n_rows() == 0 {
             choices.label_states(n_states, &known)?;
         }
@@ -107,7 +107,7 @@ fn next_line<R: BufRead>(lines: &mut Lines<R>) -> Result<Option<String>, ImportE
 }
 
 fn first_line<R: BufRead>(lines: &mut Lines<R>) -> Result<String, ImportError> {
-    next_line(lines)?.ok_or_else(|| lines.wrong("the file is empty"))
+    next_line(lines)?.ok_or_else(|| ImportError::at(Spot::Whole, "the file is empty"))
 }
 
 /// The numbers of the first line: states, choices if there are any, and entries.
@@ -188,15 +188,18 @@ fn read_labels<R: BufRead>(mut lines: Lines<R>, labels: &mut Labels, draft: &mut
 struct Rewards {
     is_there: bool,
     of_states: Vec<(u64, f64)>,
-    of_transitions: Vec<([u64; 3], f64)>,
+    /// Each with where it stands, until a transition has it.
+    of_transitions: Vec<([u64; 3], f64, Spot)>,
+    /// Of each file: its name, how many states and choices it says that there are, and where.
+    heads: Vec<(String, Vec<u64>, Spot)>,
 }
 
 impl Rewards {
-    fn read_states<R: BufRead>(&mut self, mut lines: Lines<R>) -> Result<(), ImportError> {
-        self.is_there = true;
-        let counts = read_counts(&mut lines)?;
+    fn read_states<R: BufRead>(&mut self, file: &str, mut lines: Lines<R>) -> Result<(), ImportError> {
+        let counts = self.read_head(file, &mut lines)?;
         while let Some(line) = next_line(&mut lines)? {
             let ([state], reward, _) = entry::<1>(&line, lines.spot())?;
+            check_state(state, counts[0], lines.spot())?;
             self.of_states.push((state, reward));
         }
         check_count(&lines, "rewards", counts.last().copied(), self.of_states.len() as u64)?;
@@ -204,9 +207,8 @@ impl Rewards {
         Ok(())
     }
 
-    fn read_transitions<R: BufRead>(&mut self, mut lines: Lines<R>) -> Result<(), ImportError> {
-        self.is_there = true;
-        let counts = read_counts(&mut lines)?;
+    fn read_transitions<R: BufRead>(&mut self, file: &str, mut lines: Lines<R>) -> Result<(), ImportError> {
+        let counts = self.read_head(file, &mut lines)?;
         while let Some(line) = next_line(&mut lines)? {
             let (key, reward) = if counts.len() == 3 {
                 let (key, reward, _) = entry::<3>(&line, lines.spot())?;
@@ -215,17 +217,49 @@ impl Rewards {
                 let ([from, to], reward, _) = entry::<2>(&line, lines.spot())?;
                 ([from, 0, to], reward)
             };
-            self.of_transitions.push((key, reward));
+            self.of_transitions.push((key, reward, lines.spot()));
         }
         check_count(&lines, "rewards", counts.last().copied(), self.of_transitions.len() as u64)?;
-        self.of_transitions.sort_by_key(|(key, _)| *key);
+        self.of_transitions.sort_by_key(|(key, ..)| *key);
         Ok(())
     }
 
+    fn read_head<R: BufRead>(&mut self, file: &str, lines: &mut Lines<R>) -> Result<Vec<u64>, ImportError> {
+        self.is_there = true;
+        let counts = read_counts(lines)?;
+        self.heads.push((file.to_owned(), counts[..counts.len() - 1].to_vec(), lines.spot()));
+        Ok(counts)
+    }
+
+    /// Checks that they are of a model of so many states and choices.
+    fn check_heads(&self, counts: &[u64]) -> Result<(), ImportError> {
+        for (file, found, spot) in &self.heads {
+            let mut pairs = ["states", "choices"].into_iter().zip(found.iter().zip(counts));
+            if let Some((what, (found, expected))) = pairs.find(|(_, (found, expected))| found != expected) {
+                let detail = format!("{found} {what}, but the transitions have {expected}");
+                return Err(ImportError::at(*spot, detail).in_file(file));
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that every transition that earns something is there.
+    fn check_all_used(&self) -> Result<(), ImportError> {
+        let unused = self.of_transitions.iter().find(|(.., spot)| *spot != Spot::Whole);
+        let Some(([from, choice, to], _, spot)) = unused else { return Ok(()) };
+        let file = self.heads.last().map_or("", |(file, ..)| file);
+        let detail =
+            format!("there is no transition from {from} to {to} by choice {choice}, or it has a reward already");
+        Err(ImportError::at(*spot, detail).in_file(file))
+    }
+
     /// What a transition earns, with the state that it leaves.
-    fn of(&self, key: [u64; 3]) -> Option<f64> {
+    fn of(&mut self, key: [u64; 3]) -> Option<f64> {
         let of_state = self.of_states.binary_search_by_key(&key[0], |(state, _)| *state);
-        let of_transition = self.of_transitions.binary_search_by_key(&key, |(key, _)| *key);
+        let of_transition = self.of_transitions.binary_search_by_key(&key, |(key, ..)| *key);
+        if let Ok(at) = of_transition {
+            self.of_transitions[at].2 = Spot::Whole;
+        }
         let [state, transition] = [
             of_state.map_or(0.0, |at| self.of_states[at].1),
             of_transition.map_or(0.0, |at| self.of_transitions[at].1),
@@ -258,7 +292,7 @@ fn entry<const N: usize>(line: &str, spot: Spot) -> Result<([u64; N], f64, Optio
 fn read_transitions<R: BufRead>(
     mut lines: Lines<R>,
     choices: &mut Choices,
-    rewards: &Rewards,
+    rewards: &mut Rewards,
 ) -> Result<u64, ImportError> {
     let counts = read_counts(&mut lines)?;
     let (n_states, has_choices) = (counts[0], counts.len() == 3);
@@ -306,5 +340,7 @@ fn read_transitions<R: BufRead>(
     }
     check_count(&lines, "choices", Some(counts[1]).filter(|_| has_choices), n_choices)?;
     check_count(&lines, "transitions", counts.last().copied(), n_transitions)?;
+    rewards.check_heads(&counts[..counts.len() - 1])?;
+    rewards.check_all_used()?;
     Ok(n_states)
 }

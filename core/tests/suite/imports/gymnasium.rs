@@ -87,9 +87,9 @@ fn a_mapping_on_a_table_of_gymnasium_costs_what_the_independent_solver_finds() {
 fn what_is_wrong_with_a_table_of_gymnasium_is_told_with_its_place() {
     let told = |content: &str| told(ImportFormat::Gymnasium, content);
     for (content, expected) in [
-        ("", "line 1: column 0: EOF while parsing a value"),
-        ("{\"0\": {\"0\": [[1, 0,", "line 1: column 19: EOF while parsing a value"),
-        ("[[[[1, 0, -1, false]]]] 1", "line 1: column 25: trailing characters"),
+        ("", "line 1, column 0: EOF while parsing a value"),
+        ("{\"0\": {\"0\": [[1, 0,", "line 1, column 19: EOF while parsing a value"),
+        ("[[[[1, 0, -1, false]]]] 1", "line 1, column 25: trailing characters"),
         ("{\"format\": \"etude.gymnasium.v2\"}", "etude.gymnasium.v1 is read here"),
         ("{\"states\": [[0]]}", "there is no `P`"),
         ("{\"Q\": 1}", "unknown member \"Q\""),
@@ -99,11 +99,23 @@ fn what_is_wrong_with_a_table_of_gymnasium_is_told_with_its_place() {
         ),
         ("[[[[1.5, 0, 0, false], [-0.5, 0, 0, false]]]]", "/P/0/0: 1.5 is no probability, from 0 to 1"),
         ("[[[[1, 7, 0, false]]]]", "/P/0/0: there is no state 7: there are 1, counted from 0"),
-        ("[[[[1, 0, 0]]]]", "line 1: column 12: invalid length 3"),
+        (
+            "[[[[1, 0, 0]]]]",
+            "line 1, column 12: expected [probability, next state, reward, terminated], with `true` or `false` at its end, found nothing",
+        ),
+        ("[[[[1, \"zero\", 0, false]]]]", "with the index of its next state, found \"zero\""),
+        ("[[[[null, 0, 0, false]]]]", "with a number as its probability, found null"),
+        ("[[[[1, 0, [[]], false]]]]", "with a number as its reward, found an array of 1"),
+        ("[[[[1, 0, 0, false, 1]]]]", "with nothing after these, found 1"),
+        (
+            "[[[7]]]",
+            "line 1, column 5: expected for state 0 and action 0 an outcome [probability, next state, reward, terminated], found integer `7`",
+        ),
+        ("{\"dynamics\": {}}", "this is a model already, which need not be imported"),
         ("[[[]]]", "/P/0/0: the probabilities of state 0 and action \"0\" sum to 0, not to 1"),
         (
             "[[[[1, 0, 3, false]]]]",
-            "/P/0/0: a reward of 3 is no cost; say what the action costs: \"0=1\", or \"*=1\" for all",
+            "/P/0/0: a reward of 3 is no cost; say by `cost` what the action costs, \"0=1\", or what all cost, \"*=1\"",
         ),
         ("{\"1\": {\"0\": [[1, 0, 0, false]]}}", "/P: state 0 is missing"),
         ("{\"0\": {}, \"0\": {}}", "/P/0: the state stands twice"),

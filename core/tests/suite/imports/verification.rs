@@ -158,7 +158,7 @@ fn several_rewards_need_a_choice_and_one_that_is_chosen_must_be_there() {
     };
     let detail = told(&[]).unwrap_err();
     assert!(
-        detail.starts_with("line 8: there are several rewards, \"time\", \"energy\": name the one that is the cost"),
+        detail.starts_with("line 8: there are several rewards, \"time\", \"energy\", of which none is named by `cost`"),
         "{detail}"
     );
     assert_eq!(told(&["fuel"]).unwrap_err(), "cost: no reward is called \"fuel\"; there are \"time\", \"energy\"");
@@ -266,6 +266,16 @@ fn what_is_wrong_with_the_files_of_prism_is_told_with_file_and_line() {
         ("lab", "0: 0", "0: 7", "line 2 of slippery.lab: there is no label 7"),
         ("lab", "0: 0", "20: 0", "line 3 of slippery.lab: states are not in their order"),
         ("srew", "20 10", "20 11", "of slippery.srew: expected 11 rewards, found 10"),
+        ("trew", "20 52", "19 52", "line 3 of slippery.trew: 19 states, but the transitions have 20"),
+        ("trew", "20 52", "20 51", "line 3 of slippery.trew: 51 choices, but the transitions have 52"),
+        ("srew", "20 10", "21 10", "line 3 of slippery.srew: 21 states, but the transitions have 20"),
+        ("srew", "\n2 ", "\n20 ", "of slippery.srew: there is no state 20: there are 20, counted from 0"),
+        (
+            "trew",
+            "\n0 0 0 1.0",
+            "\n0 0 9 1.0",
+            "line 4 of slippery.trew: there is no transition from 0 to 9 by choice 0",
+        ),
         ("trew", "\n0 0 0 1.0", "\n0 0 0 x", "line 4 of slippery.trew: expected a number, found \"x\""),
     ] {
         let told = prism(|name, content| {
@@ -278,6 +288,8 @@ fn what_is_wrong_with_the_files_of_prism_is_told_with_file_and_line() {
         let told = told.unwrap_err().to_string();
         assert!(told.contains(expected), "{wrong}: {told}");
     }
+    let empty = prism(|part, content| Some(if part == "sta" { String::new() } else { content }));
+    assert_eq!(empty.unwrap_err().to_string(), "slippery.sta: the file is empty");
     let missing = prism(|part, content| (part != "tra").then_some(content)).unwrap_err().to_string();
     assert_eq!(missing, "there is no file of transitions: .tra");
     let archive = archive();

@@ -64,11 +64,13 @@ fn told(error: serde_json::Error) -> ImportError {
     if error.is_io() {
         return io::Error::from(error).into();
     }
-    let spot = Spot::Line(u64::try_from(error.line()).unwrap_or(u64::MAX));
-    let column = error.column();
+    let [line, column] = [error.line(), error.column()].map(|n| u64::try_from(n).unwrap_or(u64::MAX));
     let detail = error.to_string();
     let detail = detail.split(" at line ").next().unwrap_or_default();
-    ImportError::at(spot, format!("column {column}: {detail}"))
+    // As everywhere else.
+    let mismatch = detail.strip_prefix("invalid type: ").and_then(|mismatch| mismatch.split_once(", expected "));
+    let detail = mismatch.map_or_else(|| detail.to_owned(), |(found, what)| format!("expected {what}, found {found}"));
+    ImportError::at(Spot::Column(line, column), detail)
 }
 
 /// `[probability, next state, reward, terminated]`.

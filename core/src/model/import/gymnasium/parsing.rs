@@ -7,6 +7,7 @@ use serde::de::{DeserializeSeed, Deserializer, Error as _, IgnoredAny, MapAccess
 use serde_json::Value as Json;
 
 use super::{FORMAT, ImportError, Outcome, Quoted, Reading, Spot};
+use crate::document::Excerpt;
 use crate::model::ActionIdx;
 
 /// What an object may have beside states.
@@ -93,6 +94,10 @@ impl<'de> Visitor<'de> for Document<'_> {
                     }
                 }
                 "environment" => drop(members.next_value::<IgnoredAny>()?),
+                "dynamics" => {
+                    let detail = "this is a model already, which need not be imported: it has \"dynamics\"";
+                    return Err(A::Error::custom(detail));
+                }
                 _ => {
                     let known = MEMBERS.join(", ");
                     return Err(A::Error::custom(format!("unknown member {}; there may be {known}", Quoted(&name))));
@@ -194,10 +199,56 @@ impl<'de> Visitor<'de> for Outcomes<'_> {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut items: A) -> Result<(), A::Error> {
-        while let Some(outcome) = items.next_element::<Outcome>()? {
+        while let Some(outcome) = items.next_element_seed(OutcomeSeed(self.1))? {
             keeping(self.0, |table| table.push_way(self.1, outcome))?;
         }
         Ok(())
+    }
+}
+
+/// One outcome.
+struct OutcomeSeed((u64, ActionIdx));
+
+impl<'de> DeserializeSeed<'de> for OutcomeSeed {
+    type Value = Outcome;
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Outcome, D::Error> {
+        deserializer.deserialize_seq(self)
+    }
+}
+
+impl<'de> Visitor<'de> for OutcomeSeed {
+    type Value = Outcome;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (state, action) = self.0;
+        write!(f, "for state {state} and action {action} an outcome [probability, next state, reward, terminated]")
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut parts: A) -> Result<Outcome, A::Error> {
+        fn wrong<E: serde::de::Error>(what: &'static str) -> impl Fn(Option<&Json>) -> E {
+            move |found| {
+                let found = found.map_or_else(|| "nothing".to_owned(), |found| Excerpt(found).to_string());
+                E::custom(format!("expected [probability, next state, reward, terminated], with {what}, found {found}"))
+            }
+        }
+        let mut next = || parts.next_element::<Json>();
+        let number = |found: Option<Json>, what| {
+            found.as_ref().and_then(Json::as_f64).ok_or_else(|| wrong(what)(found.as_ref()))
+        };
+        let probability = number(next()?, "a number as its probability")?;
+        let to = next()?;
+        let to = to.as_ref().and_then(Json::as_u64).ok_or_else(|| wrong("the index of its next state")(to.as_ref()))?;
+        let reward = number(next()?, "a number as its reward")?;
+        let ended = next()?;
+        let ended = ended
+            .as_ref()
+            .and_then(Json::as_bool)
+            .ok_or_else(|| wrong("`true` or `false` at its end")(ended.as_ref()))?;
+        match next()? {
+            None => Ok((probability, to, reward, ended)),
+            Some(more) => Err(wrong("nothing after these")(Some(&more))),
+        }
     }
 }
 
