@@ -1,23 +1,26 @@
 //! `etude model experience`.
 
 use std::collections::BTreeMap;
-use std::io::Write;
-use std::path::PathBuf;
+use std::io::{BufRead, Read, Write};
+use std::path::{Path, PathBuf};
 
 use clap::Args;
+use indicatif::ProgressBar;
+use serde_json::Value;
 
 use super::CliError;
-use super::opened::read_json;
+use super::opened::{open, read_json};
 use super::written::write_model;
-use etude_core::document::{Faults, Place};
+use etude_core::document::{self, Faults, Place};
 use etude_core::interrupt::Uninterrupted;
-use etude_core::model::{CompileError, Definition, Limits, NOTHING_YET, Tally};
+use etude_core::model::{Batch, CompileError, Definition, Limits, NOTHING_YET, ReadError, Tally};
 
 #[derive(Args, Debug)]
 pub(super) struct Experience {
     /// The model, of which the dynamics are of the kind `experience`: JSON, as for PUT `/v1/models/{model}`.
     model: PathBuf,
-    /// What was experienced, in this order: JSON, each as for POST `/v1/models/{model}/experience`. Of those of the same name, the first counts.
+    /// What was experienced, in this order: JSON, each as for POST `/v1/models/{model}/experience`; or lines of JSON, a transition each, which are
+    /// called after their file. They may be compressed (gzip, zstd). Of those of the same name, the first counts.
     #[arg(required = true)]
     batches: Vec<PathBuf>,
     /// Where to write the model; standard output if left out.
@@ -39,9 +42,8 @@ impl Experience {
         let mut tally = tally.ok_or_else(|| told("the kind of its dynamics is not `experience`"))?;
         let mut known = BTreeMap::new();
         for path in &self.batches {
-            let document = read_json(path)?;
             let mut faults = Faults::default();
-            let batch = tally.read_batch(&Place::root(&document), &mut faults, &mut Uninterrupted)?;
+            let batch = read_batch(&tally, path, &mut faults)?;
             let batch = faults.check(batch).map_err(|faults| faulty(path, faults))?;
             match known.get(&batch.id) {
                 None => tally.add(&batch),
@@ -56,4 +58,41 @@ impl Experience {
         let table = tally.definition(&mut Uninterrupted)?.ok_or_else(|| told(NOTHING_YET))?;
         write_model(&table, self.out.as_deref(), out)
     }
+}
+
+/// Reads a batch, whichever form it is of; lines as they come.
+fn read_batch(tally: &Tally, path: &Path, faults: &mut Faults) -> Result<Option<Batch>, CliError> {
+    let read = |source| CliError::Read { path: path.to_owned(), source };
+    let mut content = open(path, &ProgressBar::hidden())?;
+    // As much as is at hand.
+    let head = content.fill_buf().map_err(read)?;
+    if is_lines(path, head) {
+        return tally.read_lines(&name_of(path), content, faults, &mut Uninterrupted).map_err(|error| match error {
+            ReadError::Read(source) => read(source),
+            // Nothing interrupts it, and what else is wrong is a fault.
+            error => CliError::Faulty(format!("{}: {error}", path.display())),
+        });
+    }
+    let mut text = Vec::new();
+    content.read_to_end(&mut text).map_err(read)?;
+    let document = document::parse(&text).map_err(|error| CliError::Faulty(format!("{}: {error}", path.display())))?;
+    Ok(tally.read_batch(&Place::root(&document), faults, &mut Uninterrupted)?)
+}
+
+/// Whether a batch is one of lines: it is called so, or its first line is a transition.
+fn is_lines(path: &Path, head: &[u8]) -> bool {
+    let name = path.to_string_lossy();
+    let name = name.strip_suffix(".gz").or_else(|| name.strip_suffix(".zst")).unwrap_or(&name);
+    let first = head.split(|byte| *byte == b'\n').find(|line| !line.trim_ascii().is_empty()).unwrap_or_default();
+    let is_transition = |line| {
+        serde_json::from_slice(line)
+            .is_ok_and(|value: Value| value.get("state").is_some() && value.get("action").is_some())
+    };
+    [".ndjson", ".jsonl"].iter().any(|extension| name.ends_with(extension)) || is_transition(first)
+}
+
+/// What the lines in a file are called: as that, up to the first point.
+fn name_of(path: &Path) -> String {
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    name.split('.').next().filter(|stem| !stem.is_empty()).unwrap_or(&name).to_owned()
 }

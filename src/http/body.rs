@@ -60,12 +60,22 @@ pub(super) async fn read_small_json(request: Request, context: &Context) -> Resu
     read_json_within(limit, request, context).await
 }
 
+/// Reads the lines (NDJSON) of a request, likewise.
+pub(super) async fn read_lines(request: Request, context: &Context) -> Result<Bytes, Problem> {
+    let limit = SentLimit { n_bytes: context.max_body_bytes, setting: "ETUDE_MAX_BODY_BYTES" };
+    read_within(limit, Format::Ndjson, request, context).await
+}
+
 async fn read_json_within(limit: SentLimit, request: Request, context: &Context) -> Result<Bytes, Problem> {
-    let is_json = format_of(request.headers()) == Some(Format::Json);
+    read_within(limit, Format::Json, request, context).await
+}
+
+async fn read_within(limit: SentLimit, format: Format, request: Request, context: &Context) -> Result<Bytes, Problem> {
+    let is_declared = format_of(request.headers()) == Some(format);
     let detail = "send JSON with the header `content-type: application/json`";
     let encoding = match declared_encoding(request.headers()) {
-        Ok(encoding) if is_json => encoding,
-        Err(problem) if is_json => return Err(refuse(request, context, problem)),
+        Ok(encoding) if is_declared => encoding,
+        Err(problem) if is_declared => return Err(refuse(request, context, problem)),
         _ => return Err(refuse(request, context, Problem::new(ProblemKind::UnsupportedMediaType, detail))),
     };
     let client = request.extensions().get::<Client>().copied().unwrap_or(Client::LOCAL);

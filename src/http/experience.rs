@@ -1,6 +1,6 @@
 //! `/v1/models/{model}/experience`.
 
-use axum::extract::{Request, State};
+use axum::extract::{Query, Request, State};
 use axum::http::StatusCode;
 use axum::response::Response;
 use serde::Serialize;
@@ -8,11 +8,12 @@ use utoipa::ToSchema;
 
 use super::SharedContext;
 use super::answer::json;
-use super::body::read_json;
+use super::body::{is_ndjson, read_json, read_lines, refuse};
 use super::models::Counts;
 use super::path::PathName;
 use super::problem::{BodyProblems, Problem};
-use crate::service::{Caller, ExperienceAnswer};
+use crate::service::{BatchText, Caller, ExperienceAnswer};
+use etude_core::document::Faults;
 use etude_core::mapping::ObservationDocument;
 
 /// What a body was seen to do.
@@ -72,13 +73,20 @@ impl From<ExperienceAnswer> for ExperienceBody {
 
 /// Tell a model what was experienced.
 ///
-/// The model's dynamics are of the kind `experience`. A batch counts once, however often it is sent, and is durable before it is answered;
+/// The model's dynamics are of the kind `experience`. A log can be sent as it is, as lines of JSON (NDJSON), a transition each; then the query
+/// says what the batch is called. A batch counts once, however often it is sent, and is durable before it is answered;
 /// sent again, it is answered as it was the first time. It gives the model a new hash: requests from then on use this revision, policies
 /// keep the hash of the one that they were made with, and sessions go on with theirs, also once they are resumed.
 #[utoipa::path(
     post, path = "/v1/models/{model}/experience", tag = "models",
-    params(("model" = String, Path, description = "Its name")),
-    request_body = ExperienceRequest,
+    params(
+        ("model" = String, Path, description = "Its name"),
+        ("batch" = Option<String>, Query, description = "Of lines: the client's name for the batch, 1 to 255 characters"),
+    ),
+    request_body(content(
+        (ExperienceRequest = "application/json"),
+        (String = "application/x-ndjson", example = "{\"state\":{\"x\":0},\"action\":\"on\",\"next\":{\"x\":1}}\n{\"state\":{\"x\":1},\"action\":\"on\",\"next\":{\"x\":2},\"cost\":1.2}\n"),
+    )),
     responses(
         (status = 200, description = "The batch counts, now or already", body = ExperienceBody),
         BodyProblems,
@@ -94,7 +102,31 @@ pub(super) async fn add_experience(
     caller: Caller,
     request: Request,
 ) -> Result<Response, Problem> {
-    let body = read_json(request, &context).await?;
-    let answer = context.etude.add_experience(&name, body, caller).await?;
+    let named = named(&request);
+    let is_lines = is_ndjson(request.headers());
+    let text = if is_lines {
+        let Some(batch) = named else {
+            return Err(refuse(request, &context, Faults::one("/batch", UNNAMED).into()));
+        };
+        BatchText::Lines { batch, text: read_lines(request, &context).await? }
+    } else {
+        if named.is_some() {
+            return Err(refuse(request, &context, Faults::one("/batch", NAMED_TWICE).into()));
+        }
+        BatchText::Json(read_json(request, &context).await?)
+    };
+    let answer = context.etude.add_experience(&name, text, caller).await?;
     Ok(json(StatusCode::OK, &ExperienceBody::from(answer)))
+}
+
+/// Why lines are refused that have no name.
+const UNNAMED: &str = "is missing: what is sent as lines has its name in the query, `?batch=NAME`";
+/// Why a name in the query is refused.
+const NAMED_TWICE: &str =
+    "is for what is sent as lines (`content-type: application/x-ndjson`); JSON has its name in it";
+
+/// What the query says that the batch is called.
+fn named(request: &Request) -> Option<String> {
+    let query = Query::<Vec<(String, String)>>::try_from_uri(request.uri()).ok()?;
+    query.0.into_iter().find_map(|(name, value)| (name == "batch").then_some(value))
 }

@@ -23,7 +23,7 @@ use crate::memory::{Held, Memory};
 use crate::store::{AcceptedBatch, Revision, Store};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::{Cancelled, Interrupt, Interrupted};
-use etude_core::model::{Batch, Limits, Tally};
+use etude_core::model::{Batch, Limits, ReadError, Tally};
 
 /// What became of a batch.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -42,10 +42,31 @@ pub struct ExperienceAnswer {
     pub revision: Revision,
 }
 
+/// A batch, as it is sent.
+#[derive(Clone, Debug)]
+pub enum BatchText {
+    /// JSON, with its name.
+    Json(Bytes),
+    /// JSON lines (NDJSON), a transition each.
+    Lines {
+        /// As the client calls it.
+        batch: String,
+        /// The lines.
+        text: Bytes,
+    },
+}
+
+/// A batch that is to be read against its model.
+#[derive(Clone)]
+enum Sent {
+    Document(Arc<Value>),
+    Lines { batch: Arc<str>, text: Bytes },
+}
+
 /// A batch on its way into a model.
 struct Adding {
     model: String,
-    document: Arc<Value>,
+    sent: Sent,
     /// For the document, if it is much.
     _held: Option<Held>,
     /// Of its text.
@@ -56,26 +77,31 @@ struct Adding {
 }
 
 impl Etude {
-    /// Tells the model called `name` the batch in `body` (JSON): it counts once, and is durable before this returns, however often it is
+    /// Tells the model called `name` a batch: it counts once, and is durable before this returns, however often it is
     /// told. Requests from then on use the new revision of the model; policies keep the hash of the one that they were made with, and
     /// sessions go on with theirs.
     ///
     /// # Errors
     ///
     /// [`ServiceError::BatchTaken`] if the model was told another batch of this name; if there is no such model, it is not one of
-    /// experience, the body is no batch, or the service cannot do it now.
+    /// experience, the text is no batch, or the service cannot do it now.
     pub async fn add_experience(
         &self,
         name: &Name,
-        body: Bytes,
+        text: BatchText,
         caller: Caller,
     ) -> Result<ExperienceAnswer, ServiceError> {
         let place = self.pool.admit_when_needed(caller.client);
-        let n_bytes = body.len();
-        let (document, held) = parse(body, &place, &self.memory).await?;
-        let (model, document) = (name.to_string(), Arc::new(document));
-        let adding =
-            Adding { model, document, _held: held, n_bytes, pool: self.pool.clone(), place, limits: self.limits };
+        let (n_bytes, sent, held) = match text {
+            BatchText::Json(body) => {
+                let n_bytes = body.len();
+                let (document, held) = parse(body, &place, &self.memory).await?;
+                (n_bytes, Sent::Document(Arc::new(document)), held)
+            }
+            BatchText::Lines { batch, text } => (text.len(), Sent::Lines { batch: batch.into(), text }, None),
+        };
+        let (model, pool, limits) = (name.to_string(), self.pool.clone(), self.limits);
+        let adding = Adding { model, sent, _held: held, n_bytes, pool, place, limits };
         let (compiler, store, memory) = (self.compiler.clone(), Arc::clone(&self.store), self.memory.clone());
         // Once begun, it is done, even if the client does not wait for it: what is in memory would have to be counted anew.
         let adding = async move {
@@ -105,9 +131,9 @@ async fn add(
     memory.reserve(&mut reading, COPIES * adding.n_bytes)?;
     for _ in 0..MAX_TRIES {
         let told = experiences.current(&adding.model, &mut room).await?;
-        let document = Arc::clone(&adding.document);
+        let sent = adding.sent.clone();
         let read = move |interrupt: &mut dyn Interrupt| {
-            let read = read(&told.tally, &document, interrupt)?;
+            let read = read(&told.tally, &sent, interrupt)?;
             Ok((told, read))
         };
         let (told, read) = adding.run(read).await?;
@@ -177,9 +203,16 @@ impl Adding {
     }
 }
 
-fn read(tally: &Tally, document: &Value, interrupt: &mut dyn Interrupt) -> Result<Result<Batch, Faults>, Cancelled> {
+fn read(tally: &Tally, sent: &Sent, interrupt: &mut dyn Interrupt) -> Result<Result<Batch, Faults>, Cancelled> {
     let mut faults = Faults::default();
-    // Nobody says how long it may take.
-    let batch = tally.read_batch(&Place::root(document), &mut faults, interrupt).map_err(|_: Interrupted| Cancelled)?;
+    // Nobody says how long it may take, and what is in memory can be read.
+    let batch = match sent {
+        Sent::Document(document) => {
+            tally.read_batch(&Place::root(document), &mut faults, interrupt).map_err(|_: Interrupted| Cancelled)?
+        }
+        Sent::Lines { batch, text } => {
+            tally.read_lines(batch, &**text, &mut faults, interrupt).map_err(|_: ReadError| Cancelled)?
+        }
+    };
     Ok(faults.check(batch))
 }

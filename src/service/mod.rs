@@ -46,7 +46,7 @@ pub use batch::{MAX_BATCH_ITEMS, MadePolicies};
 pub use caller::{Caller, Client};
 pub use definitions::{DefinitionReader, ModelForm, ModelText, OpenText};
 pub use error::{Outage, OutageKind, ServiceError};
-pub use experience::ExperienceAnswer;
+pub use experience::{BatchText, ExperienceAnswer};
 pub use hash::{hash_of, hash_of_definition};
 pub use idempotency::{IdempotencyKey, InvalidIdempotencyKey};
 pub use learners::{Difference, LearnedWeight, LearnerAnswer, Replay, WeightsAnswer};

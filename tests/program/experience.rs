@@ -33,3 +33,37 @@ fn a_log_becomes_a_table_without_a_service_and_each_batch_counts_once() {
     let faults = told(&[model, faulty.to_str().unwrap()]);
     assert!(faults.contains("/transitions/0/state/door") && faults.contains("/transitions/0/action"), "{faults}");
 }
+
+#[test]
+fn a_log_of_lines_is_a_batch_that_is_called_as_its_file_compressed_or_not() {
+    const DEFINITION: &str = "examples/explored/model.json";
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name).to_str().unwrap().to_owned();
+    let log = std::fs::read("examples/explored/tuesday.jsonl").unwrap();
+    let lines: Vec<Value> = text(&log).lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let batch = serde_json::json!({"batch": "tuesday", "transitions": lines}).to_string();
+    std::fs::write(path("batch.json"), &batch).unwrap();
+    std::fs::write(path("log"), &log).unwrap();
+    std::fs::write(path("tuesday.jsonl.zst"), zstd::bulk::compress(&log, 1).unwrap()).unwrap();
+    std::fs::write(path("cut.ndjson"), [&log[..], b"\n{\"state\": {\"x\": 1}, \"action\": \"jump\"}\n{"].concat())
+        .unwrap();
+    let made = |file: &str| run(&["model", "experience", DEFINITION, file]);
+    let expected = made(&path("batch.json")).stdout;
+    assert!(!expected.is_empty());
+    for file in [&path("tuesday.jsonl.zst"), &path("log"), "examples/explored/tuesday.jsonl"] {
+        assert_eq!(text(&made(file).stdout), text(&expected), "{file}");
+    }
+    // Of the same name and content, it counts once.
+    let twice = run(&["model", "experience", DEFINITION, &path("batch.json"), &path("tuesday.jsonl.zst")]);
+    assert_eq!(twice.stdout, expected);
+    let told = text(&made(&path("cut.ndjson")).stderr).to_owned();
+    for expected in [
+        "cut.ndjson has faults:",
+        "line 5, /state/door: is missing",
+        "line 5, /action: unknown action \"jump\"",
+        "line 5, /next: is missing",
+        "line 6, (document): not JSON at column ",
+    ] {
+        assert!(told.contains(expected), "{expected}: {told}");
+    }
+}

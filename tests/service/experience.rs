@@ -1,5 +1,7 @@
 //! Models that are told what was experienced, from outside.
 
+mod lines;
+
 use etude::service::hash_of;
 use reqwest::Method;
 use reqwest::header::{ETAG, IF_MATCH};

@@ -86,6 +86,14 @@ impl Faults {
         self.n_unlisted += n;
     }
 
+    /// Adds the faults of a line of the document, from 1.
+    pub(crate) fn append_at(&mut self, line: u64, mut other: Self) {
+        for fault in &mut other.listed {
+            fault.line = Some(line);
+        }
+        self.append(other);
+    }
+
     /// Adds the faults of another part of the document.
     pub(crate) fn append(&mut self, other: Self) {
         let n_fitting = (Self::MAX_LISTED - self.listed.len()).min(other.listed.len());

@@ -43,6 +43,14 @@ pub(crate) fn read_experience(bytes: &[u8]) -> Option<usize> {
         tally.check(&batch, LIMITS, &mut faults);
         faults.is_empty().then_some(batch)
     };
+    // The same lines, as if each were a transition.
+    let rest = &bytes[bytes.iter().position(|byte| *byte == b'\n').map_or(bytes.len(), |end| end + 1)..];
+    let mut faults = Faults::default();
+    if let Ok(Some(batch)) = tally.read_lines("lines", rest, &mut faults, &mut Uninterrupted) {
+        let again: Value = serde_json::from_str(&batch.text).expect("it is JSON");
+        assert_eq!(read(&tally, &again).expect("it is a batch").text, batch.text);
+        tally.add(&batch);
+    }
     let mut n_read = 0;
     for document in documents.filter_map(Result::ok) {
         let Some(batch) = read(&tally, &document) else { continue };

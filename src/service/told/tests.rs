@@ -9,7 +9,7 @@ use tokio_util::task::TaskTracker;
 
 use super::*;
 use crate::clock::Clock;
-use crate::service::{Caller, Etude, ModelText, Name, Settings};
+use crate::service::{BatchText, Caller, Etude, ModelText, Name, Settings};
 use crate::store::ModelKey;
 
 fn caller() -> Caller {
@@ -37,7 +37,8 @@ fn way(id: &str, numbers: std::ops::Range<u32>) -> Value {
 }
 
 async fn tell(etude: &Etude, name: &str, batch: &Value) -> Result<String, ServiceError> {
-    let answer = etude.add_experience(&Name::new(name).unwrap(), batch.to_string().into(), caller()).await;
+    let answer =
+        etude.add_experience(&Name::new(name).unwrap(), BatchText::Json(batch.to_string().into()), caller()).await;
     answer.map(|answer| answer.hash)
 }
 

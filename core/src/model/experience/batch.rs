@@ -1,16 +1,18 @@
 //! What was experienced, as it is sent: a batch of transitions.
 
 use std::collections::HashMap;
+use std::io::{BufRead, Read as _};
 
 use serde::Serialize;
+use serde_json::Value as Json;
 
 use super::Experience;
 use super::reading::read_state;
 use super::values::DistinctStates;
 use crate::attribute::{MAX_COST, Value, WrittenValue};
-use crate::document::{Faults, Place, Quoted, Range, list_known, normal};
+use crate::document::{Faults, ParseError, Path, Place, Quoted, Range, list_known, normal, parse};
 use crate::interrupt::{Interrupted, Meter};
-use crate::model::{ActionIdx, OwnCost, StateIdx};
+use crate::model::{ActionIdx, OwnCost, ReadError, StateIdx};
 
 /// Transitions that a body was seen to make, checked against a model's attributes and actions.
 #[derive(Clone, Debug)]
@@ -67,32 +69,106 @@ impl Batch {
         meter: &mut Meter<'_>,
         faults: &mut Faults,
     ) -> Result<Option<Self>, Interrupted> {
-        let n_before = faults.count();
         let Some(object) = place.object(&["batch", "transitions"], faults) else { return Ok(None) };
+        let mut reader = BatchReader::new(experience, faults);
         let id = object.required("batch", faults).and_then(|place| read_id(&place, faults));
         let place = object.required("transitions", faults);
         let Some((place, items)) = place.and_then(|place| Some((place, place.array(faults)?))) else { return Ok(None) };
-        // Hashed with a seed, as clients choose the names.
-        let known: HashMap<&str, ActionIdx> = experience.actions.iter().map(|action| &*action.name).zip(0..).collect();
-        let mut states = DistinctStates::new(experience.schema.len());
-        let mut transitions = Vec::with_capacity(items.len());
-        let mut text = format!("{{\"batch\":{},\"transitions\":[", serde_json::json!(id.unwrap_or_default()));
         for (n, item) in items.iter().enumerate() {
-            meter.spend_or_stop(2 * experience.schema.len() as u64)?;
-            let read = Transition::read(experience, &known, &place.item(n, item), faults);
-            // Once something is wrong, the rest is read for its faults alone.
-            let Some(transition) = read.filter(|_| faults.count() == n_before) else { continue };
-            transition.write(experience, &mut text);
-            let Transition { state, action, next, count, own_cost } = transition;
-            let [from, to] = [state, next].map(|values| states.number_of(experience.binned(values).into_iter()));
-            transitions.push(Seen { from, action, to, count, own_cost });
+            reader.read(&place.item(n, item), meter, faults)?;
         }
-        if text.ends_with(',') {
-            text.pop();
+        Ok(reader.end(id, faults))
+    }
+
+    /// Reads a batch called `id` from lines of JSON, a transition each; likewise.
+    ///
+    /// # Errors
+    ///
+    /// [`ReadError`] if the lines could not be read, one of them is not JSON, or `interrupt` said so.
+    pub(super) fn read_lines(
+        experience: &Experience,
+        id: &str,
+        mut lines: impl BufRead,
+        meter: &mut Meter<'_>,
+        faults: &mut Faults,
+    ) -> Result<Option<Self>, ReadError> {
+        let mut reader = BatchReader::new(experience, faults);
+        let name = Json::from(id);
+        let path = Path::Member(&Path::Root, "batch");
+        let id = read_id(&Place { value: &name, path }, faults);
+        let (mut text, mut number) = (Vec::new(), 0);
+        loop {
+            text.clear();
+            if lines.by_ref().take(MAX_LINE_BYTES).read_until(b'\n', &mut text)? == 0 {
+                return Ok(reader.end(id, faults));
+            }
+            number += 1;
+            let path = Path::Line(number);
+            if text.trim_ascii().is_empty() {
+                continue;
+            }
+            if text.len() as u64 == MAX_LINE_BYTES {
+                faults.note_at(&path, format!("the line has over {MAX_LINE_BYTES} bytes"));
+                return Ok(None);
+            }
+            match parse(&text) {
+                Ok(value) => reader.read(&Place { value: &value, path }, meter, faults)?,
+                Err(ParseError::Syntax { column, detail, .. }) => {
+                    faults.note_at(&path, format!("not JSON at column {column}: {detail}"));
+                }
+                Err(ParseError::Faults(found)) => faults.append_at(number, found),
+            }
         }
+    }
+}
+
+/// Longest line of a batch, in bytes: it is kept while it is read.
+const MAX_LINE_BYTES: u64 = 4 << 20;
+
+/// Reads the transitions of a batch, one after the other.
+struct BatchReader<'e> {
+    experience: &'e Experience,
+    /// Hashed with a seed, as clients choose the names.
+    known: HashMap<&'e str, ActionIdx>,
+    n_faults_before: usize,
+    states: DistinctStates,
+    transitions: Vec<Seen>,
+    /// In canonical form, with a comma after each.
+    text: String,
+}
+
+impl<'e> BatchReader<'e> {
+    fn new(experience: &'e Experience, faults: &Faults) -> Self {
+        Self {
+            experience,
+            known: experience.actions.iter().map(|action| &*action.name).zip(0..).collect(),
+            n_faults_before: faults.count(),
+            states: DistinctStates::new(experience.schema.len()),
+            transitions: Vec::new(),
+            text: String::new(),
+        }
+    }
+
+    fn read(&mut self, place: &Place<'_, '_>, meter: &mut Meter<'_>, faults: &mut Faults) -> Result<(), Interrupted> {
+        meter.spend_or_stop(2 * self.experience.schema.len() as u64)?;
+        let read = Transition::read(self.experience, &self.known, place, faults);
+        // Once something is wrong, the rest is read for its faults alone.
+        let Some(transition) = read.filter(|_| faults.count() == self.n_faults_before) else { return Ok(()) };
+        transition.write(self.experience, &mut self.text);
+        let Transition { state, action, next, count, own_cost } = transition;
+        let [from, to] = [state, next].map(|values| self.states.number_of(self.experience.binned(values).into_iter()));
+        self.transitions.push(Seen { from, action, to, count, own_cost });
+        Ok(())
+    }
+
+    /// The batch called `id`; `None` if anything was wrong with it.
+    fn end(self, id: Option<&str>, faults: &Faults) -> Option<Batch> {
+        let id = id.filter(|_| faults.count() == self.n_faults_before)?;
+        let mut text = self.text;
+        text.pop();
+        text.insert_str(0, &format!("{{\"batch\":{},\"transitions\":[", serde_json::json!(id)));
         text.push_str("]}");
-        let id = id.filter(|_| faults.count() == n_before);
-        Ok(id.map(|id| Self { id: id.to_owned(), text, states, transitions }))
+        Some(Batch { id: id.to_owned(), text, states: self.states, transitions: self.transitions })
     }
 }
 

@@ -1,6 +1,7 @@
 //! What was experienced, counted.
 
 use std::collections::{HashMap, HashSet};
+use std::io::BufRead;
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
@@ -11,7 +12,7 @@ use crate::attribute::{Schema, Value};
 use crate::document::{Faults, Path, Place};
 use crate::interrupt::{Interrupt, Interrupted, Meter};
 use crate::model::table::{Edges, Table};
-use crate::model::{Action, ActionIdx, Limits, Outcome, Start, StateIdx};
+use crate::model::{Action, ActionIdx, Limits, Outcome, ReadError, Start, StateIdx};
 
 /// What was experienced with a model, counted: which outcomes its actions had, how often, and at what cost.
 ///
@@ -119,6 +120,22 @@ impl Tally {
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Batch>, Interrupted> {
         Batch::read(&self.experience, place, &mut Meter::new(interrupt, POLL_EVERY), faults)
+    }
+
+    /// Reads a batch called `id` from lines of JSON (NDJSON), a transition each: `{"state", "action", "next", "count", "cost"}`. `None`: at least one
+    /// fault was noted, with its line.
+    ///
+    /// # Errors
+    ///
+    /// [`ReadError`] if `lines` could not be read, or `interrupt` said so.
+    pub fn read_lines(
+        &self,
+        id: &str,
+        lines: impl BufRead,
+        faults: &mut Faults,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<Batch>, ReadError> {
+        Batch::read_lines(&self.experience, id, lines, &mut Meter::new(interrupt, POLL_EVERY), faults)
     }
 
     /// Notes that there would be more states or transitions than `limits` allow, if that is so once `batch` is added.
