@@ -67,3 +67,38 @@ fn a_log_of_lines_is_a_batch_that_is_called_as_its_file_compressed_or_not() {
         assert!(told.contains(expected), "{expected}: {told}");
     }
 }
+
+#[test]
+fn rows_of_states_and_actions_are_the_transitions_between_them() {
+    const DEFINITION: &str = "examples/explored/model.json";
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name).to_str().unwrap().to_owned();
+    let made = |file: &str| run(&["model", "experience", DEFINITION, file]);
+    let batch = serde_json::json!({"batch": "wednesday", "transitions": [
+        {"state": [0.02, "shut"], "action": "forward", "next": [0.51, "shut"], "cost": 1.0},
+        {"state": [0.51, "shut"], "action": "push", "next": [0.5, "open"]},
+        {"state": [0.5, "open"], "action": "forward", "next": [1.02, "open"]},
+        {"state": [2.98, "open"], "action": "forward", "next": [3.51, "open"], "cost": 1.3},
+    ]});
+    std::fs::write(path("batch.json"), batch.to_string()).unwrap();
+    let done = made("examples/explored/wednesday.csv");
+    assert_eq!(text(&done.stdout), text(&made(&path("batch.json")).stdout));
+    let told = text(&done.stderr);
+    assert!(told.contains("what is in \"time\" is no attribute of the model") && !told.contains("action"), "{told}");
+    for (log, expected) in [
+        ("x,door,action\n0,shut,forward\n", "log.csv: what the last action led to is not told"),
+        (
+            "x,door,action\n0,shut,forward\n0.5,shut,\n1,shut,jump\nfar,shut,\n",
+            "line 4, /action: unknown action \"jump\"",
+        ),
+        (
+            "x,door,action\n0,shut,forward\n0.5,shut,\n1,shut,jump\nfar,shut,\n",
+            "line 4, /next/x: expected a number, found \"far\"",
+        ),
+        ("x,action\n0,forward\n1,\n", "line 2, /state/door: is missing"),
+    ] {
+        std::fs::write(path("log.csv"), log).unwrap();
+        let done = made(&path("log.csv"));
+        assert!(!done.status.success() && text(&done.stderr).contains(expected), "{expected}: {}", text(&done.stderr));
+    }
+}
