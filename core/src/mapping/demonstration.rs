@@ -140,6 +140,17 @@ impl Demonstration {
         Some(Self { values: observations.flatten().collect(), n_attributes })
     }
 
+    /// Appends an observation of shape `[n_attributes]`.
+    pub(super) fn push(&mut self, observation: &[Option<Value>]) {
+        self.values.extend_from_slice(observation);
+    }
+
+    /// Drops the first `n_observations`, and keeps at least one.
+    pub(super) fn drop_first(&mut self, n_observations: usize) {
+        let n_dropped = n_observations.min(self.len() - 1);
+        self.values.drain(..n_dropped * self.n_attributes);
+    }
+
     /// The observations, in order.
     pub fn iter(&self) -> impl Iterator<Item = &[Option<Value>]> {
         self.values.chunks_exact(self.n_attributes)

@@ -6,7 +6,6 @@
 //! only one, and what the last window decides, of which the end is known: whether others would go on alike however the demonstration does is not
 //! asked, as that would take the ways to all states.
 
-use std::collections::VecDeque;
 use std::num::NonZeroU32;
 use std::sync::Arc;
 
@@ -25,8 +24,10 @@ pub(super) struct Windows {
     weights: Weights,
     /// Those of the whole, without weights of observations.
     conditions: Conditions,
-    /// From the root's on, with their weights; each of shape `[n_attributes]`.
-    observations: VecDeque<(Vec<Option<Value>>, f64)>,
+    /// From the root's on; `None` if nothing was observed.
+    observations: Option<Demonstration>,
+    /// Their weights. Shape `[n_observations]`.
+    observation_weights: Vec<f64>,
     /// The number of the first of them.
     first: u32,
     /// The last committed state; `None` before the start.
@@ -38,8 +39,8 @@ impl Windows {
     /// Nothing was observed yet.
     pub(super) fn new(mapper: Arc<Mapper>, weights: Weights, conditions: &Conditions) -> Self {
         let conditions = Conditions { observation_weights: Vec::new(), collapse: None, ..conditions.clone() };
-        let (observations, work) = (VecDeque::new(), Work::default());
-        Self { mapper, weights, conditions, observations, first: 0, root: None, work }
+        let (observation_weights, work) = (Vec::new(), Work::default());
+        Self { mapper, weights, conditions, observations: None, observation_weights, first: 0, root: None, work }
     }
 
     /// Goes on from `root`, when nothing was observed yet.
@@ -51,16 +52,20 @@ impl Windows {
 
     /// Keeps an observation.
     pub(super) fn observe(&mut self, observation: &[Option<Value>], observation_weight: f64) {
-        self.observations.push_back((observation.to_vec(), observation_weight));
+        match &mut self.observations {
+            Some(observations) => observations.push(observation),
+            none => *none = Demonstration::of([observation.to_vec()]),
+        }
+        self.observation_weights.push(observation_weight);
     }
 
     /// The start, if there is a single one, when the first observation has come: whatever else does, a mapping begins there.
     pub(super) fn sole_start(&mut self) -> Option<Decided> {
-        if self.root.is_some() || self.observations.len() != 1 {
+        if self.root.is_some() || self.observation_weights.len() != 1 {
             return None;
         }
         let start = {
-            let problem = self.problem(false)?;
+            let problem = self.problem_of(&self.mapper, self.observations.clone()?, false);
             let mut starts = problem.starts.iter(problem.model);
             let (state, row) = starts.next().filter(|_| starts.next().is_none())?;
             Decided {
@@ -81,34 +86,49 @@ impl Windows {
             Signal::Finish => return Err(Halt::OutOf(StoppedBy::Deadline)),
             Signal::Cancel => return Err(Halt::Cancelled),
         }
-        let Some(problem) = self.problem(false) else { return Ok(Vec::new()) };
-        let mapping = self.mapper.map_window(&problem, self.budget_left(budget), interrupt)?;
-        if mapping.status != Status::Optimal {
-            return Err(Halt::OutOf(mapping.stopped_by.unwrap_or(StoppedBy::Memory)));
-        }
-        let mut steps: Vec<_> = self.steps(&problem, &mapping).collect();
-        let work = Work { n_expanded: mapping.n_expanded, n_generated: mapping.n_generated };
-        let advances = |step: &Decided| match self.root {
-            Some(_) => step.step.observation > self.first,
-            None => step.step.kind == MoveKind::Start,
-        };
-        let n_decided = steps.iter().position(advances).map_or(steps.len(), |at| at + 1);
-        drop(problem);
-        steps.truncate(n_decided);
-        if let Some(last) = steps.last() {
+        let Some(observations) = self.observations.take() else { return Ok(Vec::new()) };
+        let mapper = Arc::clone(&self.mapper);
+        // Nearly all observations stay, and the problem is made once for each: they are lent to it.
+        let problem = self.problem_of(&mapper, observations, false);
+        let found = self.first_steps(&problem, budget, interrupt);
+        self.observations = Some(problem.demonstration);
+        let (steps, work) = found?;
+        if let (Some(last), Some(observations)) = (steps.last(), &mut self.observations) {
             self.root = Some(last.origin());
-            while self.first < last.step.observation {
-                self.observations.pop_front();
-                self.first += 1;
-            }
+            let n_passed = (last.step.observation - self.first) as usize;
+            observations.drop_first(n_passed);
+            self.observation_weights.drain(..n_passed);
+            self.first = last.step.observation;
         }
         self.work += work;
         Ok(steps)
     }
 
+    /// The first steps of the cheapest way of the window, which is `problem`, and the work of finding it.
+    fn first_steps(
+        &self,
+        problem: &Problem<'_>,
+        budget: Budget,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<(Vec<Decided>, Work), Halt> {
+        let mapping = self.mapper.map_window(problem, self.budget_left(budget), interrupt)?;
+        if mapping.status != Status::Optimal {
+            return Err(Halt::OutOf(mapping.stopped_by.unwrap_or(StoppedBy::Memory)));
+        }
+        let mut steps: Vec<_> = self.steps(problem, &mapping).collect();
+        let advances = |step: &Decided| match self.root {
+            Some(_) => step.step.observation > self.first,
+            None => step.step.kind == MoveKind::Start,
+        };
+        let n_decided = steps.iter().position(advances).map_or(steps.len(), |at| at + 1);
+        steps.truncate(n_decided);
+        Ok((steps, Work { n_expanded: mapping.n_expanded, n_generated: mapping.n_generated }))
+    }
+
     /// The cheapest way to the end.
     pub(super) fn rest(&self, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Option<Rest>, Cancelled> {
-        let Some(problem) = self.problem(true) else { return Ok(None) };
+        let Some(observations) = self.observations.clone() else { return Ok(None) };
+        let problem = self.problem_of(&self.mapper, observations, true);
         let mapping = self.mapper.map_window(&problem, self.budget_left(budget), interrupt)?;
         Ok(Some(Rest {
             steps: self.steps(&problem, &mapping).collect(),
@@ -123,8 +143,8 @@ impl Windows {
     /// Approximate size in memory, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
         let n_attributes = self.weights.as_slice().len();
-        let each = size_of::<(Vec<Option<Value>>, f64)>() + n_attributes * size_of::<Option<Value>>();
-        size_of::<Self>() + self.observations.capacity() * each
+        let each = size_of::<f64>() + n_attributes * size_of::<Option<Value>>();
+        size_of::<Self>() + self.observation_weights.capacity() * each
     }
 
     /// What a search may spend.
@@ -133,16 +153,15 @@ impl Windows {
         Budget { max_expansions, ..budget.beside(self.size_bytes()) }
     }
 
-    /// The way from the root to the newest observation as a problem; `None` if nothing was observed. What ending costs counts if it `ends`.
-    fn problem(&self, ends: bool) -> Option<Problem<'_>> {
-        let demonstration = Demonstration::of(self.observations.iter().map(|(values, _)| values.clone()))?;
+    /// The way from the root to the newest of `observations` as a problem. What ending costs counts if it `ends`.
+    fn problem_of<'m>(&self, mapper: &'m Mapper, observations: Demonstration, ends: bool) -> Problem<'m> {
         let conditions = Conditions {
             starts: self.root.as_ref().map(|root| vec![root.clone()]).or_else(|| self.conditions.starts.clone()),
-            observation_weights: self.observations.iter().map(|(_, weight)| *weight).collect(),
+            observation_weights: self.observation_weights.clone(),
             end_weight: if ends { self.conditions.end_weight } else { 0.0 },
             ..self.conditions.clone()
         };
-        Some(Problem::new(self.mapper.model(), demonstration, self.weights.clone(), conditions))
+        Problem::new(mapper.model(), observations, self.weights.clone(), conditions)
     }
 
     /// The steps of a mapping of the window that are not committed yet.
