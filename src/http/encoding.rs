@@ -76,6 +76,8 @@ pub(super) enum BodyError {
     Slow(String),
     #[error(transparent)]
     NoRoom(NoRoom),
+    #[error("{0}")]
+    Broken(String),
 }
 
 impl From<BodyError> for io::Error {
@@ -93,7 +95,12 @@ struct Limited<R> {
 
 impl<R: Read> Read for Limited<R> {
     fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
-        let n_read = self.inner.read(buffer)?;
+        // Whoever reads it might take what cannot be decompressed for a file that is compressed within the body.
+        let broken = |error: io::Error| match error.kind() {
+            io::ErrorKind::InvalidData => BodyError::Broken(error.to_string()).into(),
+            _ => error,
+        };
+        let n_read = self.inner.read(buffer).map_err(broken)?;
         self.n_left = self.n_left.checked_sub(n_read as u64).ok_or_else(|| {
             let DecodedLimit { n_bytes, setting } = self.limit;
             BodyError::TooLarge(format!(

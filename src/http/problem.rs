@@ -284,6 +284,7 @@ impl From<&BodyError> for Problem {
             BodyError::TooLarge(_) => ProblemKind::TooLarge,
             BodyError::Slow(_) => ProblemKind::SlowBody,
             BodyError::NoRoom(_) => ProblemKind::Busy,
+            BodyError::Broken(_) => ProblemKind::BrokenEncoding,
         };
         Self::new(kind, error.to_string())
     }

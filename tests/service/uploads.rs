@@ -277,6 +277,8 @@ async fn limits_hold_for_what_is_sent_and_for_what_comes_out_of_it() {
 
 #[tokio::test]
 async fn a_body_that_cannot_be_decompressed_is_refused() {
+    const SAS: &str = "application/vnd.fast-downward.sas";
+    const UMB: &str = "application/vnd.umb";
     let service = Service::start(&[]).await;
     let text = ring(N_LARGE).to_string();
     for (encoding, whole) in [("gzip", gzip(text.as_bytes())), ("zstd", zstd(text.as_bytes()))] {
@@ -288,7 +290,14 @@ async fn a_body_that_cannot_be_decompressed_is_refused() {
         let (_, problem) = put(&service, "m", JSON, Some(encoding), whole[..whole.len() / 2].to_vec()).await;
         let expected = format!("compressed data ends early, at byte {}", whole.len() / 2);
         assert_eq!(problem["detail"], expected);
+        // So is the file of another tool; what is compressed within it is its own affair.
+        let (status, problem) = put(&service, "m", SAS, Some(encoding), whole[..whole.len() / 2].to_vec()).await;
+        assert_eq!((status, &problem["type"]), (400, &json!("/problems/broken-encoding")), "{problem}");
+        assert_eq!(problem["detail"], expected);
     }
+    let (status, problem) = put(&service, "m", UMB, None, gzip(text.as_bytes())[..100].to_vec()).await;
+    assert_eq!((status, &problem["type"]), (422, &json!("/problems/invalid")), "{problem}");
+    assert_eq!(problem["errors"][0]["detail"], "cannot be decompressed: compressed data ends early, at byte 100");
     // Of gzip, the last bytes are a checksum.
     let mut flipped = gzip(text.as_bytes());
     *flipped.last_mut().unwrap() ^= 1;
