@@ -360,4 +360,19 @@ async fn insert_weights(
 }
 
 #[cfg(test)]
+impl NewLearner {
+    /// A learner of one attribute.
+    pub(in crate::store) fn plain(name: &str) -> Self {
+        let initial = Distribution { mean: vec![1.0], sd: vec![1.0], expected_reward: None };
+        Self {
+            name: name.to_owned(),
+            hash: "0".to_owned(),
+            definition: "{}".to_owned(),
+            initial,
+            created_at: Timestamp::UNIX_EPOCH,
+        }
+    }
+}
+
+#[cfg(test)]
 mod tests;

@@ -6,39 +6,16 @@ use tokio_util::task::TaskTracker;
 use super::*;
 use crate::store::{NewReward, NewTrial, Opened, RewardAnswer};
 
-fn new_learner(name: &str) -> NewLearner {
-    let initial = Distribution { mean: vec![1.0], sd: vec![1.0], expected_reward: None };
-    NewLearner {
-        name: name.to_owned(),
-        hash: "0".to_owned(),
-        definition: "{}".to_owned(),
-        initial,
-        created_at: Timestamp::UNIX_EPOCH,
-    }
-}
-
 async fn learner(store: &Store, name: &str) -> i64 {
-    let Registration::Created(row) = store.register_learner(new_learner(name)).await.unwrap() else {
+    let Registration::Created(row) = store.register_learner(NewLearner::plain(name)).await.unwrap() else {
         panic!("it is new")
     };
     row.sequence
 }
 
 async fn reward(store: &Store, learner: i64, number: u64) {
-    let id = format!("{learner}-{number}");
-    let trial = NewTrial {
-        id: id.clone(),
-        learner,
-        number,
-        weights: "{\"x\":1.0}".to_owned(),
-        weights_version: 0,
-        policy_id: id.clone(),
-        policy: None,
-        refinement: None,
-        key: None,
-        created_at: Timestamp::UNIX_EPOCH,
-        lease_expires_at: Timestamp::UNIX_EPOCH,
-    };
+    let trial = NewTrial::plain(learner, number);
+    let id = trial.id.clone();
     assert_eq!(store.open_trial(trial).await.unwrap(), Opened::Yes);
     let put = store.accept_reward(NewReward { trial: id, reward: 1.0, accepted_at: Timestamp::UNIX_EPOCH }).await;
     assert!(matches!(put.unwrap(), RewardAnswer::Accepted(_)));
@@ -69,7 +46,10 @@ async fn a_learner_is_behind_from_its_first_reward_to_the_fold_of_the_last_one()
     assert_eq!(store.learners_behind().await.unwrap(), Vec::<String>::new());
     // After an error, nothing is known of who is marked.
     reward(&store, b, 3).await;
-    assert!(store.open_trial(NewTrial { id: format!("{a}-1"), ..repeated(a) }).await.is_err(), "its id is taken");
+    assert!(
+        store.open_trial(NewTrial { id: format!("{a}-1"), ..NewTrial::plain(a, 99) }).await.is_err(),
+        "its id is taken"
+    );
     fold(&store, b, 3, 3).await;
     reward(&store, b, 4).await;
     drop(store);
@@ -78,22 +58,6 @@ async fn a_learner_is_behind_from_its_first_reward_to_the_fold_of_the_last_one()
     reward(&store, b, 5).await;
     fold(&store, b, 4, 5).await;
     assert_eq!(store.learners_behind().await.unwrap(), Vec::<String>::new());
-}
-
-fn repeated(learner: i64) -> NewTrial {
-    NewTrial {
-        id: String::new(),
-        learner,
-        number: 99,
-        weights: "{}".to_owned(),
-        weights_version: 0,
-        policy_id: String::new(),
-        policy: None,
-        refinement: None,
-        key: None,
-        created_at: Timestamp::UNIX_EPOCH,
-        lease_expires_at: Timestamp::UNIX_EPOCH,
-    }
 }
 
 /// However many there are, the index only has those that are behind.

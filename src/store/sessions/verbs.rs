@@ -10,7 +10,7 @@ use crate::store::observations::{Owner, SessionRefusal};
 use crate::store::policies::{NewPolicy, NewRefinement};
 use crate::store::trials::{self, Opened};
 use crate::store::writer::{Verb, Writing};
-use crate::store::{StoreError, as_integer, corrupt, count, policies, refinements, timestamp};
+use crate::store::{NewTrial, StoreError, as_integer, corrupt, count, policies, refinements, timestamp};
 
 /// Brings observations that have arrived to their table.
 #[derive(Debug)]
@@ -53,14 +53,14 @@ impl Verb for NewSession {
     type Answer = Opened;
 
     fn n_bytes(&self) -> usize {
-        self.trial.as_ref().map_or(0, Verb::n_bytes)
+        self.trial.as_ref().map_or(0, NewTrial::n_bytes)
     }
 
     async fn apply(&self, writing: &mut Writing<'_>) -> Result<Opened, StoreError> {
         if let Some(trial) = &self.trial {
-            let opened = trials::open(writing.connection, trial).await?;
-            if opened != Opened::Yes {
-                return Ok(opened);
+            let opened = trials::open_all(writing.connection, &[trial]).await?;
+            if let Some(refused) = opened.into_iter().find(|opened| *opened != Opened::Yes) {
+                return Ok(refused);
             }
         }
         insert(writing.connection, self).await?;

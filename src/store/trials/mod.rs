@@ -12,7 +12,7 @@ use super::{NewPolicy, NewRefinement, NewRequestKey, Page, Store, StoreError, as
 pub use numbers::NextNumber;
 pub(super) use numbers::TrialNumbers;
 use verbs::FailTrial;
-pub(super) use verbs::{accept_all, open};
+pub(super) use verbs::{accept_all, accept_at_once, open_all};
 
 /// A trial to be stored.
 #[derive(Clone, Debug)]
@@ -39,6 +39,13 @@ pub struct NewTrial {
     pub created_at: Timestamp,
     /// When it expires.
     pub lease_expires_at: Timestamp,
+}
+
+impl NewTrial {
+    /// How many bytes there are to be written, roughly.
+    pub(super) fn n_bytes(&self) -> usize {
+        self.policy.as_ref().map_or(0, NewPolicy::n_bytes) + self.refinement.as_ref().map_or(0, NewRefinement::n_bytes)
+    }
 }
 
 /// A reward to be accepted.
@@ -232,7 +239,7 @@ impl Store {
     /// If the database failed.
     pub async fn open_trial(&self, trial: NewTrial) -> Result<Opened, StoreError> {
         let learner = trial.learner;
-        let opened = self.writer.write(trial).await?;
+        let opened = self.writer.open_trial(trial).await?;
         if opened == Opened::NumberTaken {
             self.trial_numbers.forget(learner);
         }
@@ -327,3 +334,27 @@ fn read_trial(row: &SqliteRow) -> Result<TrialRecord, StoreError> {
         learned_version: learned.is_some().then(|| count(row, "weights", "learned_version")).transpose()?,
     })
 }
+
+#[cfg(test)]
+impl NewTrial {
+    /// The trial of this number of this learner, whose id is made of both, without a policy.
+    pub(in crate::store) fn plain(learner: i64, number: u64) -> Self {
+        let id = format!("{learner}-{number}");
+        Self {
+            id: id.clone(),
+            learner,
+            number,
+            weights: "{\"x\":1.0}".to_owned(),
+            weights_version: 0,
+            policy_id: id,
+            policy: None,
+            refinement: None,
+            key: None,
+            created_at: Timestamp::UNIX_EPOCH,
+            lease_expires_at: Timestamp::UNIX_EPOCH,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use jiff::Timestamp;
 use rustc_hash::{FxHashMap, FxHashSet};
 use sqlx::{AssertSqlSafe, QueryBuilder, Row, SqliteConnection};
 
@@ -9,60 +10,68 @@ use super::{
     AcceptedReward, FROM, Failure, FailureAnswer, NewReward, NewTrial, Opened, RewardAnswer, SELECT, TrialRecord,
     read_trial,
 };
-use crate::store::policies::{NewPolicy, NewRefinement};
 use crate::store::writer::{Verb, Writing};
 use crate::store::{StoreError, as_integer, corrupt, count, learners, policies, refinements, request_keys};
 
-impl Verb for NewTrial {
-    type Answer = Opened;
-
-    fn n_bytes(&self) -> usize {
-        self.policy.as_ref().map_or(0, NewPolicy::n_bytes) + self.refinement.as_ref().map_or(0, NewRefinement::n_bytes)
+/// Stores trials and their policies, in order, and the keys of the requests for them, within a transaction. Takes two statements for all without
+/// a key that come one after the other, and more for those that are refused or are to be refined.
+pub(in crate::store) async fn open_all(
+    connection: &mut SqliteConnection,
+    trials: &[&NewTrial],
+) -> Result<Vec<Opened>, StoreError> {
+    let mut answers = Vec::with_capacity(trials.len());
+    // A key of one that is refused is free for the next.
+    for together in trials.chunk_by(|one, next| one.key.is_none() && next.key.is_none()) {
+        if let [trial] = together
+            && let Some(key) = &trial.key
+            && request_keys::add(connection, key, &trial.id).await?.is_err()
+        {
+            answers.push(Opened::KeyTaken);
+            continue;
+        }
+        let inserted = insert(connection, together).await?;
+        let opened: Vec<&NewTrial> = together.iter().copied().filter(|trial| inserted.contains(&trial.id)).collect();
+        let policies: Vec<_> = opened.iter().filter_map(|trial| trial.policy.as_ref()).collect();
+        policies::add_all(connection, &policies).await?;
+        for refinement in opened.iter().filter_map(|trial| trial.refinement.as_ref()) {
+            refinements::add(connection, refinement).await?;
+        }
+        for trial in together {
+            let was_opened = inserted.contains(&trial.id);
+            answers.push(if was_opened { Opened::Yes } else { refused(connection, trial).await? });
+        }
     }
-
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Opened, StoreError> {
-        open(writing.connection, self).await
-    }
+    Ok(answers)
 }
 
-/// Stores a trial and its policy, and the key of the request for it.
-pub(in crate::store) async fn open(connection: &mut SqliteConnection, trial: &NewTrial) -> Result<Opened, StoreError> {
-    if let Some(key) = &trial.key
-        && request_keys::add(connection, key, &trial.id).await?.is_err()
-    {
-        return Ok(Opened::KeyTaken);
-    }
-    let inserted = sqlx::query(
+/// Inserts trials, in this order, those whose learner is there and whose number no other one has. Gives their ids.
+async fn insert(connection: &mut SqliteConnection, trials: &[&NewTrial]) -> Result<FxHashSet<String>, StoreError> {
+    let mut insert = QueryBuilder::new(
         "INSERT INTO trials
              (id, learner, number, weights, weights_version, policy_id, lease_expires_at_ms, created_at_ms)
-         SELECT $1, sequence, $3, $4, $5, $6, $7, $8 FROM learners WHERE sequence = $2
-         ON CONFLICT (learner, number) DO NOTHING",
-    )
-    .bind(&trial.id)
-    .bind(trial.learner)
-    .bind(as_integer(trial.number))
-    .bind(&trial.weights)
-    .bind(as_integer(trial.weights_version))
-    .bind(&trial.policy_id)
-    .bind(trial.lease_expires_at.as_millisecond())
-    .bind(trial.created_at.as_millisecond())
-    .execute(&mut *connection)
-    .await?;
-    if inserted.rows_affected() == 0 {
-        if trial.key.is_some() {
-            request_keys::forget(connection, &trial.id).await?;
-        }
-        let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM learners WHERE sequence = $1)");
-        let has_learner = query.bind(trial.learner).fetch_one(connection).await?;
-        return Ok(if has_learner { Opened::NumberTaken } else { Opened::NoLearner });
+         SELECT * FROM (",
+    );
+    insert.push_values(trials, |mut columns, trial| {
+        columns.push_bind(&trial.id).push_bind(trial.learner).push_bind(as_integer(trial.number));
+        columns.push_bind(&trial.weights).push_bind(as_integer(trial.weights_version)).push_bind(&trial.policy_id);
+        columns.push_bind(trial.lease_expires_at.as_millisecond()).push_bind(trial.created_at.as_millisecond());
+    });
+    // The columns of values have these names.
+    insert.push(
+        ") WHERE column2 IN (SELECT sequence FROM learners)
+         ON CONFLICT (learner, number) DO NOTHING RETURNING id",
+    );
+    Ok(insert.build_query_scalar().fetch_all(connection).await?.into_iter().collect())
+}
+
+/// Why a trial was not inserted. Nothing is left of it.
+async fn refused(connection: &mut SqliteConnection, trial: &NewTrial) -> Result<Opened, StoreError> {
+    if trial.key.is_some() {
+        request_keys::forget(connection, &trial.id).await?;
     }
-    if let Some(policy) = &trial.policy {
-        policies::add(connection, policy).await?;
-    }
-    if let Some(refinement) = &trial.refinement {
-        refinements::add(connection, refinement).await?;
-    }
-    Ok(Opened::Yes)
+    let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM learners WHERE sequence = $1)");
+    let has_learner = query.bind(trial.learner).fetch_one(connection).await?;
+    Ok(if has_learner { Opened::NumberTaken } else { Opened::NoLearner })
 }
 
 /// Ends a trial without a reward.
@@ -100,53 +109,76 @@ impl Verb for FailTrial {
     }
 }
 
-/// Accepts rewards, in order. Takes two statements, however many there are, and another one if a learner is not yet among those that
-/// are marked as having rewards to fold, `pending`.
+/// Accepts rewards, in order, within a transaction. Takes two statements, however many there are, and another one if a learner is not yet
+/// among those that are marked as having rewards to fold, `pending`.
 pub(in crate::store) async fn accept_all(
     connection: &mut SqliteConnection,
     rewards: &[&NewReward],
     pending: &mut FxHashSet<i64>,
 ) -> Result<Vec<RewardAnswer>, StoreError> {
-    let mut read = read_rewarded(connection, rewards).await?;
-    let mut accepted = Vec::with_capacity(rewards.len());
-    let mut put = Vec::with_capacity(rewards.len());
-    for new in rewards {
-        let Some(found) = read.trials.get_mut(new.trial.as_str()) else {
-            put.push(RewardAnswer::Unknown);
-            continue;
-        };
-        put.push(match (&found.row.failed, found.row.reward) {
-            (Some(_), _) => RewardAnswer::Failed,
-            (None, Some(AcceptedReward { reward, .. })) if reward == new.reward => {
-                RewardAnswer::Unchanged(found.row.clone())
-            }
-            (None, Some(AcceptedReward { reward, .. })) => RewardAnswer::Conflict { existing: reward },
-            (None, None) => {
-                let last = read.last_orders.entry(found.learner).or_insert(0);
-                *last += 1;
-                found.row.reward = Some(AcceptedReward { reward: new.reward, reward_order: *last });
-                accepted.push((found.learner, *last, found.row.sequence, new));
-                RewardAnswer::Accepted(found.row.clone())
-            }
-        });
+    let decided = read_rewarded(connection, rewards).await?.decide(rewards);
+    let new = decided.unmarked(pending);
+    if !new.is_empty() {
+        let ids = serde_json::to_string(&new).map_err(corrupt("learners", "sequence"))?;
+        learners::mark_pending(connection, &ids).await?;
+        pending.extend(new);
     }
-    if !accepted.is_empty() {
-        let new: BTreeSet<i64> =
-            accepted.iter().map(|(learner, ..)| *learner).filter(|id| !pending.contains(id)).collect();
-        if !new.is_empty() {
-            let ids = serde_json::to_string(&new).map_err(corrupt("learners", "sequence"))?;
-            learners::mark_pending(connection, &ids).await?;
-            pending.extend(new);
+    decided.insert(connection).await?;
+    Ok(decided.answers)
+}
+
+/// Accepts rewards, in order, outside of a transaction: durable when this returns. Gives no answers, and has done nothing, if a learner is not
+/// marked yet, or others have written meanwhile.
+pub(in crate::store) async fn accept_at_once(
+    connection: &mut SqliteConnection,
+    rewards: &[&NewReward],
+    pending: &FxHashSet<i64>,
+) -> Result<Option<Vec<RewardAnswer>>, StoreError> {
+    let decided = read_rewarded(connection, rewards).await?.decide(rewards);
+    let was_done = decided.unmarked(pending).is_empty() && decided.insert(connection).await?;
+    Ok(was_done.then_some(decided.answers))
+}
+
+/// What becomes of rewards.
+struct Decided {
+    /// For each of them.
+    answers: Vec<RewardAnswer>,
+    /// Of those that are accepted.
+    rows: Vec<RewardRow>,
+    /// SQLite's number that changes when others write, as it was.
+    data_version: i64,
+}
+
+/// A row of the log of rewards.
+struct RewardRow {
+    learner: i64,
+    order: u64,
+    trial: i64,
+    reward: f64,
+    accepted_at: Timestamp,
+}
+
+impl Decided {
+    /// The learners whose rewards are accepted that are not among those that are marked.
+    fn unmarked(&self, pending: &FxHashSet<i64>) -> BTreeSet<i64> {
+        self.rows.iter().map(|row| row.learner).filter(|id| !pending.contains(id)).collect()
+    }
+
+    /// Adds what is accepted to the log of rewards, unless others have written meanwhile. Says whether it did.
+    async fn insert(&self, connection: &mut SqliteConnection) -> Result<bool, StoreError> {
+        if self.rows.is_empty() {
+            return Ok(true);
         }
-        let mut insert =
-            QueryBuilder::new("INSERT INTO rewards (learner, reward_order, trial, reward, accepted_at_ms) ");
-        insert.push_values(accepted, |mut row, (learner, order, trial, new)| {
-            row.push_bind(learner).push_bind(as_integer(order)).push_bind(trial).push_bind(new.reward);
-            row.push_bind(new.accepted_at.as_millisecond());
+        let mut insert = QueryBuilder::new(
+            "INSERT INTO rewards (learner, reward_order, trial, reward, accepted_at_ms) SELECT * FROM (",
+        );
+        insert.push_values(&self.rows, |mut columns, row| {
+            columns.push_bind(row.learner).push_bind(as_integer(row.order)).push_bind(row.trial);
+            columns.push_bind(row.reward).push_bind(row.accepted_at.as_millisecond());
         });
-        insert.build().execute(connection).await?;
+        insert.push(") WHERE (SELECT data_version FROM pragma_data_version) = ").push_bind(self.data_version);
+        Ok(insert.build().execute(connection).await?.rows_affected() > 0)
     }
-    Ok(put)
 }
 
 /// The trials that rewards are for, as they are before any of these.
@@ -154,11 +186,46 @@ struct Rewarded {
     trials: FxHashMap<String, Found>,
     /// By learner, the order of the last reward.
     last_orders: BTreeMap<i64, u64>,
+    /// SQLite's number that changes when others write.
+    data_version: i64,
 }
 
 struct Found {
     learner: i64,
     row: TrialRecord,
+}
+
+impl Rewarded {
+    /// What becomes of these rewards, in order, if nothing else is written meanwhile.
+    fn decide(mut self, rewards: &[&NewReward]) -> Decided {
+        let mut rows = Vec::with_capacity(rewards.len());
+        let answers = rewards.iter().map(|new| {
+            let Some(Found { learner, row: trial }) = self.trials.get_mut(new.trial.as_str()) else {
+                return RewardAnswer::Unknown;
+            };
+            match (&trial.failed, trial.reward) {
+                (Some(_), _) => RewardAnswer::Failed,
+                (None, Some(AcceptedReward { reward, .. })) if reward == new.reward => {
+                    RewardAnswer::Unchanged(trial.clone())
+                }
+                (None, Some(AcceptedReward { reward, .. })) => RewardAnswer::Conflict { existing: reward },
+                (None, None) => {
+                    let last = self.last_orders.entry(*learner).or_insert(0);
+                    *last += 1;
+                    trial.reward = Some(AcceptedReward { reward: new.reward, reward_order: *last });
+                    rows.push(RewardRow {
+                        learner: *learner,
+                        order: *last,
+                        trial: trial.sequence,
+                        reward: new.reward,
+                        accepted_at: new.accepted_at,
+                    });
+                    RewardAnswer::Accepted(trial.clone())
+                }
+            }
+        });
+        Decided { answers: answers.collect(), rows, data_version: self.data_version }
+    }
 }
 
 async fn read_rewarded(connection: &mut SqliteConnection, rewards: &[&NewReward]) -> Result<Rewarded, StoreError> {
@@ -167,13 +234,15 @@ async fn read_rewarded(connection: &mut SqliteConnection, rewards: &[&NewReward]
     // `CROSS JOIN` makes SQLite look trials up by id, rather than ids up by trial.
     let query = sqlx::query(AssertSqlSafe(format!(
         "{SELECT}, t.learner,
-             (SELECT MAX(last.reward_order) FROM rewards last WHERE last.learner = t.learner) AS last_order
+             (SELECT MAX(last.reward_order) FROM rewards last WHERE last.learner = t.learner) AS last_order,
+             (SELECT data_version FROM pragma_data_version) AS data_version
          FROM json_each($1) wanted CROSS JOIN trials t ON t.id = wanted.value
              JOIN learners l ON l.sequence = t.learner LEFT JOIN rewards r ON r.trial = t.sequence"
     )));
-    let mut read = Rewarded { trials: FxHashMap::default(), last_orders: BTreeMap::new() };
+    let mut read = Rewarded { trials: FxHashMap::default(), last_orders: BTreeMap::new(), data_version: 0 };
     for row in query.bind(ids).fetch_all(connection).await? {
         let learner = row.try_get("learner")?;
+        read.data_version = row.try_get("data_version")?;
         let last: Option<i64> = row.try_get("last_order")?;
         if last.is_some() {
             read.last_orders.insert(learner, count(&row, "rewards", "last_order")?);
@@ -183,3 +252,6 @@ async fn read_rewarded(connection: &mut SqliteConnection, rewards: &[&NewReward]
     }
     Ok(read)
 }
+
+#[cfg(test)]
+mod tests;

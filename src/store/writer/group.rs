@@ -6,6 +6,7 @@ use super::Known;
 use super::verb::{Effects, Job, Writing};
 use crate::store::arrivals::Arrivals;
 use crate::store::observations::SessionRefusal;
+use crate::store::trials::{NewReward, NewTrial, RewardAnswer};
 use crate::store::{NewObservations, NewPolicy, StoreError, policies, refinements, trials};
 
 /// Applies `group`: durable when this returns.
@@ -15,7 +16,10 @@ pub(super) async fn write(
     group: &mut [Job],
     was_interrupted: bool,
 ) -> Result<Effects, StoreError> {
-    if append_at_once(connection, &mut known.arrivals, group).await? || add_policies_at_once(connection, group).await? {
+    if append_at_once(connection, &mut known.arrivals, group).await?
+        || add_policies_at_once(connection, group).await?
+        || accept_rewards_at_once(connection, known, group).await?
+    {
         return Ok(Effects::default());
     }
     transact(connection, known, group, was_interrupted).await
@@ -89,7 +93,7 @@ fn answer_policies(group: &mut [Job]) {
     }
 }
 
-/// Applies `group` in one transaction: observations and policies first, rewards last, each kind together. As nobody was answered yet, the
+/// Applies `group` in one transaction: observations, policies and trials first, rewards last, each kind together. As nobody was answered yet, the
 /// requests of a group may be applied in any order.
 async fn transact(
     connection: &mut SqliteConnection,
@@ -101,6 +105,7 @@ async fn transact(
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
     append(&mut transaction, &mut known.arrivals, group).await?;
     policies::add_all(&mut transaction, &added_policies(group)).await?;
+    open_trials(&mut transaction, group).await?;
     for job in &mut *group {
         match job {
             Job::Policies(asked) => {
@@ -112,7 +117,7 @@ async fn transact(
                 let (connection, effects) = (&mut *transaction, &mut effects);
                 verb.apply(&mut Writing { connection, known, effects, was_interrupted }).await?;
             }
-            Job::Observations(_) | Job::Reward(_) => {}
+            Job::Observations(_) | Job::Trial(_) | Job::Reward(_) => {}
         }
     }
     answer_policies(group);
@@ -146,24 +151,67 @@ async fn append(
     Ok(())
 }
 
+/// Stores the trials in `group`, in order.
+async fn open_trials(transaction: &mut SqliteConnection, group: &mut [Job]) -> Result<(), StoreError> {
+    let mut asked: Vec<_> = group
+        .iter_mut()
+        .filter_map(|job| match job {
+            Job::Trial(asked) => Some(asked),
+            _ => None,
+        })
+        .collect();
+    let new: Vec<&NewTrial> = asked.iter().map(|asked| &*asked.request).collect();
+    let answers = trials::open_all(transaction, &new).await?;
+    for (asked, answer) in asked.iter_mut().zip(answers) {
+        asked.answer = Some(answer);
+    }
+    Ok(())
+}
+
+/// The rewards in a group, in order.
+fn rewards(group: &[Job]) -> Vec<&NewReward> {
+    let rewards = group.iter().filter_map(|job| match job {
+        Job::Reward(asked) => Some(&asked.request),
+        _ => None,
+    });
+    rewards.collect()
+}
+
+/// Accepts rewards without a transaction, if there is nothing else in the group, as [`trials::accept_at_once`] does. Says whether it did; it
+/// has done nothing otherwise.
+async fn accept_rewards_at_once(
+    connection: &mut SqliteConnection,
+    known: &Known,
+    group: &mut [Job],
+) -> Result<bool, StoreError> {
+    let rewards = rewards(group);
+    if rewards.len() < group.len() {
+        return Ok(false);
+    }
+    let answers = trials::accept_at_once(connection, &rewards, &known.pending).await?;
+    Ok(answers.map(|answers| answer_rewards(group, answers)).is_some())
+}
+
 /// Accepts the rewards in `group`, in order.
 async fn accept_rewards(
     transaction: &mut SqliteConnection,
     known: &mut Known,
     group: &mut [Job],
 ) -> Result<(), StoreError> {
+    let rewards = rewards(group);
+    if !rewards.is_empty() {
+        let answers = trials::accept_all(transaction, &rewards, &mut known.pending).await?;
+        answer_rewards(group, answers);
+    }
+    Ok(())
+}
+
+fn answer_rewards(group: &mut [Job], answers: Vec<RewardAnswer>) {
     let asked = group.iter_mut().filter_map(|job| match job {
         Job::Reward(asked) => Some(asked),
         _ => None,
     });
-    let mut asked: Vec<_> = asked.collect();
-    if asked.is_empty() {
-        return Ok(());
-    }
-    let rewards: Vec<_> = asked.iter().map(|asked| &asked.request).collect();
-    let answers = trials::accept_all(transaction, &rewards, &mut known.pending).await?;
-    for (asked, answer) in asked.iter_mut().zip(answers) {
+    for (asked, answer) in asked.zip(answers) {
         asked.answer = Some(answer);
     }
-    Ok(())
 }

@@ -5,7 +5,7 @@
 //! grow with the load, and no timer is needed. Small and large requests wait in lines of their own. A group takes all small requests, but
 //! only about a MiB of large ones, so that small requests never wait long behind large ones. Observations, which are most requests, are
 //! written to `arrivals` with a commit, and moved to their table later. A group of observations alone, or of policies alone, takes a
-//! single statement, as each statement costs the driver a change of threads.
+//! single statement, and one of rewards alone two, outside of a transaction, as each statement costs the driver a change of threads.
 //!
 //! After an error the state of the connection is unknown: a transaction may still be open. So the connection is closed, and the next
 //! group opens another. A write is acknowledged only if the file that was written to still has the database's name.
@@ -33,7 +33,7 @@ use super::database::{Database, Readers};
 use super::observations::NewObservations;
 use super::observations::SessionRefusal;
 use super::policies::AddPolicies;
-use super::trials::{NewReward, RewardAnswer};
+use super::trials::{NewReward, NewTrial, Opened, RewardAnswer};
 use super::{StoreError, Unavailable, count, database};
 pub(super) use lines::MAX_LARGE_BYTES;
 use lines::{Lines, MAX_SMALL_BYTES};
@@ -136,7 +136,7 @@ impl Writer {
         self.closing.cancelled().await;
     }
 
-    /// Applies `verb`, and returns once that is on disk. Dropping the future does not undo it, here and in the three methods that follow.
+    /// Applies `verb`, and returns once that is on disk. Dropping the future does not undo it, here and in the methods that follow.
     ///
     /// # Errors
     ///
@@ -164,6 +164,16 @@ impl Writer {
     pub(super) async fn add_policies(&self, added: AddPolicies) -> Result<(), StoreError> {
         let (asked, answered) = Asked::new(added);
         self.send(Job::Policies(asked), answered).await
+    }
+
+    /// Stores a trial and its policy.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub(super) async fn open_trial(&self, trial: NewTrial) -> Result<Opened, StoreError> {
+        let (asked, answered) = Asked::new(Box::new(trial));
+        self.send(Job::Trial(asked), answered).await
     }
 
     /// Accepts a reward, unless its trial has one.

@@ -10,7 +10,7 @@ use tokio::sync::oneshot;
 use super::Known;
 use crate::store::observations::SessionRefusal;
 use crate::store::policies::AddPolicies;
-use crate::store::trials::{NewReward, RewardAnswer};
+use crate::store::trials::{NewReward, NewTrial, Opened, RewardAnswer};
 use crate::store::{NewObservations, StoreError};
 
 /// Something to be written by itself, whatever else is in the transaction.
@@ -53,6 +53,7 @@ pub(in crate::store) struct Effects {
 pub(super) enum Job {
     Observations(Asked<NewObservations, Result<(), SessionRefusal>>),
     Policies(Asked<AddPolicies, ()>),
+    Trial(Asked<Box<NewTrial>, Opened>),
     Reward(Asked<NewReward, RewardAnswer>),
     Other(Box<dyn AnyVerb>),
 }
@@ -62,6 +63,7 @@ impl Job {
         match self {
             Self::Observations(asked) => asked.request.n_bytes(),
             Self::Policies(asked) => asked.request.n_bytes(),
+            Self::Trial(asked) => asked.request.n_bytes(),
             Self::Reward(_) => 0,
             Self::Other(verb) => verb.n_bytes(),
         }
@@ -72,6 +74,7 @@ impl Job {
         match self {
             Self::Observations(asked) => asked.tell(committed),
             Self::Policies(asked) => asked.tell(committed),
+            Self::Trial(asked) => asked.tell(committed),
             Self::Reward(asked) => asked.tell(committed),
             Self::Other(verb) => verb.tell(committed),
         }
