@@ -1,7 +1,7 @@
 //! The one writer, which groups commits.
 //!
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies it in one
-//! transaction, and answers all of it after the commit. It yields once before it takes a group, so that ready tasks can enqueue: groups
+//! transaction, and answers all of it after the commit. After a group of several it yields once, so that ready tasks can enqueue: groups
 //! grow with the load, and no timer is needed. Small and large requests wait in lines of their own. A group takes all small requests, but
 //! only about a MiB of large ones, so that small requests never wait long behind large ones. Observations, which are most requests, are
 //! written to `arrivals` with a commit, and moved to their table later. A group of observations alone, or of policies alone, takes a
@@ -231,12 +231,17 @@ struct Open {
 impl Open {
     async fn run(mut self, mut lines: Lines) {
         let mut group = Vec::with_capacity(MAX_GROUP);
+        let mut n_told = 0;
         loop {
-            // It yields once, so that ready tasks can enqueue.
-            tokio::task::yield_now().await;
+            if n_told > 1 {
+                // It yields once, so that those who were told can enqueue. One alone would come alone again, and to yield for it wakes threads
+                // that find nothing to do.
+                tokio::task::yield_now().await;
+            }
             if !lines.take(&mut group).await {
                 break;
             }
+            n_told = group.len();
             match self.commit(&mut group).await {
                 Ok(()) => group.drain(..).for_each(|job| job.tell(Ok(()))),
                 Err(StoreError::Unavailable(unavailable)) => {
