@@ -133,6 +133,7 @@ impl Etude {
             waits: Waits::of(lookahead_ms),
             unwritten: Unwritten::default(),
             is_slow: false,
+            takes_some_time: false,
             watch: Watch::new(&weights),
             weights,
             online,

@@ -24,6 +24,9 @@ use crate::store::NewObservations;
 use etude_core::document::{Faults, Place};
 use etude_core::mapping::{Demonstration, Options, Policy};
 
+/// A mapping that takes longer does not begin before the disk is at work; to let that begin first takes some microseconds.
+const SOME_TIME: Duration = Duration::from_micros(50);
+
 impl Session {
     /// Takes the states from `seq` on into what is coming, of which those that came before are ignored. `observation_weights` gives the
     /// weight of each of them, if not what the session was opened with.
@@ -133,7 +136,13 @@ impl Session {
             service_time: self.waits.as_ref().map(|_| etude.store.service_time(now)),
             steps,
         });
-        let mapping = async { self.map_frames(etude, frames) };
+        let mapping = async {
+            if self.takes_some_time {
+                // What writes runs on this thread, once it has nothing else to do.
+                tokio::task::yield_now().await;
+            }
+            self.map_frames(etude, frames)
+        };
         // In this order: the disk is at work before the mapping begins.
         let (appended, received) = tokio::join!(biased; appending, mapping);
         appended??;
@@ -166,7 +175,9 @@ impl Session {
             }
             ReceivedFrame { n_received, warnings, mapped }
         });
-        frames.collect()
+        let frames = frames.collect();
+        self.takes_some_time = etude.clock.elapsed(began) > SOME_TIME;
+        frames
     }
 }
 

@@ -123,6 +123,7 @@ impl Etude {
             unwritten: Unwritten::default(),
             watch: Watch::new(&weights),
             is_slow: false,
+            takes_some_time: false,
             online: None,
             mapper,
             held: self.memory.try_take(0).map_err(ServiceError::from)?,

@@ -45,6 +45,8 @@ pub struct Session {
     pub(super) unwritten: Unwritten,
     /// Whether its last decisions took longer than what is done where observations arrive.
     pub(super) is_slow: bool,
+    /// Whether what it received last took so long to be mapped that the disk is to begin before.
+    pub(super) takes_some_time: bool,
     /// `None` once the session has ended.
     pub(super) online: Option<OnlineMapping>,
     /// What was observed and can hardly be meant.

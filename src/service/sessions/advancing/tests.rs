@@ -5,7 +5,7 @@ use tokio_util::task::TaskTracker;
 
 use super::super::tests::receive;
 use super::*;
-use crate::service::{Caller, Client, ModelText, Name, Settings};
+use crate::service::{Caller, Client, Coming, ModelText, Name, Settings};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Definition, Format, Limits, Model};
@@ -107,6 +107,25 @@ async fn a_session_that_finds_no_memory_in_its_turn_waits_for_it() {
     assert!(futures_util::poll!(&mut advancing).is_pending());
     drop(others);
     assert!(!advancing.await.unwrap().is_empty());
+}
+
+/// What writes runs on the same thread.
+#[tokio::test]
+async fn a_mapping_that_takes_some_time_begins_after_the_writing() {
+    let directory = tempfile::tempdir().unwrap();
+    let (etude, seen, caller) = service(directory.path()).await;
+    let seen = Value::from(seen);
+    for takes_some_time in [false, true] {
+        let open = json!({"type": "open", "model": "ring", "lookahead": 1, "start": 0});
+        let mut session = etude.open_session(&open, caller).await.unwrap();
+        session.takes_some_time = takes_some_time;
+        let mut coming = Coming::default();
+        session.take_in(&mut coming, 0, &Place::root(&seen), None).unwrap();
+        let mut receiving = Box::pin(session.receive(&etude, coming, caller.now));
+        assert!(futures_util::poll!(&mut receiving).is_pending());
+        drop(receiving);
+        assert_eq!(session.n_steps == 0, takes_some_time, "{} steps", session.n_steps);
+    }
 }
 
 #[tokio::test]
