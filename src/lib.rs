@@ -44,7 +44,8 @@
 //! is long) before `store::writer` makes it visible.
 //!
 //! What a model of experience is told passes `service::experience` (its turn), [`etude_core::model::Tally`] (counted in memory, by `service::told`), and
-//! `store::writer`, which gives the model its next hash with the batch. It is made a table when somebody searches it.
+//! `store::writer`, which gives the model its next hash with the batch. It is made a table when somebody searches it. What was counted is stored from time to
+//! time, beside the batches, which alone are true: a service that starts counts only what came since.
 //!
 //! What is large takes its memory from [`memory`] before it begins, and whose turn it is to use a thread is told by `service::pool`. A
 //! model that is not at hand is made ready by `service::compiler`, once, however many ask for it.

@@ -3,7 +3,7 @@
 //! ```text
 //! batch --> turn of its model --> read, counted in memory --> store: the batch, and the model's new hash, at once --> answered
 //!                                       ^                       |
-//!                 batches of the store -+<-- failed, or replaced meanwhile
+//!   tally and batches of the store -----+<-- failed, or replaced meanwhile
 //! ```
 //!
 //! A batch is one row, whatever came before it. It becomes part of a model that can be searched only when somebody searches that.
