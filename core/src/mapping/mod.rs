@@ -32,22 +32,25 @@
 //! | search | chosen when | why |
 //! |---|---|---|
 //! | `search::layered` | default heuristic; extra actions pay whole distances and ending is free; at most 65,536 nodes (observations times states); expansions allowed for twice as many, and memory for all | an expansion takes less than half of the time: figure 4 takes 13 microseconds rather than 24 |
-//! | `search::best_first` | default heuristic, in all other problems, also where states are found as it goes; and no heuristic, where it has no estimates | it looks at a small part of the nodes |
-//! | `search::sweep` | best first has expanded 65,536 nodes, or one in 16 if that is more, or memory is used up; all states are known | it takes a sixteenth of the time for a node and two bytes of memory |
+//! | `search::banded` | default heuristic, in larger problems of this kind, of at most 256 observations, whose estimates are sums of entries of tables of at most eight attributes that change; up to 131,072 expansions, or until its memory is used up | it looks at a small part of the nodes, and an expansion takes two thirds of the time |
+//! | `search::best_first` | default heuristic, in all other problems, also where states are found as it goes, and after a search in bands that has not come to its end; and no heuristic, where it has no estimates | it looks at a small part of the nodes |
+//! | `search::sweep` | one of these has expanded 65,536 nodes, or one in 16 if that is more, or memory is used up; all states are known | it takes a sixteenth of the time for a node and two bytes of memory |
 //! | `search::astar` | the paper's heuristic | that one is not consistent, and which of its mappings is found is part of what is reproduced |
 //! | `online` | a lookahead, or the demonstration is still running | with a lookahead, one of the above for each window; else, and where windows are small, layers of all states |
 //! | `completion` | a budget ran out before the last observation | there is always an answer |
 //!
-//! Best first begins with those tables of estimates alone that are small, and makes the others once it has expanded a sixteenth of
-//! their entries, as large tables may take longer than the search (`mapper::by_default`). Where it takes long, estimates are raised by a group
-//! of attributes that are projected together (`heuristic::abstraction`): if extra actions pay less than a quarter of the distance, after 2,048
-//! expansions, or one for 1,024 nodes if that is more; else after as many, as soon as a probe for cheaper mappings leaves one that costs twice
-//! as much as all cost at least. What moves cost is said in `recurrence`, for all of them.
+//! Searches in bands and best first begin with those tables of estimates alone that are small, and make the others once they have expanded a
+//! sixteenth of their entries, as large tables may take longer than the search (`mapper::by_default`). Where a best-first search takes long,
+//! estimates are raised by a group of attributes that are projected together (`heuristic::abstraction`): if extra actions pay less than a
+//! quarter of the distance, after 2,048 expansions, or one for 1,024 nodes if that is more; else after as many, as soon as a probe for cheaper
+//! mappings leaves one that costs twice as much as all cost at least. What moves cost is said in `recurrence`, for all of them.
 //!
 //! **Ties.** Answers are deterministic. The first path found to a node wins ties: it is replaced only by a cheaper one, by the sums of
 //! floats along the paths. A node's successors are generated in this order: the `skip`, then for each action the `match` and the `extra`.
 //!
 //! - `search::layered` expands each layer in the order in which its nodes were found, those within a beam first.
+//! - `search::banded` goes through the layers as beams, and then in passes of growing bounds of `f`. In each it expands a layer's nodes in the
+//!   order in which they were found since the pass before, and then those that waited.
 //! - `search::best_first` expands nodes in the order of `f` to a thousandth, the most recently found of equals first.
 //! - `search::sweep` leaves a node by the skip unless a match is cheaper, and by a match unless an extra action is cheaper. Whether it
 //!   replaces a best-first search depends on the problem and the budget alone.

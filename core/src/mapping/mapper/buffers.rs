@@ -6,13 +6,14 @@ use std::thread::{self, ThreadId};
 
 use crate::interrupt::Cancelled;
 use crate::mapping::heuristic::projected::TableBuffers;
-use crate::mapping::search::{best_first, layered};
+use crate::mapping::search::{banded, best_first, layered};
 
 /// Buffers of a search, kept to be used again.
 #[derive(Debug, Default)]
 pub(super) struct Buffers {
     pub(super) solving: TableBuffers,
     pub(super) searching: best_first::SearchBuffers,
+    pub(super) banded: banded::BandedBuffers,
     pub(super) layered: layered::LayeredBuffers,
 }
 
@@ -28,7 +29,8 @@ impl Buffers {
 
     /// How much memory they take, in bytes.
     fn size_bytes(&self) -> usize {
-        size_of::<Self>() + self.solving.kept_bytes() + self.searching.kept_bytes() + self.layered.kept_bytes()
+        let searching = self.searching.kept_bytes() + self.banded.kept_bytes() + self.layered.kept_bytes();
+        size_of::<Self>() + self.solving.kept_bytes() + searching
     }
 }
 

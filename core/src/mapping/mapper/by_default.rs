@@ -7,12 +7,12 @@ use crate::mapping::heuristic::abstraction::{AbstractionRoom, KnownCosts};
 use crate::mapping::heuristic::projected::{Projected, TableRoom};
 use crate::mapping::heuristic::{Guide, Heuristic, Raising};
 use crate::mapping::search::sweep::{KnownLayer, Swept, sweep};
-use crate::mapping::search::{Found, best_first};
+use crate::mapping::search::{Found, banded, best_first};
 use crate::mapping::{Problem, StoppedBy};
 use crate::model::{Space, StateIdx};
 
 impl Mapper {
-    /// Searches best first, in up to four stages: with the small tables of projections only, then with all of them; where single attributes
+    /// Searches, in bands or best first, in up to four stages: with the small tables of projections only, then with all of them; where single attributes
     /// tell little, with estimates that an [abstraction](crate::mapping::heuristic::abstraction) raises; and once a good part of all nodes was
     /// expanded, [`sweep`] goes over all nodes instead, which takes a fraction of the time for each.
     pub(super) fn best_first<S: Space>(
@@ -66,7 +66,7 @@ impl Mapper {
             let may_raise = n_untabled == 0 && choices.may_turn && self.may_abstract();
             let raising = may_raise.then_some(Raising { after, least_excess, abstract_in: &mut abstract_in });
             let guide = Guide { projected: &projected, raising };
-            let mut found = self.search(space, problem, guide, capped, most_f, interrupt)?;
+            let mut found = self.in_bands(space, problem, guide, capped, most_f, interrupt)?;
             let is_enough = !found.is_complete && enough < max_expansions && found.n_expanded >= enough;
             let is_out_of_memory = choices.may_turn && found.stopped_by == Some(StoppedBy::Memory);
             if let Some(before) = found_before {
@@ -107,6 +107,37 @@ impl Mapper {
         let found = self.search(space, problem, Guide::from(&blind), budget, most_f, interrupt)?;
         let found = Found { stopped_by: Some(StoppedBy::Deadline), ..found };
         conclude(problem, space, &blind, found, interrupt)
+    }
+
+    /// Searches in bands, where that may be done, and best first if that takes long, or too much memory.
+    fn in_bands<S: Space>(
+        &self,
+        space: &mut S,
+        problem: &Problem<'_>,
+        guide: Guide<'_, '_>,
+        budget: Budget,
+        most_f: f64,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Found, Cancelled> {
+        if !banded::is_for(problem, guide.projected) {
+            return self.search(space, problem, guide, budget, most_f, interrupt);
+        }
+        let few = Budget { max_expansions: budget.max_expansions.min(self.patience.max_banded_expansions), ..budget };
+        let found = self.buffers.lend(budget.max_bytes, |Buffers { banded, .. }| {
+            banded::search(problem, space, guide.projected, few, most_f, banded, interrupt)
+        })?;
+        let is_left = few.max_expansions < budget.max_expansions;
+        let goes_on = match found.stopped_by {
+            Some(StoppedBy::MaxExpansions) => is_left,
+            // Best first takes none for nodes that it does not come to.
+            Some(StoppedBy::Memory) => true,
+            Some(StoppedBy::Deadline) | None => false,
+        };
+        if !goes_on {
+            return Ok(found);
+        }
+        let rest = Budget { max_expansions: budget.max_expansions - found.n_expanded, ..budget };
+        Ok(joined(found, self.search(space, problem, guide, rest, most_f, interrupt)?))
     }
 
     /// Whether estimates can be raised by an [abstraction](crate::mapping::heuristic::abstraction): all states are listed.
@@ -178,6 +209,8 @@ fn joined(before: Found, found: Found) -> Found {
 pub(super) struct Patience {
     /// Most nodes, observations times states, of a problem that is searched layer by layer.
     pub(super) max_layered_nodes: usize,
+    /// Most expansions of a search in bands, before one that is best first begins.
+    max_banded_expansions: u64,
     /// Most entries of the tables of a search's first attempt, unless `few_entries_per_observation` allows more.
     few_entries: usize,
     /// The same limit for each observation.
@@ -218,6 +251,8 @@ impl Patience {
     pub(super) const DEFAULT: Self = Self {
         // To make room for as many takes ten microseconds.
         max_layered_nodes: 1 << 16,
+        // They take seven milliseconds. Few searches take more, and to raise estimates takes some.
+        max_banded_expansions: 1 << 17,
         // They take half a millisecond.
         few_entries: 1 << 16,
         // Two microseconds, which is no more than the search is bound to take.

@@ -4,7 +4,7 @@ use super::{HeuristicName, Mapper, Settings, way_bytes};
 use crate::mapping::Problem;
 use crate::mapping::heuristic::abstraction::Abstracted;
 use crate::mapping::heuristic::projected::{self, TableRoom};
-use crate::mapping::search::{astar, best_first, layered, sweep};
+use crate::mapping::search::{astar, banded, best_first, layered, sweep};
 
 impl Mapper {
     /// About how much memory a search takes at most, in bytes: its budget, or less if all nodes of `problem` take less. Most
@@ -32,8 +32,9 @@ impl Mapper {
             // Tables have a quarter of the budget, and it half.
             HeuristicName::Default if is_layered => 2 * layered::bytes_for(model, n_nodes).max(2 * tables),
             HeuristicName::Default => {
-                let search =
-                    best_first::most_bytes(model, n_observations).max(sweep::most_bytes(model, n_observations));
+                let search = best_first::most_bytes(model, n_observations)
+                    .max(banded::most_bytes(model, n_observations))
+                    .max(sweep::most_bytes(model, n_observations));
                 let abstracted = if self.may_abstract() {
                     // It has half of what the tables leave.
                     2 * Abstracted::most_bytes(self.max_classes(), problem)

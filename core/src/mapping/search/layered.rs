@@ -342,7 +342,7 @@ impl Search<'_> {
 }
 
 /// Notes `f` if it is among the least, which are sorted.
-fn note(least: &mut [f64], f: f64) {
+pub(super) fn note(least: &mut [f64], f: f64) {
     let Some(last) = least.last_mut().filter(|last| f < **last) else { return };
     *last = f;
     for at in (1..least.len()).rev() {

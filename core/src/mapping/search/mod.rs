@@ -3,12 +3,14 @@
 //! | module | is | used with |
 //! |---|---|---|
 //! | [`layered`] | beams, and what they leave, layer by layer | the default heuristic, in small problems |
-//! | [`best_first`] | A* for consistent estimates, with an incumbent and buckets | the default heuristic, in larger ones, and none |
+//! | [`banded`] | the same for more states than can be listed, in bands of `f` | the default heuristic, in larger ones of the same kind |
+//! | [`best_first`] | A* for consistent estimates, with an incumbent and buckets | the default heuristic, in others and in long searches, and none |
 //! | [`sweep`] | what it costs to go on from every node, from the last layer back | what takes the others long |
 //! | [`astar`] | A* as in the textbook | the paper's heuristic, which is not consistent |
-//! | [`seen`], [`nodes`] with [`index`], [`buckets`] | the states, the closed and the open list of [`best_first`] | |
+//! | [`seen`], [`nodes`] with [`index`], [`buckets`] | the states, the closed and the open list of [`best_first`]; the first of [`banded`], too | |
 
 pub(super) mod astar;
+pub(super) mod banded;
 pub(super) mod best_first;
 mod buckets;
 mod index;

@@ -196,7 +196,7 @@ impl Seen {
 
     /// The classes of a state.
     #[inline]
-    fn classes(&self, number: SeenIdx) -> &[u32] {
+    pub(super) fn classes(&self, number: SeenIdx) -> &[u32] {
         let n_classes = self.columns.len();
         &self.classes[number as usize * n_classes..][..n_classes]
     }

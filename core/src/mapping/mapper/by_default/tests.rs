@@ -60,6 +60,7 @@ fn finish_at(n: u64) -> impl FnMut() -> Signal {
 /// Whatever takes long is done as soon as may be.
 const IMPATIENT: Patience = Patience {
     max_layered_nodes: 0,
+    max_banded_expansions: 0,
     few_entries: 0,
     few_entries_per_observation: 8,
     entries_per_expansion: 16,
@@ -82,6 +83,7 @@ proptest! {
         helps in prop_oneof![
             Just(Patience::DEFAULT),
             Just(Patience { max_layered_nodes: 0, ..Patience::DEFAULT }),
+            Just(Patience { max_layered_nodes: 0, max_banded_expansions: 30, ..Patience::DEFAULT }),
             Just(IMPATIENT),
             Just(Patience { min_expansions_before_sweep: u64::MAX, ..IMPATIENT }),
         ],
@@ -269,12 +271,35 @@ fn a_long_search_whose_mappings_cost_far_more_than_attributes_tell_one_by_one_is
         let settings = Settings { heuristic, ..Settings::default() };
         mapper.map(&problem(mapper.model(), &request), settings, &mut Uninterrupted).unwrap()
     };
+    // In bands, it would not be long.
+    let long = Patience { max_banded_expansions: 0, ..Patience::DEFAULT };
+    let mapper = Mapper { patience: long, ..mapper };
     let guided = map(&mapper, HeuristicName::Default);
-    let alone = Patience { least_excess: f64::INFINITY, ..Patience::DEFAULT };
+    let alone = Patience { least_excess: f64::INFINITY, ..long };
     let mapper = Mapper { patience: alone, ..mapper };
     let (alone, without) = (map(&mapper, HeuristicName::Default), map(&mapper, HeuristicName::None));
     assert!((guided.cost.total - without.cost.total).abs() < 1e-9 && guided.status == Status::Optimal);
     assert!(guided.n_expanded < alone.n_expanded / 2, "{} and {}", guided.n_expanded, alone.n_expanded);
+}
+
+#[test]
+fn a_search_in_bands_comes_to_the_same_cost_as_best_first_with_few_more_expansions() {
+    let (mapper, request) = belt(60, 100);
+    let map = |mapper: &Mapper, n_observations: usize| {
+        let seen = &request["demonstration"].as_array().unwrap()[..n_observations];
+        let request = json!({"model": "belt", "demonstration": seen});
+        mapper.map(&problem(mapper.model(), &request), Settings::default(), &mut Uninterrupted).unwrap()
+    };
+    let patience = Patience { max_layered_nodes: 0, ..Patience::DEFAULT };
+    let mapper = Mapper { patience, ..mapper };
+    let banded = [20, 60, 100].map(|n_observations| map(&mapper, n_observations));
+    let mapper = Mapper { patience: Patience { max_banded_expansions: 0, ..patience }, ..mapper };
+    for (banded, n_observations) in banded.iter().zip([20, 60, 100]) {
+        let best_first = map(&mapper, n_observations);
+        assert_eq!((banded.cost, banded.status), (best_first.cost, Status::Optimal));
+        let [n_banded, n] = [banded, &best_first].map(|mapping| mapping.n_expanded);
+        assert!(n_banded != n && n_banded < n + n / 2 + 12 * n_observations as u64, "{n_banded} and {n}");
+    }
 }
 
 #[test]
