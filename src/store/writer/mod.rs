@@ -1,8 +1,8 @@
 //! The one writer, which groups commits.
 //!
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies it in one
-//! transaction, and answers all of it after the commit. After a group of several it yields once, so that ready tasks can enqueue: groups
-//! grow with the load, and no timer is needed. Small and large requests wait in lines of their own. A group takes all small requests, but
+//! transaction, and answers all of it after the commit. Meanwhile the next group gathers: groups grow with the load, and no timer is needed.
+//! The writer has a thread of its own, so that what everybody waits for does not wait for a turn among everybody's tasks. Small and large requests wait in lines of their own. A group takes all small requests, but
 //! only about a MiB of large ones, so that small requests never wait long behind large ones. Observations, which are most requests, are
 //! written to `arrivals` with a commit, and moved to their table later. A group of observations alone, or of policies alone, takes a
 //! single statement, and one of rewards alone two, outside of a transaction, as each statement costs the driver a change of threads.
@@ -18,10 +18,12 @@ mod verb;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::thread;
 use std::time::Duration;
 
 use rustc_hash::FxHashSet;
 use sqlx::{Connection, SqliteConnection};
+use tokio::runtime::Handle;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
@@ -82,8 +84,12 @@ impl ModelsGeneration {
 }
 
 impl Writer {
-    /// Starts the writer in `tasks`, with its connection if there is one yet. It ends once it was closed or dropped, and all that waited has
-    /// been written.
+    /// Starts the writer, with its connection if there is one yet, on a thread of its own that counts among `tasks`. It ends once it was closed
+    /// or dropped, and all that waited has been written.
+    ///
+    /// # Panics
+    ///
+    /// If the system has no thread for it.
     pub(super) fn start(
         database: Database,
         connection: Option<SqliteConnection>,
@@ -91,7 +97,22 @@ impl Writer {
         tasks: &TaskTracker,
     ) -> Self {
         let (writer, lines) = Self::with_lines();
-        let open = Open {
+        let open = writer.open(database, connection, readers, tasks);
+        let (running, runtime) = (tasks.track_future(open.run(lines)), Handle::current());
+        let run = move || runtime.block_on(running);
+        thread::Builder::new().name("etude-writer".to_owned()).spawn(run).expect("a thread for the writer");
+        writer
+    }
+
+    /// Who writes what is asked by this handle.
+    fn open(
+        &self,
+        database: Database,
+        connection: Option<SqliteConnection>,
+        readers: Arc<Readers>,
+        tasks: &TaskTracker,
+    ) -> Open {
+        Open {
             database,
             connection,
             readers,
@@ -101,10 +122,8 @@ impl Writer {
             known: Known::default(),
             was_interrupted: true,
             trouble: None,
-            models_generation: writer.models_generation.clone(),
-        };
-        tasks.spawn(open.run(lines));
-        writer
+            models_generation: self.models_generation.clone(),
+        }
     }
 
     /// A handle without a writer.
@@ -231,17 +250,7 @@ struct Open {
 impl Open {
     async fn run(mut self, mut lines: Lines) {
         let mut group = Vec::with_capacity(MAX_GROUP);
-        let mut n_told = 0;
-        loop {
-            if n_told > 1 {
-                // It yields once, so that those who were told can enqueue. One alone would come alone again, and to yield for it wakes threads
-                // that find nothing to do.
-                tokio::task::yield_now().await;
-            }
-            if !lines.take(&mut group).await {
-                break;
-            }
-            n_told = group.len();
+        while lines.take(&mut group).await {
             match self.commit(&mut group).await {
                 Ok(()) => group.drain(..).for_each(|job| job.tell(Ok(()))),
                 Err(StoreError::Unavailable(unavailable)) => {
