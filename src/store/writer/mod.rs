@@ -45,6 +45,9 @@ pub(super) use verb::{Verb, Writing};
 /// Most small requests in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
 const MAX_GROUP: usize = 256;
 
+/// After a group of so many, other threads are let go first: those who were told soon come again, and all of them should be in the next one.
+const LARGE_GROUP: usize = 16;
+
 /// How long those who ask wait to get in line.
 const LINE_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -251,6 +254,7 @@ impl Open {
     async fn run(mut self, mut lines: Lines) {
         let mut group = Vec::with_capacity(MAX_GROUP);
         while lines.take(&mut group).await {
+            let is_large = group.len() >= LARGE_GROUP;
             match self.commit(&mut group).await {
                 Ok(()) => group.drain(..).for_each(|job| job.tell(Ok(()))),
                 Err(StoreError::Unavailable(unavailable)) => {
@@ -275,6 +279,9 @@ impl Open {
                 }
             }
             self.finish_checkpoint().await;
+            if is_large {
+                thread::yield_now();
+            }
         }
         self.close().await;
     }
