@@ -71,8 +71,10 @@ fn read<R: BufRead>(
         read_states(Lines::new(reader), &mut choices.draft).map_err(|error| error.in_file(&name))?;
     }
     let mut known = Labels::default();
+    let mut last_labelled = None;
     if let Some((name, reader)) = labels {
-        read_labels(Lines::new(reader), &mut known, &mut choices.draft).map_err(|error| error.in_file(&name))?;
+        let last = read_labels(Lines::new(reader), &mut known, &mut choices.draft);
+        last_labelled = last.map_err(|error| error.in_file(&name))?.map(|(state, spot)| (name, state, spot));
     }
     let mut rewards = Rewards::default();
     if let Some((name, reader)) = state_rewards {
@@ -86,12 +88,12 @@ fn read<R: BufRead>(
         if choices.draft.n_rows() == 0 {
             choices.label_states(n_states, &known)?;
         }
-        if let Some(last) = choices.draft.start.iter().max() {
-            check_state((*last).into(), n_states, Spot::Whole)?;
-        }
-        Ok(())
+        Ok(n_states)
     };
-    finish().map_err(|error: ImportError| error.in_file(&name))?;
+    let n_states = finish().map_err(|error: ImportError| error.in_file(&name))?;
+    if let Some((name, state, spot)) = last_labelled {
+        check_state(state, n_states, spot).map_err(|error| error.in_file(&name))?;
+    }
     choices.draft.finish(edits, meter).map_err(|error| error.in_file(&name))
 }
 
@@ -147,7 +149,12 @@ fn read_states<R: BufRead>(mut lines: Lines<R>, draft: &mut Draft) -> Result<(),
     Ok(())
 }
 
-fn read_labels<R: BufRead>(mut lines: Lines<R>, labels: &mut Labels, draft: &mut Draft) -> Result<(), ImportError> {
+/// Reads the labels of states, and where it starts. Gives the last state that is named, and where.
+fn read_labels<R: BufRead>(
+    mut lines: Lines<R>,
+    labels: &mut Labels,
+    draft: &mut Draft,
+) -> Result<Option<(u64, Spot)>, ImportError> {
     let header = first_line(&mut lines)?;
     let mut names: Vec<(u64, String)> = Vec::new();
     let mut rest = header.as_str();
@@ -167,7 +174,7 @@ fn read_labels<R: BufRead>(mut lines: Lines<R>, labels: &mut Labels, draft: &mut
             line.split_once(':').and_then(|(state, numbers)| Some((state.trim().parse::<u64>().ok()?, numbers)));
         let (state, numbers) =
             parts.ok_or_else(|| lines.wrong(format!("expected a state's labels, `0: 1`, found {}", Quoted(&line))))?;
-        if last.replace(state).is_some_and(|last| last >= state) {
+        if last.replace((state, lines.spot())).is_some_and(|(last, _)| last >= state) {
             return Err(lines.wrong("states are not in their order"));
         }
         for written in numbers.split_ascii_whitespace() {
@@ -180,7 +187,7 @@ fn read_labels<R: BufRead>(mut lines: Lines<R>, labels: &mut Labels, draft: &mut
             }
         }
     }
-    Ok(())
+    Ok(last)
 }
 
 /// What states and transitions earn, ascending.

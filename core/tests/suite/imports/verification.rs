@@ -265,6 +265,7 @@ fn what_is_wrong_with_the_files_of_prism_is_told_with_file_and_line() {
         ("lab", "0=\"init\"", "init", "line 1 of slippery.lab: expected labels, `0=\"init\"`, found"),
         ("lab", "0: 0", "0: 7", "line 2 of slippery.lab: there is no label 7"),
         ("lab", "0: 0", "20: 0", "line 3 of slippery.lab: states are not in their order"),
+        ("lab", "\n19: 2", "\n20: 2", "line 6 of slippery.lab: there is no state 20: there are 20, counted from 0"),
         ("srew", "20 10", "20 11", "of slippery.srew: expected 11 rewards, found 10"),
         ("trew", "20 52", "19 52", "line 3 of slippery.trew: 19 states, but the transitions have 20"),
         ("trew", "20 52", "20 51", "line 3 of slippery.trew: 51 choices, but the transitions have 52"),
@@ -290,6 +291,13 @@ fn what_is_wrong_with_the_files_of_prism_is_told_with_file_and_line() {
     }
     let empty = prism(|part, content| Some(if part == "sta" { String::new() } else { content }));
     assert_eq!(empty.unwrap_err().to_string(), "slippery.sta: the file is empty");
+    let alone = prism(|part, content| match part {
+        "sta" => None,
+        "lab" => Some(content.replace("\n19: 2", "\n20: 2")),
+        _ => Some(content),
+    });
+    let expected = "line 6 of slippery.lab: there is no state 20: there are 20, counted from 0";
+    assert_eq!(alone.unwrap_err().to_string(), expected);
     let missing = prism(|part, content| (part != "tra").then_some(content)).unwrap_err().to_string();
     assert_eq!(missing, "there is no file of transitions: .tra");
     let archive = archive();
