@@ -136,7 +136,7 @@ impl Verb for DeleteSession {
             let given_up = sqlx::query("DELETE FROM refinements WHERE policy_id = $1 AND session_id = $2");
             given_up.bind(policy_id).bind(id).execute(connection).await?;
         }
-        writing.known.arrivals.ended(id);
+        writing.arrivals.ended(id);
         Ok(Deletion::Deleted)
     }
 }

@@ -308,7 +308,6 @@ impl Verb for FoldRewards {
 
     async fn apply(&self, writing: &mut Writing<'_>) -> Result<Fold, StoreError> {
         let Self { learner, weights } = self;
-        writing.known.pending.remove(learner);
         let connection = &mut *writing.connection;
         let query = sqlx::query_scalar("SELECT MAX(version) FROM weights WHERE learner = $1").bind(learner);
         let last: Option<i64> = query.fetch_one(&mut *connection).await?;

@@ -64,7 +64,7 @@ impl Verb for NewSession {
             }
         }
         insert(writing.connection, self).await?;
-        writing.known.arrivals.opened(&self.id);
+        writing.arrivals.opened(&self.id);
         Ok(Opened::Yes)
     }
 }
@@ -84,7 +84,7 @@ impl Verb for TakeSession {
         let taken = taken.bind(id).bind(at.as_millisecond()).fetch_optional(&mut *writing.connection).await?;
         if let Some(row) = taken {
             let session = read_session(&row).map_err(in_row)?;
-            writing.known.arrivals.taken(id, session.owner, session.n_observations);
+            writing.arrivals.taken(id, session.owner, session.n_observations);
             return Ok(Taken::Open(session));
         }
         let query = sqlx::query("SELECT * FROM sessions WHERE id = $1").bind(id);
@@ -128,7 +128,7 @@ impl Verb for SessionEnd {
         if updated.execute(&mut *writing.connection).await?.rows_affected() == 0 {
             return refusal(writing.connection, &self.session_id).await.map(Err);
         }
-        writing.known.arrivals.ended(&self.session_id);
+        writing.arrivals.ended(&self.session_id);
         policies::add(writing.connection, &self.policy).await?;
         if let Some(refinement) = &self.refinement {
             refinements::add(writing.connection, refinement).await?;
@@ -144,7 +144,7 @@ impl Verb for ExpireSessions {
 
     async fn apply(&self, writing: &mut Writing<'_>) -> Result<(Down, Vec<ExpiredSession>), StoreError> {
         let down = alive::note(writing, self.alive).await?;
-        writing.known.arrivals.expired();
+        writing.arrivals.expired();
         Ok((down, expire(writing.connection, self.before).await?))
     }
 }

@@ -110,18 +110,15 @@ impl Verb for FailTrial {
 }
 
 /// Accepts rewards, in order, within a transaction. Takes two statements, however many there are, and another one if a learner is not yet
-/// among those that are marked as having rewards to fold, `pending`.
+/// marked as having rewards to fold.
 pub(in crate::store) async fn accept_all(
     connection: &mut SqliteConnection,
     rewards: &[&NewReward],
-    pending: &mut FxHashSet<i64>,
 ) -> Result<Vec<RewardAnswer>, StoreError> {
     let decided = read_rewarded(connection, rewards).await?.decide(rewards);
-    let new = decided.unmarked(pending);
-    if !new.is_empty() {
-        let ids = serde_json::to_string(&new).map_err(corrupt("learners", "sequence"))?;
+    if !decided.unmarked.is_empty() {
+        let ids = serde_json::to_string(&decided.unmarked).map_err(corrupt("learners", "sequence"))?;
         learners::mark_pending(connection, &ids).await?;
-        pending.extend(new);
     }
     decided.insert(connection).await?;
     Ok(decided.answers)
@@ -132,10 +129,9 @@ pub(in crate::store) async fn accept_all(
 pub(in crate::store) async fn accept_at_once(
     connection: &mut SqliteConnection,
     rewards: &[&NewReward],
-    pending: &FxHashSet<i64>,
 ) -> Result<Option<Vec<RewardAnswer>>, StoreError> {
     let decided = read_rewarded(connection, rewards).await?.decide(rewards);
-    let was_done = decided.unmarked(pending).is_empty() && decided.insert(connection).await?;
+    let was_done = decided.unmarked.is_empty() && decided.insert(connection).await?;
     Ok(was_done.then_some(decided.answers))
 }
 
@@ -145,6 +141,8 @@ struct Decided {
     answers: Vec<RewardAnswer>,
     /// Of those that are accepted.
     rows: Vec<RewardRow>,
+    /// Their learners that are not marked as having rewards to fold.
+    unmarked: BTreeSet<i64>,
     /// SQLite's number that changes when others write, as it was.
     data_version: i64,
 }
@@ -159,11 +157,6 @@ struct RewardRow {
 }
 
 impl Decided {
-    /// The learners whose rewards are accepted that are not among those that are marked.
-    fn unmarked(&self, pending: &FxHashSet<i64>) -> BTreeSet<i64> {
-        self.rows.iter().map(|row| row.learner).filter(|id| !pending.contains(id)).collect()
-    }
-
     /// Adds what is accepted to the log of rewards, unless others have written meanwhile. Says whether it did.
     async fn insert(&self, connection: &mut SqliteConnection) -> Result<bool, StoreError> {
         if self.rows.is_empty() {
@@ -192,15 +185,17 @@ struct Rewarded {
 
 struct Found {
     learner: i64,
+    /// Whether the learner is marked as having rewards to fold.
+    is_marked: bool,
     row: TrialRecord,
 }
 
 impl Rewarded {
     /// What becomes of these rewards, in order, if nothing else is written meanwhile.
     fn decide(mut self, rewards: &[&NewReward]) -> Decided {
-        let mut rows = Vec::with_capacity(rewards.len());
+        let (mut rows, mut unmarked) = (Vec::with_capacity(rewards.len()), BTreeSet::new());
         let answers = rewards.iter().map(|new| {
-            let Some(Found { learner, row: trial }) = self.trials.get_mut(new.trial.as_str()) else {
+            let Some(Found { learner, is_marked, row: trial }) = self.trials.get_mut(new.trial.as_str()) else {
                 return RewardAnswer::Unknown;
             };
             match (&trial.failed, trial.reward) {
@@ -213,6 +208,9 @@ impl Rewarded {
                     let last = self.last_orders.entry(*learner).or_insert(0);
                     *last += 1;
                     trial.reward = Some(AcceptedReward { reward: new.reward, reward_order: *last });
+                    if !*is_marked {
+                        unmarked.insert(*learner);
+                    }
                     rows.push(RewardRow {
                         learner: *learner,
                         order: *last,
@@ -224,7 +222,8 @@ impl Rewarded {
                 }
             }
         });
-        Decided { answers: answers.collect(), rows, data_version: self.data_version }
+        let answers = answers.collect();
+        Decided { answers, rows, unmarked, data_version: self.data_version }
     }
 }
 
@@ -233,7 +232,7 @@ async fn read_rewarded(connection: &mut SqliteConnection, rewards: &[&NewReward]
     let ids = serde_json::to_string(&ids).map_err(corrupt("trials", "id"))?;
     // `CROSS JOIN` makes SQLite look trials up by id, rather than ids up by trial.
     let query = sqlx::query(AssertSqlSafe(format!(
-        "{SELECT}, t.learner,
+        "{SELECT}, t.learner, l.has_pending,
              (SELECT MAX(last.reward_order) FROM rewards last WHERE last.learner = t.learner) AS last_order,
              (SELECT data_version FROM pragma_data_version) AS data_version
          FROM json_each($1) wanted CROSS JOIN trials t ON t.id = wanted.value
@@ -241,14 +240,14 @@ async fn read_rewarded(connection: &mut SqliteConnection, rewards: &[&NewReward]
     )));
     let mut read = Rewarded { trials: FxHashMap::default(), last_orders: BTreeMap::new(), data_version: 0 };
     for row in query.bind(ids).fetch_all(connection).await? {
-        let learner = row.try_get("learner")?;
+        let (learner, is_marked) = (row.try_get("learner")?, row.try_get("has_pending")?);
         read.data_version = row.try_get("data_version")?;
         let last: Option<i64> = row.try_get("last_order")?;
         if last.is_some() {
             read.last_orders.insert(learner, count(&row, "rewards", "last_order")?);
         }
         let row = read_trial(&row)?;
-        read.trials.insert(row.id.clone(), Found { learner, row });
+        read.trials.insert(row.id.clone(), Found { learner, is_marked, row });
     }
     Ok(read)
 }

@@ -2,7 +2,6 @@
 
 use sqlx::{Connection, SqliteConnection};
 
-use super::Known;
 use super::verb::{Effects, Job, Writing};
 use crate::store::arrivals::Arrivals;
 use crate::store::observations::SessionRefusal;
@@ -12,17 +11,17 @@ use crate::store::{NewObservations, NewPolicy, StoreError, policies, refinements
 /// Applies `group`: durable when this returns.
 pub(super) async fn write(
     connection: &mut SqliteConnection,
-    known: &mut Known,
+    arrivals: &mut Arrivals,
     group: &mut [Job],
     was_interrupted: bool,
 ) -> Result<Effects, StoreError> {
-    if append_at_once(connection, &mut known.arrivals, group).await?
+    if append_at_once(connection, arrivals, group).await?
         || add_policies_at_once(connection, group).await?
-        || accept_rewards_at_once(connection, known, group).await?
+        || accept_rewards_at_once(connection, group).await?
     {
         return Ok(Effects::default());
     }
-    transact(connection, known, group, was_interrupted).await
+    transact(connection, arrivals, group, was_interrupted).await
 }
 
 /// The observations in a group, in order.
@@ -97,13 +96,13 @@ fn answer_policies(group: &mut [Job]) {
 /// requests of a group may be applied in any order.
 async fn transact(
     connection: &mut SqliteConnection,
-    known: &mut Known,
+    arrivals: &mut Arrivals,
     group: &mut [Job],
     was_interrupted: bool,
 ) -> Result<Effects, StoreError> {
     let mut effects = Effects::default();
     let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
-    append(&mut transaction, &mut known.arrivals, group).await?;
+    append(&mut transaction, arrivals, group).await?;
     policies::add_all(&mut transaction, &added_policies(group)).await?;
     open_trials(&mut transaction, group).await?;
     for job in &mut *group {
@@ -115,13 +114,13 @@ async fn transact(
             }
             Job::Other(verb) => {
                 let (connection, effects) = (&mut *transaction, &mut effects);
-                verb.apply(&mut Writing { connection, known, effects, was_interrupted }).await?;
+                verb.apply(&mut Writing { connection, arrivals, effects, was_interrupted }).await?;
             }
             Job::Observations(_) | Job::Trial(_) | Job::Reward(_) => {}
         }
     }
     answer_policies(group);
-    accept_rewards(&mut transaction, known, group).await?;
+    accept_rewards(&mut transaction, group).await?;
     transaction.commit().await?;
     Ok(effects)
 }
@@ -179,28 +178,20 @@ fn rewards(group: &[Job]) -> Vec<&NewReward> {
 
 /// Accepts rewards without a transaction, if there is nothing else in the group, as [`trials::accept_at_once`] does. Says whether it did; it
 /// has done nothing otherwise.
-async fn accept_rewards_at_once(
-    connection: &mut SqliteConnection,
-    known: &Known,
-    group: &mut [Job],
-) -> Result<bool, StoreError> {
+async fn accept_rewards_at_once(connection: &mut SqliteConnection, group: &mut [Job]) -> Result<bool, StoreError> {
     let rewards = rewards(group);
     if rewards.len() < group.len() {
         return Ok(false);
     }
-    let answers = trials::accept_at_once(connection, &rewards, &known.pending).await?;
+    let answers = trials::accept_at_once(connection, &rewards).await?;
     Ok(answers.map(|answers| answer_rewards(group, answers)).is_some())
 }
 
 /// Accepts the rewards in `group`, in order.
-async fn accept_rewards(
-    transaction: &mut SqliteConnection,
-    known: &mut Known,
-    group: &mut [Job],
-) -> Result<(), StoreError> {
+async fn accept_rewards(transaction: &mut SqliteConnection, group: &mut [Job]) -> Result<(), StoreError> {
     let rewards = rewards(group);
     if !rewards.is_empty() {
-        let answers = trials::accept_all(transaction, &rewards, &mut known.pending).await?;
+        let answers = trials::accept_all(transaction, &rewards).await?;
         answer_rewards(group, answers);
     }
     Ok(())

@@ -21,7 +21,6 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::thread;
 use std::time::Duration;
 
-use rustc_hash::FxHashSet;
 use sqlx::{Connection, SqliteConnection};
 use tokio::runtime::Handle;
 use tokio::sync::mpsc::error::TrySendError;
@@ -122,7 +121,7 @@ impl Writer {
             tasks: tasks.clone(),
             n_logged_bytes: 0,
             checkpoint: None,
-            known: Known::default(),
+            arrivals: Arrivals::default(),
             was_interrupted: true,
             trouble: None,
             models_generation: self.models_generation.clone(),
@@ -223,14 +222,6 @@ impl Writer {
     }
 }
 
-/// What the writer knows of the database without looking, as long as what it writes succeeds.
-#[derive(Debug, Default)]
-pub(super) struct Known {
-    pub(super) arrivals: Arrivals,
-    /// Learners that are marked as having rewards to fold.
-    pub(super) pending: FxHashSet<i64>,
-}
-
 /// The writer at work.
 struct Open {
     database: Database,
@@ -242,7 +233,8 @@ struct Open {
     n_logged_bytes: usize,
     /// The last checkpoint.
     checkpoint: Option<JoinHandle<()>>,
-    known: Known,
+    /// Known without looking, as long as what it writes succeeds.
+    arrivals: Arrivals,
     /// Whether no sign of life was written since the start, or since the database was unavailable.
     was_interrupted: bool,
     /// Why nothing could be written the last time, if that was so.
@@ -309,7 +301,7 @@ impl Open {
         if self.models_generation.get().is_none() {
             self.models_generation.set(Some(models_generation(connection).await?));
         }
-        let effects = group::write(connection, &mut self.known, group, self.was_interrupted).await?;
+        let effects = group::write(connection, &mut self.arrivals, group, self.was_interrupted).await?;
         self.database.check_written()?;
         self.was_interrupted &= !effects.has_noted_life;
         if effects.models_generation.is_some() {
@@ -348,7 +340,7 @@ impl Open {
     }
 
     async fn failed(&mut self, error: StoreError) -> StoreError {
-        self.known = Known::default();
+        self.arrivals.forget();
         self.models_generation.set(None);
         if let Some(connection) = self.connection.take() {
             self.database.disconnect(connection).await;
@@ -365,8 +357,8 @@ impl Open {
 
     async fn close(mut self) {
         let Some(mut connection) = self.connection.take() else { return };
-        if !self.known.arrivals.is_empty()
-            && let Err(error) = settle(&mut connection, &mut self.known.arrivals).await
+        if !self.arrivals.is_empty()
+            && let Err(error) = settle(&mut connection, &mut self.arrivals).await
         {
             // Observations are durable in `arrivals` too.
             tracing::warn!(

@@ -7,7 +7,7 @@ use futures_util::future::BoxFuture;
 use sqlx::SqliteConnection;
 use tokio::sync::oneshot;
 
-use super::Known;
+use crate::store::arrivals::Arrivals;
 use crate::store::observations::SessionRefusal;
 use crate::store::policies::AddPolicies;
 use crate::store::trials::{NewReward, NewTrial, Opened, RewardAnswer};
@@ -33,7 +33,7 @@ pub(in crate::store) trait Verb: fmt::Debug + Send + Sync + 'static {
 /// A transaction that writes.
 pub(in crate::store) struct Writing<'w> {
     pub(in crate::store) connection: &'w mut SqliteConnection,
-    pub(in crate::store) known: &'w mut Known,
+    pub(in crate::store) arrivals: &'w mut Arrivals,
     pub(in crate::store) effects: &'w mut Effects,
     /// Whether no sign of life was written since the start, or since the database was unavailable.
     pub(in crate::store) was_interrupted: bool,
