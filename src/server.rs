@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-use tokio::net::TcpListener;
+use tokio::net::{TcpListener, TcpSocket};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
@@ -23,6 +23,10 @@ use crate::service::Etude;
 use crate::service::ServiceError;
 use crate::stream::Rooms;
 use crate::telemetry;
+
+/// Connections that may wait to be accepted; Linux takes `net.core.somaxconn` if that is less. Whoever comes when the line is full must send
+/// its SYN again, a second later.
+const MAX_UNACCEPTED: u32 = 4096;
 
 /// How long answers may take to be sent, once searches were aborted.
 const ABORT_GRACE: Duration = Duration::from_secs(2);
@@ -87,7 +91,7 @@ impl Server {
             .map_err(not_usable)?;
         etude.begin(etude.clock().now()).await.map_err(not_usable)?;
         let listen = |source| ServerError::Listen { listen: config.listen, source };
-        let listener = TcpListener::bind(config.listen).await.map_err(listen)?;
+        let listener = listen_on(config.listen).map_err(listen)?;
         let address = listener.local_addr().map_err(listen)?;
         tasks.spawn(upkeep(metrics.clone(), stopping.clone()));
         let etude = Arc::new(etude);
@@ -179,6 +183,15 @@ impl Server {
     }
 }
 
+/// Listens at `address`, for bursts of connections too.
+fn listen_on(address: SocketAddr) -> std::io::Result<TcpListener> {
+    let socket = if address.is_ipv4() { TcpSocket::new_v4() } else { TcpSocket::new_v6() }?;
+    // So that a restart need not wait until the connections of before are forgotten.
+    socket.set_reuseaddr(true)?;
+    socket.bind(address)?;
+    socket.listen(MAX_UNACCEPTED)
+}
+
 /// The settings, with no more connections than the process can have open files.
 fn within_limits(config: &ServeConfig) -> ServeConfig {
     let config_within = config.within(raise_file_limit());
@@ -257,5 +270,25 @@ impl StopSignals {
                 None => {}
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn connections_that_come_in_a_burst_wait_in_line() {
+        let somaxconn =
+            fs::read_to_string("/proc/sys/net/core/somaxconn").ok().and_then(|most| most.trim().parse().ok());
+        let n_connections = somaxconn.unwrap_or(128).min(512);
+        let listener = listen_on(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
+        let address = listener.local_addr().unwrap();
+        // Nobody accepts them. If one did not fit in line, this would end with the kernel's timeout.
+        let connecting = (0..n_connections).map(|_| tokio::net::TcpStream::connect(address));
+        let connected = futures_util::future::try_join_all(connecting).await.unwrap();
+        assert_eq!(connected.len(), n_connections);
     }
 }
