@@ -10,9 +10,9 @@ use super::queue::QUEUE_BYTES;
 use crate::memory::{Held, Memory, NoRoom};
 use crate::service::{Client, Places};
 
-/// Size of the buffer into which a socket is read. Every stream has one, and most wait for a small frame, so it is small; a larger frame is
-/// read in several parts.
-pub const READ_BUFFER_BYTES: usize = 8 << 10;
+/// How much is read from a socket at a time. The websocket fills as much with zeros whenever it looks whether something has come, which is
+/// several times for an observation of some 200 bytes; a larger frame is read in several parts.
+pub const READ_BUFFER_BYTES: usize = 2 << 10;
 
 /// Size of the buffer in which frames to the client are gathered before they are written.
 pub const WRITE_BUFFER_BYTES: usize = 8 << 10;
@@ -20,10 +20,10 @@ pub const WRITE_BUFFER_BYTES: usize = 8 << 10;
 /// A frame of up to this size fits into the buffers that every stream has. A larger one takes memory of its own.
 pub const SMALL_FRAME_BYTES: usize = 16 << 10;
 
-/// Memory of the buffers of a stream, 80 KiB: what was read, with a frame of which a part has come (three read buffers); the queue of frames
-/// to be handled; the queue of frames to be written; the write buffer, and the frame that is being written.
+/// Memory of the buffers of a stream, 80 KiB: what was read, with a frame of which a part has come (one and a half small frames); the queue
+/// of frames to be handled; the queue of frames to be written; the write buffer, and the frame that is being written.
 const STREAM_BYTES: u64 =
-    (3 * READ_BUFFER_BYTES + QUEUE_BYTES as usize + QUEUE_BYTES as usize + WRITE_BUFFER_BYTES + SMALL_FRAME_BYTES)
+    (SMALL_FRAME_BYTES * 3 / 2 + QUEUE_BYTES as usize + QUEUE_BYTES as usize + WRITE_BUFFER_BYTES + SMALL_FRAME_BYTES)
         as u64;
 
 /// Memory of a large frame while it is read, per byte of the frame: its buffer grows by doubling, so it may be twice as large.
