@@ -145,11 +145,12 @@ struct Stream {
     n_sent: usize,
     /// How many messages have come.
     n_messages: usize,
-    states: Arc<Vec<Value>>,
+    /// Their texts.
+    states: Arc<Vec<String>>,
 }
 
 impl Stream {
-    async fn open(address: &str, states: &Arc<Vec<Value>>) -> Result<Self, Failure> {
+    async fn open(address: &str, states: &Arc<Vec<String>>) -> Result<Self, Failure> {
         let (mut socket, _) = tokio_tungstenite::connect_async(format!("ws://{address}/v1/stream")).await?;
         socket.send(Message::text(json!({"type": "open", "model": "m"}).to_string())).await?;
         for _ in ["hello", "opened"] {
@@ -267,16 +268,21 @@ fn corridor() -> World {
     }
 }
 
+/// The states of a demonstration as they are sent. Written once: it is the service that is measured.
+fn texts(world: &World) -> Arc<Vec<String>> {
+    Arc::new(world.demonstration.as_array().into_iter().flatten().map(Value::to_string).collect())
+}
+
 /// Round trips of `n_connections` at the same time, beside what bounds them.
 async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure> {
     let service = Service::start(world).await?;
-    let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
+    let (texts, states) = (texts(world), Arc::new(world.demonstration.as_array().cloned().unwrap_or_default()));
     let echo = Echo::start()?;
     let mapper = mapper(world)?;
     let mut streams = Vec::new();
     let mut echoes = Vec::new();
     for _ in 0..n_connections {
-        streams.push(Stream::open(&service.address, &states).await?);
+        streams.push(Stream::open(&service.address, &texts).await?);
         let socket = tokio_tungstenite::connect_async(format!("ws://{}/", echo.address)).await?.0;
         echoes.push(Echoed { socket, n_messages: 1.0, rest: 0.0 });
     }
@@ -451,7 +457,7 @@ enum Load {
 /// Opens sessions, each of which then sees so many observations.
 async fn open_all(
     service: &Service,
-    states: &Arc<Vec<Value>>,
+    states: &Arc<Vec<String>>,
     n_sessions: usize,
     n_observations: usize,
 ) -> Result<Vec<Stream>, Failure> {
@@ -470,7 +476,7 @@ async fn open_all(
 async fn memory(n_sessions: usize, n_observations: usize, load: Load) -> Result<(), Failure> {
     let world = worlds::example("figure-4");
     let service = Service::start(&world).await?;
-    let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
+    let states = texts(&world);
     let before = service.resident_kib()?;
     let mut streams = open_all(&service, &states, n_sessions, n_observations).await?;
     let (mut most, what) = (service.resident_kib()?, if load == Load::Busy { "busy" } else { "idle" });
@@ -512,7 +518,7 @@ async fn many(n_sessions: usize, n_busy: usize) -> Result<(), Failure> {
     const N_SEEN: usize = 20;
     let world = worlds::cave(20, 5, 50, 1);
     let service = Service::start(&world).await?;
-    let states = Arc::new(world.demonstration.as_array().cloned().unwrap_or_default());
+    let states = texts(&world);
     let before = service.resident_kib()?;
     let mut streams = open_all(&service, &states, n_sessions, N_SEEN).await?;
     let idle = service.resident_kib()?;
