@@ -91,7 +91,7 @@ pub async fn run(
 pub(super) struct Connection<'c> {
     pub(super) etude: &'c Etude,
     client: Client,
-    limits: Limits,
+    pub(super) limits: Limits,
     pub(super) outlet: Outlet<'c>,
     pub(super) session: Option<Session>,
     /// What was taken out of the queue, and is answered next.
@@ -142,8 +142,13 @@ impl Connection<'_> {
             let n_bytes = came.item.n_bytes();
             n_bytes_in_a_row += n_bytes.max(MIN_FRAME_BYTES);
             // Its room in the queue is given back once it is answered.
-            let (frame, memory) = self.read(came.item).await?;
-            if let Some(closed) = self.answer(frame, memory, n_bytes, incoming).await? {
+            let closed = if let Some(coming) = self.take_in_next(&came.item) {
+                self.receive(coming, n_bytes, incoming, self.etude.clock().now()).await?
+            } else {
+                let (frame, memory) = self.read(came.item).await?;
+                self.answer(frame, memory, n_bytes, incoming).await?
+            };
+            if let Some(closed) = closed {
                 return Ok(closed);
             }
         }

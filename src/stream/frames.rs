@@ -44,6 +44,9 @@ pub enum ClientFrame {
 }
 
 impl ClientFrame {
+    /// What a frame of observed states has.
+    pub(super) const OBSERVE_FIELDS: &'static [&'static str] = &["type", "seq", "states", "observation_weights"];
+
     /// Reads a frame.
     ///
     /// # Errors
@@ -71,7 +74,7 @@ impl ClientFrame {
         match kind.string(faults)? {
             "open" => Some(Self::Open(Value::Null)),
             "observe" => {
-                root.object(&["type", "seq", "states", "observation_weights"], faults)?;
+                root.object(Self::OBSERVE_FIELDS, faults)?;
                 let states = object.required("states", faults).and_then(|place| place.array(faults).map(drop));
                 let seq = count("seq", faults);
                 states?;

@@ -156,6 +156,12 @@ impl Demonstration {
         self.values.chunks_exact(self.n_attributes)
     }
 
+    /// The observations, in order, each of shape `[n_attributes]`.
+    pub fn into_observations(self) -> impl Iterator<Item = Vec<Option<Value>>> {
+        let (n_observations, mut values) = (self.len(), self.values.into_iter());
+        (0..n_observations).map(move |_| values.by_ref().take(self.n_attributes).collect())
+    }
+
     /// The observation at `index`. Shape `[n_attributes]`.
     #[must_use]
     pub fn observation(&self, index: usize) -> &[Option<Value>] {

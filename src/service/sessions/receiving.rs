@@ -1,9 +1,13 @@
 //! How observations are received: read, made durable, and mapped as far as that takes little.
 //!
 //! ```text
-//! frame --take_in--> Coming <--take_in-- the frames that wait behind it
-//!                      | receive: one commit, and mapping while the disk is at work
-//!                      v
+//! frame, and those that wait behind it
+//!   | take_in_next: as it is, if nothing is wrong with it
+//!   | take_in: as a document, which tells what is
+//!   v
+//! Coming
+//!   | receive: one commit, and mapping while the disk is at work
+//!   v
 //! one ReceivedFrame for each
 //! ```
 
@@ -22,12 +26,39 @@ use crate::service::requests::STATES;
 use crate::service::{Etude, ServiceError};
 use crate::store::NewObservations;
 use etude_core::document::{Faults, Place};
-use etude_core::mapping::{Demonstration, Options, Policy};
+use etude_core::mapping::{Demonstration, Options, Policy, WellFormed};
 
 /// A mapping that takes longer does not begin before the disk is at work; to let that begin first takes some microseconds.
 const SOME_TIME: Duration = Duration::from_micros(50);
 
 impl Session {
+    /// Takes the states from `seq` on into what is coming, given their text: an array. Says whether it did. It does if they come next, and
+    /// nothing is wrong with them; all else is left to [`Self::take_in`], which takes several times as long.
+    pub fn take_in_next(&self, coming: &mut Coming, seq: u32, states: &str) -> bool {
+        let n_received = coming.frames.last().map_or(self.n_received, |last| last.n_received);
+        let model = self.mapper.model();
+        let most = Policy::max_observations(model).min(Demonstration::MAX_OBSERVATIONS);
+        if self.has_ended() || seq != n_received || self.perception.is_some() {
+            return false;
+        }
+        let well_formed = WellFormed {
+            max_len: most.saturating_sub(n_received as usize),
+            ..WellFormed::in_text(model.schema(), states.len())
+        };
+        let Ok(demonstration) = well_formed.read(states) else { return false };
+        let Some(items) = states.trim().strip_prefix('[').and_then(|states| states.strip_suffix(']')) else {
+            return false;
+        };
+        coming.stored.push(if coming.stored.is_empty() { '[' } else { ',' });
+        coming.stored.push_str(items);
+        let observations = demonstration.into_observations().map(|values| Observation { values, weight: None });
+        let observations: Vec<Observation> = observations.collect();
+        #[expect(clippy::cast_possible_truncation, reason = "at most MAX_OBSERVATIONS")]
+        let n_received = n_received + observations.len() as u32;
+        coming.frames.push(ComingFrame { seq, n_received, observations });
+        true
+    }
+
     /// Takes the states from `seq` on into what is coming, of which those that came before are ignored. `observation_weights` gives the
     /// weight of each of them, if not what the session was opened with.
     ///
