@@ -90,8 +90,8 @@ impl Arrivals {
         connection: &mut SqliteConnection,
         group: &[&NewObservations],
     ) -> Result<Accepted, StoreError> {
-        let unknown: HashSet<_> = group.iter().map(|new| &new.session_id).collect();
-        let unknown: Vec<_> = unknown.into_iter().filter(|id| !self.open.contains_key(*id)).collect();
+        let ids = group.iter().map(|new| &new.session_id);
+        let unknown: HashSet<_> = ids.filter(|id| !self.open.contains_key(*id)).collect();
         if !unknown.is_empty() {
             let ids = serde_json::to_string(&unknown).map_err(corrupt("sessions", "id"))?;
             self.open.extend(observations::find_open(connection, &ids).await?);
