@@ -232,6 +232,36 @@ async fn frames_are_answered_alike_one_by_one_or_one_behind_the_other_and_whethe
 }
 
 #[tokio::test]
+async fn observations_are_read_again_after_a_break_however_they_were_written() {
+    let (service, demonstration) = figure_4().await;
+    let request = json!({"model": "figure-4", "demonstration": demonstration, "lookahead": 8, "store": false});
+    let (_, expected) = service.post("/v1/policies", &request).await;
+    let (etude, _directory) = without_service(service, &CancellationToken::new()).await;
+    let (etude, stopping) = (Arc::new(etude), CancellationToken::new());
+    let mut wire = Wire::connect(&etude, &stopping);
+    wire.send(json!({"type": "open", "model": "figure-4"})).await;
+    let session = wire.receive_until("opened").await["session"].clone();
+    // The names escaped, whole numbers as floats, and blanks wherever there may be some.
+    for (seq, state) in demonstration.iter().enumerate() {
+        let states = serde_json::to_string_pretty(&json!([state])).unwrap();
+        let states = states.replace("\"x\": ", "\"\\u0078\" :\t").replace("\"gold\": 1", "\"gold\": 1.0e0");
+        let text = format!("{{ \"states\" :\n{states}, \"seq\": {seq} ,\"type\": \"observe\" }}");
+        assert!(serde_json::from_str::<Value>(&text).is_ok() && text.contains("u0078"), "{text}");
+        wire.to_server.send(Incoming::Frame { text: text.into(), memory: None }).await.unwrap();
+        wire.receive_until("received").await;
+        if seq % 5 == 3 {
+            wire = Wire::connect(&etude, &stopping);
+            wire.send(json!({"type": "resume", "session": session})).await;
+            assert_eq!(wire.receive_until("opened").await["received"], seq + 1);
+        }
+    }
+    wire.send(json!({"type": "end", "seq": demonstration.len()})).await;
+    let done = wire.receive_until("done").await;
+    assert_eq!((&done["cost"], &done["actions"]), (&expected["cost"], &expected["actions"]));
+    etude.close().await;
+}
+
+#[tokio::test]
 async fn frames_that_wait_one_behind_the_other_take_one_commit() {
     let (service, demonstration) = figure_4().await;
     let (etude, directory) = without_service(service, &CancellationToken::new()).await;
