@@ -32,7 +32,7 @@
 //! | search | chosen when | why |
 //! |---|---|---|
 //! | `search::layered` | default heuristic; extra actions pay whole distances and ending is free; at most 65,536 nodes (observations times states); expansions allowed for twice as many, and memory for all | an expansion takes less than half of the time: figure 4 takes 13 microseconds rather than 24 |
-//! | `search::banded` | default heuristic, in larger problems of this kind, of at most 256 observations, whose estimates are sums of entries of tables of at most eight attributes that change; up to 131,072 expansions, or until its memory is used up | it looks at a small part of the nodes, and an expansion takes two thirds of the time |
+//! | `search::banded` | default heuristic, in larger problems of this kind, of at most 256 observations, whose estimates are sums of entries of tables of at most eight attributes that change; up to 131,072 expansions, or until its memory is used up | it looks at a small part of the nodes, and an expansion takes half of the time |
 //! | `search::best_first` | default heuristic, in all other problems, also where states are found as it goes, and after a search in bands that has not come to its end; and no heuristic, where it has no estimates | it looks at a small part of the nodes |
 //! | `search::sweep` | one of these has expanded 65,536 nodes, or one in 16 if that is more, or memory is used up; all states are known | it takes a sixteenth of the time for a node and two bytes of memory |
 //! | `search::astar` | the paper's heuristic | that one is not consistent, and which of its mappings is found is part of what is reproduced |
@@ -49,8 +49,8 @@
 //! floats along the paths. A node's successors are generated in this order: the `skip`, then for each action the `match` and the `extra`.
 //!
 //! - `search::layered` expands each layer in the order in which its nodes were found, those within a beam first.
-//! - `search::banded` goes through the layers as beams, and then in passes of growing bounds of `f`. In each it expands a layer's nodes in the
-//!   order in which they were found since the pass before, and then those that waited.
+//! - `search::banded` goes through the layers as beams, which expand a layer's nodes in the order in which they were found, and then in passes,
+//!   one for each band of `f`, which expand those of the band that were found last first, and then those to which extra actions led from them.
 //! - `search::best_first` expands nodes in the order of `f` to a thousandth, the most recently found of equals first.
 //! - `search::sweep` leaves a node by the skip unless a match is cheaper, and by a match unless an extra action is cheaper. Whether it
 //!   replaces a best-first search depends on the problem and the budget alone.

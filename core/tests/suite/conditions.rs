@@ -261,5 +261,5 @@ fn way_points_and_an_end_that_matters_take_no_more_than_three_times_the_expansio
         }
     }
     // As before there was anything but the default.
-    assert_eq!(n_default[..2], [685, 6843]);
+    assert_eq!(n_default[..2], [685, 5622]);
 }

@@ -69,10 +69,11 @@ const ENTRY_BYTES: usize = 2 * size_of::<(StateIdx, SeenIdx)>();
 
 impl Seen {
     /// Makes room for a search in `space` of the ways of `body`, with estimates by `projected`: keeps the states that mean the same to it,
-    /// unless they are too many.
-    pub(super) fn prepare(&mut self, space: &impl Space, body: &Body, projected: &Projected<'_>) {
+    /// unless they are too many. Gives whether they were kept.
+    pub(super) fn prepare(&mut self, space: &impl Space, body: &Body, projected: &Projected<'_>) -> bool {
         let are_alike = space.keeps_numbers() && self.columns == projected.changing_columns() && self.body == *body;
-        if !are_alike || self.states.len() > MAX_KEPT_STATES || self.search == SearchNumber::MAX {
+        let are_kept = are_alike && self.states.len() <= MAX_KEPT_STATES && self.search < SearchNumber::MAX;
+        if !are_kept {
             self.numbers.clear();
             self.states.clear();
             self.bounds.clear();
@@ -85,6 +86,7 @@ impl Seen {
         }
         self.search += 1;
         (self.n_states, self.n_ways) = (0, 0);
+        are_kept
     }
 
     /// How many states this search came to.
@@ -94,8 +96,13 @@ impl Seen {
 
     /// How much memory those take that this search came to, in bytes: the same whether or not others were there before.
     pub(super) fn size_bytes(&self) -> usize {
+        self.bytes_of(self.n_states, self.n_ways)
+    }
+
+    /// How much memory so many states with so many ways out take, in bytes.
+    pub(super) fn bytes_of(&self, n_states: usize, n_ways: usize) -> usize {
         let state_bytes = STATE_BYTES + self.columns.len() * size_of::<u32>();
-        self.n_states * (state_bytes + ENTRY_BYTES) + self.n_ways * size_of::<SeenWay>()
+        n_states * (state_bytes + ENTRY_BYTES) + n_ways * size_of::<SeenWay>()
     }
 
     /// How much memory those take, in bytes, if they are all of a model, of so many transitions and attributes.
@@ -165,27 +172,41 @@ impl Seen {
         space: &mut impl Space,
         projected: &Projected<'_>,
     ) -> Range<usize> {
-        let known = self.bounds[number as usize];
-        let ways = if known.explored_by == 0 {
-            let state = self.state(number);
-            space.explore(state);
-            let begin = self.ways.len();
-            let body = std::mem::take(&mut self.body);
-            for (transition, cost) in body.ways(space, state) {
-                let to = self.number_of(transition.to, space, projected);
-                self.ways.push(SeenWay { cost, to, action: transition.action });
-            }
-            self.body = body;
-            begin..self.ways.len()
-        } else {
-            known.ways().for_each(|at| self.come_to(self.ways[at].to));
-            known.ways()
-        };
+        let ways = self.known_ways(number, space, projected);
+        ways.clone().for_each(|at| self.come_to(self.ways[at].to));
         self.n_ways += ways.len();
-        #[expect(clippy::cast_possible_truncation, reason = "models have fewer than 2^32 transitions")]
-        let [begin, end] = [ways.start, ways.end].map(|bound| bound as u32);
-        self.bounds[number as usize] = Bounds { begin, end, explored_by: self.search };
+        self.bounds[number as usize].explored_by = self.search;
         ways
+    }
+
+    /// Where the ways out of a state are; nothing is counted.
+    #[inline]
+    pub(super) fn known_ways(
+        &mut self,
+        number: SeenIdx,
+        space: &mut impl Space,
+        projected: &Projected<'_>,
+    ) -> Range<usize> {
+        let known = self.bounds[number as usize];
+        if known.explored_by == 0 { self.see_ways(number, space, projected) } else { known.ways() }
+    }
+
+    #[cold]
+    fn see_ways(&mut self, number: SeenIdx, space: &mut impl Space, projected: &Projected<'_>) -> Range<usize> {
+        let state = self.state(number);
+        space.explore(state);
+        let begin = self.ways.len();
+        let body = std::mem::take(&mut self.body);
+        for (transition, cost) in body.ways(space, state) {
+            let to = self.number_of(transition.to, space, projected);
+            self.ways.push(SeenWay { cost, to, action: transition.action });
+        }
+        self.body = body;
+        #[expect(clippy::cast_possible_truncation, reason = "models have fewer than 2^32 transitions")]
+        let [begin, end] = [begin, self.ways.len()].map(|bound| bound as u32);
+        let bounds = Bounds { begin, end, explored_by: self.search };
+        self.bounds[number as usize] = bounds;
+        bounds.ways()
     }
 
     /// The way out of a state that is there.

@@ -164,6 +164,21 @@ impl<'p> Projected<'p> {
         self.sum_chunk(self.unchanged[first..].first_chunk().copied().unwrap_or_default(), first, classes)
     }
 
+    /// Appends the estimates for all observations, and some that mean nothing, of the part with these classes; with what is the same in all
+    /// states if it `is_first`.
+    pub(in crate::mapping) fn append_part(&self, is_first: bool, classes: &[u32], parts: &mut Vec<Estimate>) {
+        let begin = parts.len();
+        if is_first {
+            parts.extend_from_slice(&self.unchanged);
+        } else {
+            parts.resize(begin + self.unchanged.len(), Estimate::default());
+        }
+        for class in classes {
+            let entries = self.table.of(*class as usize);
+            parts[begin..].iter_mut().zip(entries).for_each(|(sum, entry)| *sum += *entry);
+        }
+    }
+
     /// `sums` with the entries of these classes added, for [`CHUNK_LEN`] observations from `first` on.
     #[inline]
     pub(in crate::mapping) fn sum_chunk(

@@ -59,6 +59,11 @@ impl<T: Copy> Table<T> {
     }
 
     /// What a class costs at each observation, and as many more as there is room for.
+    pub(super) fn of(&self, class: usize) -> &[T] {
+        &self.entries[class * self.stride..][..self.stride]
+    }
+
+    /// The same, to be written.
     pub(super) fn of_mut(&mut self, class: usize) -> &mut [T] {
         &mut self.entries[class * self.stride..][..self.stride]
     }

@@ -1,62 +1,61 @@
 //! Larger problems, layer by layer, in bands of `f`.
 //!
 //! As in a search of [small problems](super::layered), the layers are gone through from the first to the last, and there is no open list to
-//! keep in order: an expansion takes two thirds of the time that it takes [`best_first`](super::best_first). But states are numbered as the search
+//! keep in order: an expansion takes half of the time that it takes [`best_first`](super::best_first). But states are numbered as the search
 //! comes to them, as there are too many for each node to have a place; and where beams miss the optimum by much, a last pass over all that is
 //! below the limit would expand several times as many nodes as it must. So
 //!
 //! 1. *beams* ([`BEAM_WIDTHS`]) come to a mapping, whose cost is the limit from then on;
-//! 2. in passes, all nodes are expanded whose `f` is below a *bound*, which grows from pass to pass ([`GROWTH`]). What is above it waits. The
-//!    first pass whose bound is not below the optimum finds it, and as much as its bound is above that, it expands more nodes than
-//!    A* does.
+//! 2. what lies between the least `f` and the limit is divided into [bands](Bands), and pass by pass, all nodes of the next band are
+//!    expanded. Those of higher bands wait. The pass of the band that the optimum is in finds it, and expands all nodes of this band: that
+//!    many more than A* does.
 //!
 //! What was expanded is not expanded again, unless it is come to more cheaply, which only actions that do not advance can lead to.
 //!
 //! Ways to a node are compared before they pay its distance, and none goes on from the last observation. So it is for problems in which
 //! all moves pay the same part of a distance, and ending is free.
 
+mod bands;
+mod expansions;
 mod layer;
 mod passed;
 mod tables;
 
-use super::layered::note;
 use super::{End, Found, Move, MoveKind, NO_ACTION, POLL_EVERY};
 use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
 use crate::mapping::heuristic::Heuristic as _;
 use crate::mapping::heuristic::projected::{Estimate, Projected};
-use crate::mapping::recurrence::Recurrence;
 use crate::mapping::{Budget, Problem, StoppedBy};
 use crate::model::{Model, Space, StateIdx};
-use layer::{Layer, Node, Stage};
-use passed::{Passed, PassedIdx, PassedWay};
+use bands::Bands;
+use expansions::Chosen;
+use layer::{Layer, Link, Stage};
+use passed::{Passed, PassedIdx};
 
 /// How many nodes of each layer the beams expand, one beam after the other.
 const BEAM_WIDTHS: [usize; 2] = [1, 8];
 
-const WIDEST_BEAM: usize = BEAM_WIDTHS[BEAM_WIDTHS.len() - 1];
-
-/// How many times as much as the one before it a pass may cost. The nodes below a bound are about its fourth power.
-const GROWTH: f64 = 1.06;
-
-/// A pass goes at least so many parts of the limit farther than the one before, so that there are not many.
-const LEAST_PART: f64 = 64.0;
+/// Most bands between the least `f` and the limit that the beams leave. In short demonstrations, there are as many as observations, as a pass
+/// may take as long as what it saves.
+const MOST_BANDS: usize = 64;
 
 /// Most layers. In each, there is a place for every state that the search comes to in any, and most states are in few layers of a long
 /// demonstration.
 const MAX_LAYERS: usize = 256;
 
 /// Most expansions between two looks at the memory,
-const LOOK_EVERY: u64 = 16;
+const LOOK_EVERY: usize = 16;
 
 /// and most ways followed. Each finds up to two nodes.
-const N_WAYS: u64 = 1 << 10;
+const N_WAYS: usize = 1 << 10;
 
 /// Buffers of a search, kept to be used again by searches of the same model.
 #[derive(Debug, Default)]
 pub(in crate::mapping) struct BandedBuffers {
     passed: Passed,
     layers: Vec<Layer>,
+    chosen: Vec<Chosen>,
 }
 
 impl BandedBuffers {
@@ -96,7 +95,7 @@ pub(in crate::mapping) fn search<S: Space>(
     buffers: &mut BandedBuffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
-    let BandedBuffers { passed, layers } = buffers;
+    let BandedBuffers { passed, layers, chosen } = buffers;
     let n_observations = problem.demonstration.len();
     passed.prepare(space, problem, projected);
     layers.iter_mut().for_each(Layer::clear);
@@ -110,15 +109,17 @@ pub(in crate::mapping) fn search<S: Space>(
         budget,
         passed,
         layers,
+        chosen,
         limit: most.next_up(),
+        bands: Bands::between(0.0, 0.0, 1),
         first: 0,
         least_f: 0.0,
         left_out_f: f64::INFINITY,
         cheapest: None,
         n_expanded: 0,
         n_generated: 0,
-        unspent_until: 0,
-        look_every: (N_WAYS / (problem.model.actions().len() as u64).max(1)).clamp(1, LOOK_EVERY),
+        n_metered: 0,
+        look_every: (N_WAYS / problem.model.actions().len().max(1)).clamp(1, LOOK_EVERY),
         last: problem.last(),
         rounding: rounding_of_sums(n_observations),
         meter: Meter::new(interrupt, POLL_EVERY),
@@ -134,8 +135,11 @@ struct Search<'s, S> {
     budget: Budget,
     passed: &'s mut Passed,
     layers: &'s mut Vec<Layer>,
+    /// Nodes of a layer that are expanded together.
+    chosen: &'s mut Vec<Chosen>,
     /// Mappings of this cost or more are of no interest.
     limit: f64,
+    bands: Bands,
     /// The most promising start.
     first: PassedIdx,
     /// No node's `f` is less.
@@ -146,10 +150,10 @@ struct Search<'s, S> {
     cheapest: Option<PassedIdx>,
     n_expanded: u64,
     n_generated: u64,
-    /// The budget lasts at least until so many nodes are expanded.
-    unspent_until: u64,
-    /// Expansions between two looks at the memory.
-    look_every: u64,
+    /// How many of both the meter knows of.
+    n_metered: u64,
+    /// Most expansions between two looks at the budget.
+    look_every: usize,
     /// The last observation.
     last: usize,
     /// Relative tolerance: mappings that are cheaper by less are not searched for.
@@ -162,8 +166,7 @@ impl<S: Space> Search<'_, S> {
         self.start();
         for width in BEAM_WIDTHS {
             for observation in 0..self.last {
-                let limit = self.limit_of_beam(observation, width);
-                let end = self.expand(observation, limit, width + width / 2)?;
+                let end = self.expand_best(observation, width)?;
                 if end != End::Done {
                     return Ok(end);
                 }
@@ -174,22 +177,21 @@ impl<S: Space> Search<'_, S> {
         if end != End::Done {
             return Ok(end);
         }
-        let mut bound = self.least_f;
-        loop {
-            let least_growth = if self.limit < f64::INFINITY { self.limit / LEAST_PART } else { 0.0 };
-            let grown = (bound * GROWTH).max(bound + least_growth);
-            bound = if grown > bound { grown.min(self.limit) } else { self.limit };
+        self.bands = Bands::between(self.least_f, self.limit, MOST_BANDS.min(self.last));
+        let n_bands = self.bands.of(self.limit, 0) + 1;
+        self.layers[..=self.last].iter_mut().for_each(|layer| layer.make_bands(n_bands));
+        let mut band = 0;
+        while band <= self.bands.of(self.limit, 0) {
             for observation in 0..self.last {
-                let end = self.expand(observation, bound.min(self.limit), usize::MAX)?;
+                let end = self.expand(observation, band)?;
                 if end != End::Done {
                     return Ok(end);
                 }
             }
             self.end();
-            if bound >= self.limit {
-                return Ok(End::Done);
-            }
+            band += 1;
         }
+        Ok(End::Done)
     }
 
     /// Takes the most promising start, whatever it costs.
@@ -204,7 +206,7 @@ impl<S: Space> Search<'_, S> {
         self.first = self.take_start(starts[best]);
         if f[best] >= self.limit {
             // It is what is left to complete if nothing is of interest.
-            self.layers[0].open.clear();
+            self.layers[0].close_fresh(|_, _| {});
         }
         self.end();
     }
@@ -241,110 +243,23 @@ impl<S: Space> Search<'_, S> {
 
     fn take_start(&mut self, state: StateIdx) -> PassedIdx {
         let state = self.passed.number_of(state, self.space, self.projected);
-        self.layers[0].make_places(self.passed.len());
-        self.layers[0].reach(state, 0.0, state, MoveKind::Start, NO_ACTION);
+        let layer = &mut self.layers[0];
+        let mut reaching = layer.reaching(self.passed.len(), 1);
+        reaching.reach(state, 0.0, Link::new(state, NO_ACTION, MoveKind::Start));
+        layer.n_fresh = reaching.n_fresh;
         state
-    }
-
-    /// What mappings must cost less than for no more than `width` of the open nodes of a layer to be expanded, equals aside.
-    fn limit_of_beam(&self, observation: usize, width: usize) -> f64 {
-        let layer = &self.layers[observation];
-        let mut least = [f64::INFINITY; WIDEST_BEAM];
-        let least = &mut least[..width];
-        for &state in &layer.open {
-            let Estimate { distance, cost_to_go } = self.passed.estimate(state, observation);
-            note(least, layer.nodes[state as usize].cost + distance + cost_to_go);
-        }
-        self.limit.min(least[width - 1].next_up())
-    }
-
-    /// Expands the open nodes of a layer that may be on a mapping of less than `bound`, and those to which they lead by actions that do
-    /// not advance, but no more than `most`. The others stay open, or wait if `most` is all.
-    fn expand(&mut self, observation: usize, bound: f64, most: usize) -> Result<End, Cancelled> {
-        let Self { space, projected, budget, passed, layers, last, meter, .. } = self;
-        let recurrence = Recurrence::default();
-        let limit = self.limit;
-        let n_layers = *last + 1;
-        let Ok([here, next]) = layers.get_disjoint_mut([observation, observation + 1]) else { return Ok(End::Done) };
-        here.make_places(passed.len());
-        next.make_places(passed.len());
-        here.open_waiting(bound, limit);
-        let (mut n_left, mut n_kept, mut at) = (most, 0, 0);
-        while let Some(&state) = here.open.get(at) {
-            at += 1;
-            let node = &mut here.nodes[state as usize];
-            let Estimate { distance, cost_to_go } = passed.estimate(state, observation);
-            // No kind pays another part.
-            let g = node.cost + distance;
-            let f = g + cost_to_go;
-            if f >= bound || n_left == 0 {
-                if f >= limit {
-                    node.stage = Stage::Closed;
-                } else if most == usize::MAX {
-                    here.wait(state, f);
-                } else {
-                    here.open[n_kept] = state;
-                    n_kept += 1;
-                }
-                continue;
-            }
-            let kind = node.kind;
-            let ways = if let Some(ways) = passed.explored(state) {
-                ways
-            } else {
-                let ways = passed.explore(state, *space, projected);
-                here.make_places(passed.len());
-                next.make_places(passed.len());
-                ways
-            };
-            match meter.spend(1 + 2 * ways.len() as u64) {
-                Signal::Continue => {}
-                Signal::Finish => return Ok(End::CutShort(StoppedBy::Deadline)),
-                Signal::Cancel => return Err(Cancelled),
-            }
-            if self.n_expanded >= self.unspent_until {
-                let n_bytes = passed.size_bytes() + passed.len() * n_layers * Layer::PLACE_BYTES;
-                if self.n_expanded >= budget.max_expansions {
-                    return Ok(End::CutShort(StoppedBy::MaxExpansions));
-                }
-                if budget.is_full(n_bytes, *space) {
-                    return Ok(End::CutShort(StoppedBy::Memory));
-                }
-                self.unspent_until = (self.n_expanded + self.look_every).min(budget.max_expansions);
-            }
-            n_left -= 1;
-            here.nodes[state as usize].stage = Stage::Closed;
-            let may_skip = recurrence.may_follow(kind, MoveKind::Skip);
-            let may_linger = recurrence.may_follow(kind, MoveKind::Extra);
-            self.n_expanded += 1;
-            self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
-            if may_skip {
-                next.reach(state, g, state, MoveKind::Skip, NO_ACTION);
-            }
-            for &PassedWay { cost, to, action } in passed.ways(ways) {
-                let cost = g + cost;
-                next.reach(to, cost, state, MoveKind::Match, action);
-                if may_linger {
-                    here.reach(to, cost, state, MoveKind::Extra, action);
-                }
-            }
-        }
-        here.open.truncate(n_kept);
-        Ok(End::Done)
     }
 
     /// Looks for a cheaper mapping among the nodes of the last layer that were reached.
     fn end(&mut self) {
-        let Layer { nodes, open, .. } = &mut self.layers[self.last];
-        for state in open.drain(..) {
-            let node = &mut nodes[state as usize];
-            node.stage = Stage::Closed;
-            let cost = node.cost + self.passed.estimate(state, self.last).distance;
-            if cost < self.limit {
-                self.limit = cost * (1.0 - self.rounding);
-                self.cheapest = Some(state);
+        let Self { passed, layers, limit, last, rounding, cheapest, .. } = self;
+        layers[*last].close_fresh(|state, cost| {
+            let cost = cost + passed.estimate(state, *last).distance;
+            if cost < *limit {
+                *limit = cost * (1.0 - *rounding);
+                *cheapest = Some(state);
             }
-        }
+        });
     }
 
     fn found(self, end: End) -> Found {
@@ -362,8 +277,8 @@ impl<S: Space> Search<'_, S> {
     /// What mappings through nodes cost at least that were not expanded.
     fn open_f(&self) -> impl Iterator<Item = f64> {
         self.layers[..=self.last].iter().enumerate().flat_map(move |(observation, layer)| {
-            let nodes = layer.found.iter().map(|state| (*state, &layer.nodes[*state as usize]));
-            let left = nodes.filter(|(_, node)| node.stage != Stage::Closed);
+            let nodes = layer.found().map(|state| (state, &layer.nodes[state as usize]));
+            let left = nodes.filter(|(_, node)| !node.link.is_at(Stage::Closed));
             left.map(move |(state, node)| {
                 let Estimate { distance, cost_to_go } = self.passed.estimate(state, observation);
                 node.cost + distance + cost_to_go
@@ -375,7 +290,8 @@ impl<S: Space> Search<'_, S> {
     fn path(&self, mut observation: usize, mut state: PassedIdx) -> Vec<Move> {
         let mut moves = Vec::with_capacity(2 * observation + 1);
         loop {
-            let Node { parent, action, kind, .. } = self.layers[observation].nodes[state as usize];
+            let link = self.layers[observation].nodes[state as usize].link;
+            let (action, kind) = (link.action(), link.kind());
             let action = (action != NO_ACTION).then_some(action);
             #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
             moves.push(Move { kind, action, observation: observation as u32, state: self.passed.state(state) });
@@ -384,7 +300,7 @@ impl<S: Space> Search<'_, S> {
                 MoveKind::Extra => {}
                 MoveKind::Match | MoveKind::Skip => observation -= 1,
             }
-            state = parent;
+            state = link.parent();
         }
         moves.reverse();
         moves

@@ -25,15 +25,21 @@ pub(super) struct PassedWay {
 pub(super) struct Passed {
     /// Kept for later searches.
     seen: Seen,
-    states: Vec<SeenIdx>,
+    states: Vec<PassedState>,
     /// By what was seen, the search's own number; [`UNNUMBERED`] where it was not in this search.
     numbers: Vec<PassedIdx>,
-    /// Where the ways out are; [`UNEXPLORED`] if they are not known yet.
-    bounds: Vec<[u32; 2]>,
     ways: Vec<PassedWay>,
     tables: JoinedTables,
-    /// Where the entries of each state are in the tables.
-    rows: Vec<[u32; 2]>,
+}
+
+/// A state that this search has come to.
+#[derive(Clone, Copy, Debug)]
+struct PassedState {
+    seen: SeenIdx,
+    /// Where the entries are in the tables.
+    rows: [u32; 2],
+    /// Where the ways out are; [`UNEXPLORED`] if they are not known yet.
+    ways: [u32; 2],
 }
 
 const UNNUMBERED: PassedIdx = PassedIdx::MAX;
@@ -41,24 +47,22 @@ const UNNUMBERED: PassedIdx = PassedIdx::MAX;
 const UNEXPLORED: [u32; 2] = [u32::MAX, u32::MAX];
 
 /// What a state takes, besides its ways and entries of tables.
-const STATE_BYTES: usize = size_of::<SeenIdx>() + size_of::<PassedIdx>() + 2 * size_of::<[u32; 2]>();
+const STATE_BYTES: usize = size_of::<PassedState>() + size_of::<PassedIdx>();
 
 impl Passed {
     /// Forgets them, for a search of `problem` in `space` with these estimates.
     pub(super) fn prepare(&mut self, space: &impl Space, problem: &Problem<'_>, projected: &Projected<'_>) {
         for state in self.states.drain(..) {
-            self.numbers[state as usize] = UNNUMBERED;
+            self.numbers[state.seen as usize] = UNNUMBERED;
         }
-        self.seen.prepare(space, &problem.body, projected);
-        self.tables.prepare(problem, projected);
-        self.bounds.clear();
+        let are_kept = self.seen.prepare(space, &problem.body, projected);
+        self.tables.prepare(problem, projected, are_kept);
         self.ways.clear();
-        self.rows.clear();
     }
 
     /// How much memory they take, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
-        self.seen.size_bytes()
+        self.seen.bytes_of(self.states.len(), self.ways.len())
             + self.states.len() * STATE_BYTES
             + size_of_val(self.ways.as_slice())
             + self.tables.size_bytes()
@@ -102,63 +106,83 @@ impl Passed {
             #[expect(clippy::cast_possible_truncation, reason = "no more than there are states")]
             let next = self.states.len() as PassedIdx;
             *number = next;
-            self.states.push(seen);
-            self.bounds.push(UNEXPLORED);
-            self.rows.push(self.tables.rows_of(self.seen.classes(seen), projected));
+            let rows = self.tables.rows_of(seen, &self.seen, projected);
+            self.states.push(PassedState { seen, rows, ways: UNEXPLORED });
         }
         *number
     }
 
     /// The model's number of a state.
     pub(super) fn state(&self, number: PassedIdx) -> StateIdx {
-        self.seen.state(self.states[number as usize])
+        self.seen.state(self.states[number as usize].seen)
     }
 
-    /// Where the ways out of a state are, if it was explored.
+    /// Where the ways out of a state are.
     #[inline]
-    pub(super) fn explored(&self, number: PassedIdx) -> Option<Range<usize>> {
-        let bounds @ [begin, end] = self.bounds[number as usize];
-        (bounds != UNEXPLORED).then_some(begin as usize..end as usize)
-    }
-
-    /// Sees where the actions lead from a state.
-    #[cold]
     pub(super) fn explore(
         &mut self,
         number: PassedIdx,
         space: &mut impl Space,
         projected: &Projected<'_>,
-    ) -> Range<usize> {
-        let seen = self.states[number as usize];
-        let ways = self.seen.explore(seen, space, projected);
+    ) -> Range<u32> {
+        let ways @ [begin, end] = self.states[number as usize].ways;
+        if ways == UNEXPLORED { self.see_ways(number, space, projected) } else { begin..end }
+    }
+
+    /// Sees where the actions lead from a state.
+    #[cold]
+    fn see_ways(&mut self, number: PassedIdx, space: &mut impl Space, projected: &Projected<'_>) -> Range<u32> {
+        let seen = self.states[number as usize].seen;
         let begin = self.ways.len();
-        for at in ways {
+        for at in self.seen.known_ways(seen, space, projected) {
             let way = self.seen.way(at);
             let to = self.number_of_seen(way.to, projected);
             self.ways.push(PassedWay { cost: way.cost, to, action: way.action });
         }
         #[expect(clippy::cast_possible_truncation, reason = "models have fewer than 2^32 transitions")]
-        {
-            self.bounds[number as usize] = [begin as u32, self.ways.len() as u32];
-        }
-        begin..self.ways.len()
+        let ways @ [begin, end] = [begin as u32, self.ways.len() as u32];
+        self.states[number as usize].ways = ways;
+        begin..end
     }
 
     /// Ways out of a state.
     #[inline]
-    pub(super) fn ways(&self, range: Range<usize>) -> &[PassedWay] {
-        &self.ways[range]
+    pub(super) fn ways(&self, range: &Range<u32>) -> &[PassedWay] {
+        &self.ways[range.start as usize..range.end as usize]
     }
 
     /// The estimate at a node.
-    #[inline]
     pub(super) fn estimate(&self, number: PassedIdx, observation: usize) -> Estimate {
-        self.tables.estimate(self.rows[number as usize], observation)
+        self.estimates(observation).of(number)
+    }
+
+    /// The estimates at the nodes of an observation.
+    #[inline]
+    pub(super) fn estimates(&self, observation: usize) -> Estimates<'_> {
+        Estimates { states: &self.states, entries: self.tables.entries_from(observation) }
     }
 
     /// How many there are.
     #[inline]
     pub(super) fn len(&self) -> usize {
         self.states.len()
+    }
+}
+
+/// The estimates at the nodes of an observation.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Estimates<'p> {
+    states: &'p [PassedState],
+    entries: &'p [Estimate],
+}
+
+impl Estimates<'_> {
+    /// At the node of a state.
+    #[inline]
+    pub(super) fn of(self, number: PassedIdx) -> Estimate {
+        let [first, second] = self.states[number as usize].rows;
+        let mut sum = self.entries[first as usize];
+        sum += self.entries[second as usize];
+        sum
     }
 }
