@@ -1,11 +1,13 @@
 //! The distance between observations and states, looked up rather than computed.
 
-use rustc_hash::FxHashMap;
+mod terms;
 
 use super::{Conditions, Demonstration};
 use crate::attribute::{Attribute, MAX_COST, Schema, Value, Weights};
 use crate::interrupt::{Meter, Signal};
 use crate::model::{Model, StateIdx, States};
+use terms::AttributeTerms;
+pub(in crate::mapping) use terms::Terms;
 
 /// Weighted terms of the distance for one demonstration, `e_i D(o_i, s)`. Attributes without weight, and those that were never observed,
 /// take no part.
@@ -14,24 +16,17 @@ use crate::model::{Model, StateIdx, States};
 /// terms are computed once for each of them.
 #[derive(Debug)]
 pub(crate) struct Distances<'m> {
-    /// In schema order, in which distances are summed.
-    active: Vec<ActiveAttribute<'m>>,
+    schema: &'m Schema,
+    states: &'m States,
+    terms: Terms,
 }
 
 /// An attribute that takes part in the distance.
-#[derive(Debug)]
-pub(crate) struct ActiveAttribute<'m> {
-    position: usize,
-    attribute: &'m Attribute,
-    weight: f64,
-    /// By observation: the number of the value that it saw, from 1 on; 0 if it did not see the attribute, or has no weight. Shape
-    /// `[n_observations]`.
-    rows: Vec<u32>,
-    domain: &'m [Value],
-    /// Terms by number and domain index. Shape `[1 + n_observed, domain.len()]`, the first row zero; empty if it would be too large.
-    table: Vec<f64>,
-    /// The observed values and their observations' weights, in the order of their numbers, if there is no table.
-    untabled: Vec<(Value, f64)>,
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ActiveAttribute<'d> {
+    attribute: &'d Attribute,
+    domain: &'d [Value],
+    terms: &'d AttributeTerms,
 }
 
 /// A `term` of a distance to an observation of this weight. Finite: at most [`MAX_COST`].
@@ -39,9 +34,6 @@ pub(crate) struct ActiveAttribute<'m> {
 fn weighted_term(weight: f64, term: f64) -> f64 {
     (weight * term).min(MAX_COST)
 }
-
-/// Most entries of all tables together: 2 MB, which take a millisecond to fill. Values of larger domains are compared one by one.
-const MAX_TABLE_ENTRIES: usize = 1 << 18;
 
 impl<'m> Distances<'m> {
     pub(crate) fn new(
@@ -51,40 +43,24 @@ impl<'m> Distances<'m> {
         weights: &Weights,
         conditions: &Conditions,
     ) -> Self {
-        let mut n_entries_left = MAX_TABLE_ENTRIES;
-        let weighted = schema.attributes().iter().zip(weights.as_slice()).enumerate();
-        let mut observed = DistinctValues::default();
-        let mut active = Vec::new();
-        for (position, (attribute, weight)) in weighted.filter(|(_, (_, weight))| **weight > 0.0) {
-            let domain = states.domain(position);
-            let rows = observed.number(demonstration, conditions, position);
-            let values = &observed.values;
-            if values.is_empty() {
-                continue;
-            }
-            let n_entries = (1 + values.len()).saturating_mul(domain.len());
-            let (mut table, mut untabled) = (Vec::new(), Vec::new());
-            if n_entries <= n_entries_left {
-                n_entries_left -= n_entries;
-                table.reserve_exact(n_entries);
-                table.resize(domain.len(), 0.0);
-                table.extend(values.iter().flat_map(|(value, observation_weight)| {
-                    domain.iter().map(|own| weighted_term(*observation_weight, attribute.term(*weight, value, own)))
-                }));
-            } else {
-                untabled
-                    .extend(values.iter().map(|(value, observation_weight)| ((*value).clone(), *observation_weight)));
-            }
-            active.push(ActiveAttribute { position, attribute, weight: *weight, rows, domain, table, untabled });
-        }
-        Self { active }
+        Self { schema, states, terms: Terms::of(schema, states, demonstration, weights, conditions) }
+    }
+
+    /// Of terms that belong to `model`.
+    pub(crate) fn of_terms(model: &'m Model, terms: Terms) -> Self {
+        Self { schema: model.schema(), states: model.states(), terms }
+    }
+
+    /// The terms alone.
+    pub(crate) fn into_terms(self) -> Terms {
+        self.terms
     }
 
     /// `e_i D(o_i, s)`, given the row of `s`. Finite, at least 0.
     #[inline]
     pub(crate) fn distance(&self, observation: usize, row: &[u32]) -> f64 {
         // Not `sum`, of which nothing is -0.
-        self.active.iter().fold(0.0, |sum, active| sum + active.term(observation, row[active.position]))
+        self.active().fold(0.0, |sum, active| sum + active.term(observation, row[active.position()]))
     }
 
     /// `e_i D(o_i, s)` of all states, in the order of their numbers.
@@ -101,11 +77,11 @@ impl<'m> Distances<'m> {
     ) -> Result<(), Signal> {
         const CHUNK_LEN: usize = 1 << 10;
         for (first, distances) in (0..states.len()).step_by(CHUNK_LEN).zip(distances.chunks_mut(CHUNK_LEN)) {
-            meter.go_on((distances.len() * self.active.len()) as u64)?;
+            meter.go_on((distances.len() * self.terms.attributes.len()) as u64)?;
             distances.fill(0.0);
-            for active in &self.active {
+            for active in self.active() {
                 for (state, distance) in (first..).zip(&mut *distances) {
-                    *distance += active.term(observation, states.row(state)[active.position]);
+                    *distance += active.term(observation, states.row(state)[active.position()]);
                 }
             }
         }
@@ -114,7 +90,7 @@ impl<'m> Distances<'m> {
 
     /// The terms of `e_i D(o_i, s)`, given the row of `s`, in schema order; attributes that take no part are left out.
     pub(crate) fn terms(&self, observation: usize, row: &[u32]) -> impl Iterator<Item = (usize, f64)> {
-        self.active.iter().map(move |active| (active.position, active.term(observation, row[active.position])))
+        self.active().map(move |active| (active.position(), active.term(observation, row[active.position()])))
     }
 
     /// What the attribute at `position` adds to the distance for the value at `value` of its domain; 0 if it takes
@@ -123,9 +99,25 @@ impl<'m> Distances<'m> {
         self.of(position).map_or(0.0, |active| active.term(observation, value))
     }
 
+    /// The attributes that take part, in schema order.
+    #[inline]
+    pub(crate) fn active(&self) -> impl Iterator<Item = ActiveAttribute<'_>> {
+        let active = self.terms.attributes.iter().filter(|terms| terms.n_seen > 0);
+        active.map(|terms| ActiveAttribute {
+            attribute: &self.schema.attributes()[terms.position],
+            domain: self.states.domain(terms.position),
+            terms,
+        })
+    }
+
+    /// Their positions.
+    pub(crate) fn positions(&self) -> impl Iterator<Item = usize> {
+        self.active().map(ActiveAttribute::position)
+    }
+
     /// The attribute at `position`, if it takes part.
-    pub(crate) fn of(&self, position: usize) -> Option<&ActiveAttribute<'m>> {
-        self.active.iter().find(|active| active.position == position)
+    pub(crate) fn of(&self, position: usize) -> Option<ActiveAttribute<'_>> {
+        self.active().find(|active| active.position() == position)
     }
 
     /// Whether the attribute at `position` takes part.
@@ -134,17 +126,30 @@ impl<'m> Distances<'m> {
     }
 }
 
-impl ActiveAttribute<'_> {
+impl<'d> ActiveAttribute<'d> {
+    #[inline]
+    fn position(self) -> usize {
+        self.terms.position
+    }
+
+    /// What it adds for each value of its domain, in order; `None` if there is no table.
+    #[inline]
+    pub(crate) fn row(self, observation: usize) -> Option<&'d [f64]> {
+        let first = self.terms.rows[observation] as usize * self.terms.n_values;
+        self.terms.table.get(first..first + self.terms.n_values)
+    }
+
     /// What it adds for the value at `value` of its domain.
     #[inline]
-    pub(crate) fn term(&self, observation: usize, value: u32) -> f64 {
-        let (row, value) = (self.rows[observation] as usize, value as usize);
-        match self.table.get(row * self.domain.len() + value) {
+    pub(crate) fn term(self, observation: usize, value: u32) -> f64 {
+        let Self { attribute, domain, terms } = self;
+        let (row, value) = (terms.rows[observation] as usize, value as usize);
+        match terms.table.get(row * terms.n_values + value) {
             Some(term) => *term,
             None if row == 0 => 0.0,
             None => {
-                let (seen, observation_weight) = &self.untabled[row - 1];
-                weighted_term(*observation_weight, self.attribute.term(self.weight, seen, &self.domain[value]))
+                let (seen, observation_weight) = &terms.untabled[row - 1];
+                weighted_term(*observation_weight, attribute.term(terms.weight, seen, &domain[value]))
             }
         }
     }
@@ -314,79 +319,5 @@ impl ObservedAttribute {
             self.observation_weight,
             model.schema().attributes()[self.position].term(self.weight, &self.value, own),
         )
-    }
-}
-
-/// The distinct values that a demonstration shows of an attribute, each with the weight of its observation.
-#[derive(Default)]
-struct DistinctValues<'d> {
-    /// In the order in which they come.
-    values: Vec<(&'d Value, f64)>,
-    /// Their numbers, from 1 on, once they are more than [`FEW`](Self::FEW); of weights, the bits.
-    numbers: FxHashMap<(&'d Value, u64), u32>,
-}
-
-impl<'d> DistinctValues<'d> {
-    /// So many values are compared one by one in less time than hashing takes.
-    const FEW: usize = 16;
-
-    /// Forgets the values, and numbers those of the attribute at `position`. Gives the number of each observation's, or 0 if it
-    /// did not see the attribute or has no weight.
-    fn number(&mut self, demonstration: &'d Demonstration, conditions: &Conditions, position: usize) -> Vec<u32> {
-        self.values.clear();
-        self.numbers.clear();
-        let seen = demonstration.iter().enumerate().map(|(i, observation)| {
-            let observation_weight = conditions.observation_weight(i);
-            observation[position].as_ref().filter(|_| observation_weight > 0.0).map(|value| (value, observation_weight))
-        });
-        seen.map(|value| value.map_or(0, |value| self.number_of(value))).collect()
-    }
-
-    #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
-    fn number_of(&mut self, value: (&'d Value, f64)) -> u32 {
-        let key = |(value, observation_weight): (&'d Value, f64)| (value, observation_weight.to_bits());
-        let known = if self.values.len() <= Self::FEW {
-            self.values.iter().position(|known| *known == value).map(|n| n as u32 + 1)
-        } else {
-            self.numbers.get(&key(value)).copied()
-        };
-        known.unwrap_or_else(|| {
-            self.values.push(value);
-            if self.values.len() > Self::FEW {
-                let first = self.numbers.len();
-                self.numbers.extend(self.values[first..].iter().copied().map(key).zip(first as u32 + 1..));
-            }
-            self.values.len() as u32
-        })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn observed_values_are_numbered_as_they_come_be_they_few_or_many() {
-        let few = i64::try_from(DistinctValues::FEW).unwrap();
-        let demonstrations = [3, few, few + 1, 1, 40].map(|n_distinct| {
-            let values = (0..100).map(|i| (i % 9 != 8).then_some(Value::Integer(i * 7 % n_distinct)));
-            Demonstration::of(values.map(|value| vec![None, value])).unwrap()
-        });
-        let mut observed = DistinctValues::default();
-        for demonstration in &demonstrations {
-            let rows = observed.number(demonstration, &Conditions::default(), 1);
-            let mut known = Vec::new();
-            for (observation, row) in demonstration.iter().zip(rows) {
-                let Some(value) = &observation[1] else {
-                    assert_eq!(row, 0);
-                    continue;
-                };
-                if !known.contains(&(value, 1.0)) {
-                    known.push((value, 1.0));
-                }
-                assert_eq!(known[row as usize - 1], (value, 1.0));
-            }
-            assert_eq!(observed.values, known);
-        }
     }
 }

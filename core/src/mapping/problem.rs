@@ -1,7 +1,7 @@
 //! What a search is asked.
 
 use super::conditions::Body;
-use super::distances::{Distances, EndDistances, plain_terms};
+use super::distances::{Distances, EndDistances, Terms, plain_terms};
 use super::recurrence::Recurrence;
 use super::{Conditions, Demonstration, Move};
 use crate::attribute::{ByAttribute, Weights};
@@ -31,7 +31,32 @@ struct Collapsed {
     numbers: Vec<u32>,
 }
 
+/// What a problem is made of, besides the model: kept between problems that have much in common.
+#[derive(Debug)]
+pub(super) struct Parts {
+    pub(super) demonstration: Demonstration,
+    pub(super) weights: Weights,
+    /// Without starts, which are as below, and with free ends.
+    pub(super) conditions: Conditions,
+    pub(super) starts: Starts,
+    pub(super) terms: Terms,
+    pub(super) body: Body,
+}
+
 impl<'m> Problem<'m> {
+    /// A problem of parts that belong together, and to `model`.
+    pub(super) fn of_parts(model: &'m Model, parts: Parts) -> Self {
+        let Parts { demonstration, weights, conditions, starts, terms, body } = parts;
+        let distances = Distances::of_terms(model, terms);
+        Self { model, demonstration, weights, conditions, starts, distances, end: None, body, collapsed: None }
+    }
+
+    /// The parts of a problem that was made of them.
+    pub(super) fn into_parts(self) -> Parts {
+        let Self { demonstration, weights, conditions, starts, distances, body, .. } = self;
+        Parts { demonstration, weights, conditions, starts, terms: distances.into_terms(), body }
+    }
+
     /// A problem. Of a demonstration that is to be [collapsed](Conditions::collapse), only the observations that are kept are followed; they
     /// are counted anew here, and in policies as they were.
     ///
@@ -166,6 +191,19 @@ impl Starts {
             states.dedup();
         }
         Self { states, rows }
+    }
+
+    /// From now on, there is only this one.
+    pub(super) fn go_to(&mut self, origin: &Origin) {
+        self.states.clear();
+        self.rows.clear();
+        match origin {
+            Origin::State(state) => self.states.push(*state),
+            Origin::Row(row) => {
+                self.states.push(0);
+                self.rows.push(row.0.clone());
+            }
+        }
     }
 
     /// Each start state with its row.

@@ -16,7 +16,7 @@ use super::completion::{Allowance, Extras, complete};
 use super::cost::{Cost, ROUNDING, SLACK, action_costs, cost_of};
 use super::heuristic::abstraction::Abstractions;
 use super::heuristic::paper::Paper;
-use super::heuristic::projected::{Projected, TableRoom};
+use super::heuristic::projected::{LayerTables, Projected, TableRoom};
 use super::heuristic::projection::Projections;
 use super::heuristic::{Guide, Heuristic, HeuristicName};
 use super::online::SharedWaysIn;
@@ -26,6 +26,7 @@ use crate::interrupt::{Cancelled, Interrupt, Interrupted, Uninterrupted};
 use crate::model::{Model, Space, StateIdx, States};
 use buffers::{BufferPool, Buffers};
 use by_default::Patience;
+pub(in crate::mapping) use online::FirstMoves;
 
 /// How a mapping is searched for.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -233,10 +234,15 @@ impl Mapper {
         // Sums in another order may be a little larger; a little room costs nothing.
         let most_f = upper_bound.map_or(f64::INFINITY, |bound| bound * (1.0 + SLACK));
         match settings.heuristic {
-            HeuristicName::Default => match self.layered(space, choices, problem, settings, most_f, interrupt)? {
-                Some(mapping) => Ok(mapping),
-                None => self.best_first(space, choices, problem, settings, most_f, interrupt),
-            },
+            HeuristicName::Default => {
+                let conclude = |found, estimates: &LayerTables, interrupt: &mut dyn Interrupt| {
+                    conclude(problem, space, estimates, found, interrupt)
+                };
+                match self.layered(choices, problem, settings, most_f, interrupt, conclude)? {
+                    Some(mapping) => Ok(mapping),
+                    None => self.best_first(space, choices, problem, settings, most_f, interrupt),
+                }
+            }
             HeuristicName::None => {
                 let blind = Projected::blind(problem);
                 let found = self.search(space, problem, Guide::from(&blind), budget, most_f, interrupt)?;
@@ -259,29 +265,33 @@ impl Mapper {
         }
     }
 
-    /// What a search layer by layer finds; `None` if the problem is too large for it, or its budget too small.
-    fn layered<S: Space>(
+    /// What `conclude` makes of what a search layer by layer finds, given its estimates; `None` if the problem is too large for it, or its budget
+    /// too small.
+    fn layered<T>(
         &self,
-        space: &mut S,
         choices: Choices,
         problem: &Problem<'_>,
-        settings: Settings,
+        Settings { budget, .. }: Settings,
         most_f: f64,
         interrupt: &mut dyn Interrupt,
-    ) -> Result<Option<Mapping>, Cancelled> {
-        let budget = settings.budget;
-        let n_nodes =
-            space.n_states().map_or(usize::MAX, |n_states| n_states.saturating_mul(problem.demonstration.len()));
+        conclude: impl FnOnce(Found, &LayerTables, &mut dyn Interrupt) -> Result<T, Cancelled>,
+    ) -> Result<Option<T>, Cancelled> {
+        if self.model.is_lazy() {
+            return Ok(None);
+        }
+        let n_nodes = self.model.graph().n_states().saturating_mul(problem.demonstration.len());
         let chosen_by = Budget { max_bytes: choices.max_bytes, ..budget };
         if n_nodes > self.patience.max_layered_nodes || !layered::is_within(chosen_by, problem, n_nodes) {
             return Ok(None);
         }
-        let solved = self.solve(problem, TableRoom::within(choices.max_bytes), interrupt)?;
-        let Some(projected) = solved.filter(Projected::are_all_in_columns) else { return Ok(None) };
-        let found = self.buffers.lend(budget.max_bytes, |Buffers { layered, .. }| {
-            layered::search(problem, &projected, budget, most_f, layered, interrupt)
-        })?;
-        conclude(problem, space, &projected, within(most_f, found, problem), interrupt).map(Some)
+        let room = TableRoom::within(choices.max_bytes);
+        self.buffers.lend(budget.max_bytes, |Buffers { layered, .. }| {
+            if !layered.solve(&self.projections, problem, room, interrupt)? {
+                return Ok(None);
+            }
+            let found = layered::search(problem, budget, most_f, layered, interrupt)?;
+            conclude(within(most_f, found, problem), &layered.estimates, interrupt).map(Some)
+        })
     }
 
     /// The tables of [`Projected::solve`].

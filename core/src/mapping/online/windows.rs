@@ -7,40 +7,47 @@
 //! asked, as that would take the ways to all states.
 
 use std::num::NonZeroU32;
+use std::slice;
 use std::sync::Arc;
 
 use super::decided::{Decided, Halt, Rest, RootNode, Work};
 use crate::attribute::{Value, Weights};
 use crate::interrupt::{Cancelled, Interrupt, Signal};
-use crate::mapping::{
-    Budget, Conditions, Demonstration, Mapper, Mapping, Move, MoveKind, Problem, Settings, Status, StoppedBy,
-};
+use crate::mapping::distances::Terms;
+use crate::mapping::mapper::FirstMoves;
+use crate::mapping::problem::{Parts, Starts};
+use crate::mapping::{Budget, Conditions, Demonstration, Mapper, Move, MoveKind, Problem, Settings, StoppedBy};
 use crate::model::{Origin, OriginRow};
 
 /// The observations ahead.
 #[derive(Debug)]
 pub(super) struct Windows {
     mapper: Arc<Mapper>,
-    weights: Weights,
     /// Those of the whole, without weights of observations.
     conditions: Conditions,
-    /// From the root's on; `None` if nothing was observed.
-    observations: Option<Demonstration>,
-    /// Their weights. Shape `[n_observations]`.
-    observation_weights: Vec<f64>,
-    /// The number of the first of them.
+    weights: Weights,
+    /// The problem of the window from the root's observation to the newest, with free ends; `None` if nothing was observed. From one window to the
+    /// next, nearly all of it stays.
+    parts: Option<Parts>,
+    /// Whether its terms are kept, and not computed anew for each window.
+    keeps_terms: bool,
+    /// The number of its first observation.
     first: u32,
     /// The last committed state; `None` before the start.
     root: Option<Origin>,
     pub(super) work: Work,
 }
 
+/// Most terms of an observation that are kept: 1 KB. Where there are more, to search the window takes longer than to compute them.
+const MAX_KEPT_TERMS: usize = 1 << 7;
+
 impl Windows {
     /// Nothing was observed yet.
     pub(super) fn new(mapper: Arc<Mapper>, weights: Weights, conditions: &Conditions) -> Self {
         let conditions = Conditions { observation_weights: Vec::new(), collapse: None, ..conditions.clone() };
-        let (observation_weights, work) = (Vec::new(), Work::default());
-        Self { mapper, weights, conditions, observations: None, observation_weights, first: 0, root: None, work }
+        let keeps_terms = Terms::n_each(mapper.model().states(), &weights) <= MAX_KEPT_TERMS;
+        let work = Work::default();
+        Self { mapper, conditions, weights, parts: None, keeps_terms, first: 0, root: None, work }
     }
 
     /// Goes on from `root`, when nothing was observed yet.
@@ -52,30 +59,45 @@ impl Windows {
 
     /// Keeps an observation.
     pub(super) fn observe(&mut self, observation: &[Option<Value>], observation_weight: f64) {
-        match &mut self.observations {
-            Some(observations) => observations.push(observation),
-            none => *none = Demonstration::of([observation.to_vec()]),
+        let model = self.mapper.model();
+        if let Some(parts) = &mut self.parts {
+            parts.demonstration.push(observation);
+        } else {
+            let root = self.root.as_ref().map(slice::from_ref);
+            self.parts = Demonstration::of([observation.to_vec()]).map(|demonstration| Parts {
+                demonstration,
+                weights: self.weights.clone(),
+                conditions: Conditions { starts: None, end_weight: 0.0, ..self.conditions.clone() },
+                starts: Starts::of(model, root.or(self.conditions.starts.as_deref())),
+                terms: Terms::none(model.states(), &self.weights),
+                body: self.conditions.body(model),
+            });
         }
-        self.observation_weights.push(observation_weight);
+        if let Some(parts) = &mut self.parts {
+            parts.conditions.observation_weights.push(observation_weight);
+            if self.keeps_terms {
+                parts.terms.push(model, observation, observation_weight);
+            }
+        }
     }
 
     /// The start, if there is a single one, when the first observation has come: whatever else does, a mapping begins there.
     pub(super) fn sole_start(&mut self) -> Option<Decided> {
-        if self.root.is_some() || self.observation_weights.len() != 1 {
+        if self.root.is_some() || self.n_observations() != 1 {
             return None;
         }
-        let start = {
-            let problem = self.problem_of(&self.mapper, self.observations.clone()?, false);
+        let first = self.first;
+        let start = self.lend(|_, problem| {
             let mut starts = problem.starts.iter(problem.model);
             let (state, row) = starts.next().filter(|_| starts.next().is_none())?;
-            Decided {
-                step: Move { kind: MoveKind::Start, action: None, observation: self.first, state },
+            Some(Decided {
+                step: Move { kind: MoveKind::Start, action: None, observation: first, state },
                 action_cost: 0.0,
                 terms: problem.distances.terms(0, row).collect(),
                 row: problem.model.is_lazy().then(|| OriginRow(row.to_vec())),
-            }
-        };
-        self.root = Some(start.origin());
+            })
+        })??;
+        self.pass(&start);
         Some(start)
     }
 
@@ -86,65 +108,84 @@ impl Windows {
             Signal::Finish => return Err(Halt::OutOf(StoppedBy::Deadline)),
             Signal::Cancel => return Err(Halt::Cancelled),
         }
-        let Some(observations) = self.observations.take() else { return Ok(Vec::new()) };
-        let mapper = Arc::clone(&self.mapper);
-        // Nearly all observations stay, and the problem is made once for each: they are lent to it.
-        let problem = self.problem_of(&mapper, observations, false);
-        let found = self.first_steps(&problem, budget, interrupt);
-        self.observations = Some(problem.demonstration);
-        let (steps, work) = found?;
-        if let (Some(last), Some(observations)) = (steps.last(), &mut self.observations) {
-            self.root = Some(last.origin());
-            let n_passed = (last.step.observation - self.first) as usize;
-            observations.drop_first(n_passed);
-            self.observation_weights.drain(..n_passed);
-            self.first = last.step.observation;
+        let budget = self.budget_left(budget);
+        let (first, has_root) = (self.first, self.root.is_some());
+        let advances = |step: &Move| if has_root { step.observation > 0 } else { step.kind == MoveKind::Start };
+        let n_first = |moves: &[Move]| moves.iter().position(advances).map_or(moves.len(), |at| at + 1);
+        let found = self.lend(|mapper, problem| -> Result<_, Halt> {
+            let way = mapper.first_moves(problem, n_first, budget, interrupt)?;
+            let steps: Vec<_> = way.steps(problem, first, usize::from(has_root)).collect();
+            Ok((steps, Work { n_expanded: way.n_expanded, n_generated: way.n_generated }))
+        });
+        let Some((steps, work)) = found.transpose()? else { return Ok(Vec::new()) };
+        if let Some(last) = steps.last() {
+            self.pass(last);
         }
         self.work += work;
         Ok(steps)
     }
 
-    /// The first steps of the cheapest way of the window, which is `problem`, and the work of finding it.
-    fn first_steps(
-        &self,
-        problem: &Problem<'_>,
-        budget: Budget,
-        interrupt: &mut dyn Interrupt,
-    ) -> Result<(Vec<Decided>, Work), Halt> {
-        let mapping = self.mapper.map_window(problem, self.budget_left(budget), interrupt)?;
-        if mapping.status != Status::Optimal {
-            return Err(Halt::OutOf(mapping.stopped_by.unwrap_or(StoppedBy::Memory)));
+    /// Does `work` with the problem of the window; `None` if nothing was observed.
+    fn lend<T>(&mut self, work: impl FnOnce(&Mapper, &Problem<'_>) -> T) -> Option<T> {
+        let mut parts = self.parts.take()?;
+        let model = self.mapper.model();
+        if !self.keeps_terms {
+            let (schema, states) = (model.schema(), model.states());
+            parts.terms = Terms::of(schema, states, &parts.demonstration, &parts.weights, &parts.conditions);
         }
-        let mut steps: Vec<_> = self.steps(problem, &mapping).collect();
-        let advances = |step: &Decided| match self.root {
-            Some(_) => step.step.observation > self.first,
-            None => step.step.kind == MoveKind::Start,
-        };
-        let n_decided = steps.iter().position(advances).map_or(steps.len(), |at| at + 1);
-        steps.truncate(n_decided);
-        Ok((steps, Work { n_expanded: mapping.n_expanded, n_generated: mapping.n_generated }))
+        let problem = Problem::of_parts(model, parts);
+        let done = work(&self.mapper, &problem);
+        self.parts = Some(problem.into_parts());
+        Some(done)
+    }
+
+    /// Goes on from the node to which this step leads.
+    fn pass(&mut self, step: &Decided) {
+        let root = step.origin();
+        let n_passed = (step.step.observation - self.first) as usize;
+        self.first = step.step.observation;
+        if let Some(parts) = &mut self.parts {
+            parts.starts.go_to(&root);
+            parts.demonstration.drop_first(n_passed);
+            parts.conditions.observation_weights.drain(..n_passed);
+            if self.keeps_terms {
+                parts.terms.drop_first(n_passed);
+            }
+        }
+        self.root = Some(root);
+    }
+
+    fn n_observations(&self) -> usize {
+        self.parts.as_ref().map_or(0, |parts| parts.demonstration.len())
     }
 
     /// The cheapest way to the end.
     pub(super) fn rest(&self, budget: Budget, interrupt: &mut dyn Interrupt) -> Result<Option<Rest>, Cancelled> {
-        let Some(observations) = self.observations.clone() else { return Ok(None) };
-        let problem = self.problem_of(&self.mapper, observations, true);
+        let Some(parts) = &self.parts else { return Ok(None) };
+        let conditions = Conditions {
+            starts: self.root.as_ref().map(|root| vec![root.clone()]).or_else(|| self.conditions.starts.clone()),
+            end_weight: self.conditions.end_weight,
+            ..parts.conditions.clone()
+        };
+        let problem = Problem::new(self.mapper.model(), parts.demonstration.clone(), self.weights.clone(), conditions);
         let mapping = self.mapper.map_window(&problem, self.budget_left(budget), interrupt)?;
-        Ok(Some(Rest {
-            steps: self.steps(&problem, &mapping).collect(),
-            end_cost: mapping.cost.end,
-            stopped_by: mapping.stopped_by,
-            lower_bound: mapping.lower_bound.unwrap_or(0.0),
-            work: Work { n_expanded: mapping.n_expanded, n_generated: mapping.n_generated },
-            end: mapping.end,
-        }))
+        let (end_cost, stopped_by) = (mapping.cost.end, mapping.stopped_by);
+        let (lower_bound, end) = (mapping.lower_bound.unwrap_or(0.0), mapping.end.clone());
+        let way = FirstMoves::from(mapping);
+        let work = Work { n_expanded: way.n_expanded, n_generated: way.n_generated };
+        let steps = way.steps(&problem, self.first, usize::from(self.root.is_some())).collect();
+        Ok(Some(Rest { steps, end_cost, end, stopped_by, lower_bound, work }))
     }
 
     /// Approximate size in memory, in bytes.
     pub(super) fn size_bytes(&self) -> usize {
         let n_attributes = self.weights.as_slice().len();
         let each = size_of::<f64>() + n_attributes * size_of::<Option<Value>>();
-        size_of::<Self>() + self.observation_weights.capacity() * each
+        let of_parts = |parts: &Parts| {
+            parts.conditions.observation_weights.capacity() * each
+                + if self.keeps_terms { parts.terms.size_bytes() } else { 0 }
+        };
+        size_of::<Self>() + self.parts.as_ref().map_or(0, of_parts)
     }
 
     /// What a search may spend.
@@ -152,27 +193,17 @@ impl Windows {
         let max_expansions = budget.max_expansions.saturating_sub(self.work.n_expanded);
         Budget { max_expansions, ..budget.beside(self.size_bytes()) }
     }
+}
 
-    /// The way from the root to the newest of `observations` as a problem. What ending costs counts if it `ends`.
-    fn problem_of<'m>(&self, mapper: &'m Mapper, observations: Demonstration, ends: bool) -> Problem<'m> {
-        let conditions = Conditions {
-            starts: self.root.as_ref().map(|root| vec![root.clone()]).or_else(|| self.conditions.starts.clone()),
-            observation_weights: self.observation_weights.clone(),
-            end_weight: if ends { self.conditions.end_weight } else { 0.0 },
-            ..self.conditions.clone()
-        };
-        Problem::new(mapper.model(), observations, self.weights.clone(), conditions)
-    }
-
-    /// The steps of a mapping of the window that are not committed yet.
-    fn steps(&self, problem: &Problem<'_>, mapping: &Mapping) -> impl Iterator<Item = Decided> {
-        let n_committed = usize::from(self.root.is_some());
-        let steps = mapping.moves.iter().zip(&mapping.action_costs).skip(n_committed);
-        let states = mapping.states.as_ref();
+impl FirstMoves {
+    /// Its steps in a window that begins with the observation `first`, without the first `n_committed`.
+    fn steps(&self, problem: &Problem<'_>, first: u32, n_committed: usize) -> impl Iterator<Item = Decided> {
+        let steps = self.moves.iter().zip(&self.action_costs).skip(n_committed);
+        let states = self.states.as_ref();
         steps.map(move |(step, action_cost)| {
             let row = states.unwrap_or_else(|| problem.model.states()).row(step.state);
             Decided {
-                step: Move { observation: self.first + step.observation, ..*step },
+                step: Move { observation: first + step.observation, ..*step },
                 action_cost: *action_cost,
                 terms: problem.distances.terms(step.observation as usize, row).collect(),
                 row: states.map(|_| OriginRow(row.to_vec())),
@@ -186,7 +217,8 @@ pub(super) fn most_bytes(mapper: &Mapper, problem: &Problem<'_>, lookahead: NonZ
     let n_observations = usize::try_from(lookahead.get()).unwrap_or(usize::MAX).saturating_add(1);
     let window = problem.demonstration.iter().take(n_observations).map(<[_]>::to_vec);
     let Some(window) = Demonstration::of(window) else { return 0 };
-    let observed_bytes = 2 * window.size_bytes();
+    let term_bytes = Terms::n_each(problem.model.states(), &problem.weights).min(MAX_KEPT_TERMS) * size_of::<f64>();
+    let observed_bytes = 2 * (window.size_bytes() + n_observations.saturating_mul(term_bytes));
     let conditions = Conditions { collapse: None, ..problem.conditions.clone() };
     let window = Problem::new(problem.model, window, problem.weights.clone(), conditions);
     mapper.search_bytes(&window, Settings::default()).saturating_add(observed_bytes)

@@ -16,16 +16,19 @@
 //! all moves pay the same part of a distance, and ending is free.
 
 mod joined;
+mod nodes;
 mod ways_out;
 
-use super::{End, Found, Move, MoveKind, POLL_EVERY};
-use crate::interrupt::{Cancelled, Interrupt, Meter, Signal};
+use super::{End, Found, MoveKind, POLL_EVERY};
+use crate::interrupt::{Cancelled, Interrupt, Interrupted, Meter, Signal};
 use crate::mapping::cost::rounding_of_sums;
-use crate::mapping::heuristic::projected::{Estimate, Projected};
+use crate::mapping::heuristic::projected::{Estimate, LayerTables, TableRoom};
+use crate::mapping::heuristic::projection::Projections;
 use crate::mapping::recurrence::Recurrence;
 use crate::mapping::{Budget, Problem, StoppedBy};
 use crate::model::{Model, StateIdx};
 use joined::JoinedTables;
+use nodes::{LastStep, Layer, LayeredNodes, Node};
 use ways_out::{WayOut, WaysOut};
 
 /// How many nodes of each layer the beams expand, one beam after the other.
@@ -36,85 +39,57 @@ const WIDEST_BEAM: usize = BEAM_WIDTHS[BEAM_WIDTHS.len() - 1];
 /// Buffers of a search, kept to be used again by searches of the same model.
 #[derive(Debug, Default)]
 pub(in crate::mapping) struct LayeredBuffers {
-    ways_out: WaysOut,
+    /// The estimates, which are solved before a search.
+    pub(in crate::mapping) estimates: LayerTables,
     tables: JoinedTables,
+    ways_out: WaysOut,
     nodes: LayeredNodes,
 }
 
-/// All nodes, observation by observation. Shapes `[n_observations, n_states]`.
-#[derive(Debug, Default)]
-struct LayeredNodes {
-    n_states: usize,
-    /// Of the cheapest way that was found, before the distance is paid; infinite if none was.
-    costs: Vec<f64>,
-    /// How that way ends; means nothing if there is none.
-    links: Vec<LastStep>,
-    /// Whether a way was found since the node was last expanded.
-    are_open: Vec<bool>,
-    /// The states of these nodes, by observation.
-    open: Vec<Vec<StateIdx>>,
-}
-
-/// How the way to a node ends: with an action, numbered as the way out of a state that it goes, or without one.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct LastStep(u32);
-
-impl LastStep {
-    const START: Self = Self(u32::MAX);
-    const SKIP: Self = Self(u32::MAX - 1);
-
-    /// With an action that advances.
-    #[inline]
-    fn matched(way: usize) -> Self {
-        #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_WAYS")]
-        let way = way as u32;
-        Self(way << 1)
-    }
-
-    /// With an action that does not.
-    #[inline]
-    fn extra(way: usize) -> Self {
-        Self(Self::matched(way).0 | 1)
-    }
-
-    #[inline]
-    fn kind(self) -> MoveKind {
-        match self {
-            Self::START => MoveKind::Start,
-            Self::SKIP => MoveKind::Skip,
-            Self(way) if way & 1 == 0 => MoveKind::Match,
-            Self(_) => MoveKind::Extra,
+impl LayeredBuffers {
+    /// Solves the estimates for `problem`, in which ending must be free. Says whether all have tables, in time.
+    ///
+    /// # Errors
+    ///
+    /// [`Cancelled`] if `interrupt` said so.
+    pub(in crate::mapping) fn solve(
+        &mut self,
+        projections: &Projections,
+        problem: &Problem<'_>,
+        room: TableRoom,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<bool, Cancelled> {
+        match self.estimates.solve(projections, problem, room, &mut Meter::new(interrupt, POLL_EVERY)) {
+            Ok(are_solved) => Ok(are_solved),
+            Err(Interrupted::OutOfTime) => Ok(false),
+            Err(Interrupted::Cancelled(cancelled)) => Err(cancelled),
         }
     }
 
-    fn way(self) -> Option<usize> {
-        (self.0 < Self::SKIP.0).then_some(self.0 as usize >> 1)
-    }
-}
-
-impl LayeredBuffers {
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
-        let Self { ways_out, tables, nodes } = self;
-        ways_out.ways.capacity() * size_of::<WayOut>()
-            + ways_out.ends.capacity() * STATE_BYTES
+        let Self { estimates, tables, ways_out, nodes } = self;
+        estimates.kept_bytes()
             + tables.kept_bytes()
-            + nodes.costs.capacity() * NODE_BYTES
+            + ways_out.ways.capacity() * size_of::<WayOut>()
+            + ways_out.ends.capacity() * STATE_BYTES
+            + nodes.kept_bytes()
     }
 }
 
-/// How much memory a node takes, in bytes: with its place among those that are open, and with the room for more of these.
-const NODE_BYTES: usize = size_of::<f64>() + size_of::<LastStep>() + size_of::<bool>() + 2 * size_of::<StateIdx>();
+/// About how much memory a node takes, in bytes: with its place among those that are open, with the room for more of these, and with its part
+/// of the sums of estimates.
+const NODE_BYTES: usize = 53;
+const _: () = assert!(size_of::<f64>() + size_of::<Node>() + 2 * size_of::<StateIdx>() <= NODE_BYTES);
 
 /// How much memory a state takes, in bytes: where its ways end, its classes, and as many distinct ones.
-const STATE_BYTES: usize = size_of::<usize>() + size_of::<[u32; 2]>() + 2 * size_of::<Vec<u32>>();
+const STATE_BYTES: usize = 64;
+const _: () = assert!(size_of::<usize>() + size_of::<[u32; 2]>() <= STATE_BYTES);
 
 /// How much memory a search takes of `n_nodes` of `model`, in bytes.
 pub(in crate::mapping) fn bytes_for(model: &Model, n_nodes: usize) -> usize {
     let ways = model.graph().n_transitions() * size_of::<WayOut>();
-    // There are no more than two distinct classes of each state, and an entry of these for each observation.
-    let nodes = n_nodes.saturating_mul(NODE_BYTES + 2 * size_of::<Estimate>());
-    nodes.saturating_add(ways + model.graph().n_states() * STATE_BYTES)
+    n_nodes.saturating_mul(NODE_BYTES).saturating_add(ways + model.graph().n_states() * STATE_BYTES)
 }
 
 /// Most transitions of a model: their copies take 6 MB.
@@ -136,24 +111,23 @@ pub(in crate::mapping) fn is_within(budget: Budget, problem: &Problem<'_>, n_nod
         && 2 * n_nodes as u64 <= budget.max_expansions
 }
 
-/// Finds the cheapest mapping, if `interrupt` allows, among those of at most `most`, of which there must be one. All that
-/// `projected` estimates must be in its columns.
+/// Finds the cheapest mapping, if `interrupt` allows, among those of at most `most`, of which there must be one. The estimates of `buffers` must be
+/// solved for `problem`.
 ///
 /// # Errors
 ///
 /// [`Cancelled`] if `interrupt` said so.
 pub(in crate::mapping) fn search(
     problem: &Problem<'_>,
-    projected: &Projected<'_>,
     budget: Budget,
     most: f64,
     buffers: &mut LayeredBuffers,
     interrupt: &mut dyn Interrupt,
 ) -> Result<Found, Cancelled> {
-    let LayeredBuffers { ways_out, tables, nodes } = buffers;
+    let LayeredBuffers { estimates, tables, ways_out, nodes } = buffers;
     ways_out.prepare(problem.model, &problem.body);
-    tables.prepare(problem, projected);
-    nodes.prepare(problem);
+    tables.prepare(problem.model, estimates, problem.demonstration.len());
+    nodes.prepare(problem, tables.at(0));
     let mut search = Search {
         last: problem.last(),
         ways_out,
@@ -178,7 +152,7 @@ pub(in crate::mapping) fn search(
     let Search { cheapest, n_expanded, n_generated, .. } = search;
     let most_promising = || {
         let f = |state: &StateIdx| {
-            let Estimate { distance, cost_to_go } = tables.estimate(tables.at(0), *state);
+            let Estimate { distance, cost_to_go } = nodes.nodes[*state as usize].estimate;
             distance + cost_to_go
         };
         let starts = problem.starts.states().iter().copied();
@@ -225,13 +199,12 @@ impl Search<'_> {
 
     /// What mappings must cost less than for no more than `width` of the open nodes of a layer to be expanded, equals aside.
     fn limit_of_beam(&self, observation: usize, width: usize) -> f64 {
-        let entries = self.tables.at(observation);
-        let costs = &self.nodes.costs[observation * self.nodes.n_states..];
+        let first = observation * self.nodes.n_states;
+        let (costs, nodes) = (&self.nodes.costs[first..], &self.nodes.nodes[first..]);
         let mut least = [f64::INFINITY; WIDEST_BEAM];
         let least = &mut least[..width];
         for &state in &self.nodes.open[observation] {
-            let Estimate { distance, cost_to_go } = self.tables.estimate(entries, state);
-            note(least, costs[state as usize] + distance + cost_to_go);
+            note(least, nodes[state as usize].f(costs[state as usize]));
         }
         self.limit.min(least[width - 1].next_up())
     }
@@ -239,31 +212,33 @@ impl Search<'_> {
     /// Expands the open nodes of a layer that may be on a mapping of less than `limit`, and those to which they lead by actions that do
     /// not advance, but not many more than `width`.
     fn expand(&mut self, observation: usize, limit: f64, width: usize) -> Result<End, Cancelled> {
-        let entries = self.tables.at(observation);
-        let LayeredNodes { n_states, costs, links, are_open, open } = &mut *self.nodes;
-        let n_states = *n_states;
-        let of_both = observation * n_states..(observation + 2) * n_states;
-        let (costs, next_costs) = costs[of_both.clone()].split_at_mut(n_states);
-        let (links, next_links) = links[of_both.clone()].split_at_mut(n_states);
-        let (are_open, are_next_open) = are_open[of_both].split_at_mut(n_states);
+        let estimates = self.tables.at(observation);
+        let next_estimates = self.tables.at(observation + 1);
+        let LayeredNodes { n_states, costs, nodes, open } = &mut *self.nodes;
+        let of_both = observation * *n_states..(observation + 2) * *n_states;
+        let (costs, next_costs) = costs[of_both.clone()].split_at_mut(*n_states);
+        let (nodes, next_nodes) = nodes[of_both].split_at_mut(*n_states);
         let Ok([open, next_open]) = open.get_disjoint_mut([observation, observation + 1]) else {
             return Ok(End::Done);
         };
+        let mut here = Layer { costs, nodes, estimates, open };
+        let mut next = Layer { costs: next_costs, nodes: next_nodes, estimates: next_estimates, open: next_open };
         let mut n_left = width.saturating_add(width / 2);
         let mut n_kept = 0;
         let mut at = 0;
-        while let Some(&state) = open.get(at) {
+        while let Some(&state) = here.open.get(at) {
             at += 1;
-            let estimate = self.tables.estimate(entries, state);
-            let kind = links[state as usize].kind();
+            let node = &mut here.nodes[state as usize];
+            let kind = node.link.kind();
             // No kind pays another part.
-            let before = costs[state as usize] + estimate.distance;
-            let f = before + estimate.cost_to_go;
+            let cost = here.costs[state as usize];
+            let before = cost + node.estimate.distance;
+            let f = node.f(cost);
             if f >= limit || n_left == 0 {
                 // It stays open for a wider beam, if it is of interest then.
                 let is_kept = f < self.limit;
-                are_open[state as usize] = is_kept;
-                open[n_kept] = state;
+                node.is_open = is_kept;
+                here.open[n_kept] = state;
                 n_kept += usize::from(is_kept);
                 continue;
             }
@@ -275,64 +250,45 @@ impl Search<'_> {
                 Signal::Cancel => return Err(Cancelled),
             }
             n_left -= 1;
-            are_open[state as usize] = false;
+            node.is_open = false;
             let recurrence = Recurrence::default();
             let may_skip = recurrence.may_follow(kind, MoveKind::Skip);
             let may_linger = recurrence.may_follow(kind, MoveKind::Extra);
             self.n_expanded += 1;
             self.n_generated += u64::from(may_skip) + (1 + u64::from(may_linger)) * ways.len() as u64;
-            let mut advance = |to: StateIdx, cost: f64, link: LastStep| {
-                let known = &mut next_costs[to as usize];
-                if cost < *known {
-                    *known = cost;
-                    next_links[to as usize] = link;
-                    if !std::mem::replace(&mut are_next_open[to as usize], true) {
-                        next_open.push(to);
-                    }
-                }
-            };
             if may_skip {
-                advance(state, before, LastStep::SKIP);
+                next.reach(state, before, LastStep::SKIP);
             }
             for (number, &WayOut { cost, to, .. }) in (first_way..).zip(ways) {
                 let cost = before + cost;
-                advance(to, cost, LastStep::matched(number));
-                if may_linger && cost < costs[to as usize] {
-                    costs[to as usize] = cost;
-                    links[to as usize] = LastStep::extra(number);
-                    if !std::mem::replace(&mut are_open[to as usize], true) {
-                        open.push(to);
-                    }
+                next.reach(to, cost, LastStep::matched(number));
+                if may_linger {
+                    here.reach(to, cost, LastStep::extra(number));
                 }
             }
         }
-        open.truncate(n_kept);
+        here.open.truncate(n_kept);
         Ok(End::Done)
     }
 
     /// What mappings cost at least, of those that were not found: they lead through open nodes.
     fn least_f(&self) -> f64 {
-        let LayeredNodes { n_states, costs, are_open, open, .. } = &*self.nodes;
+        let LayeredNodes { n_states, costs, nodes, open } = &*self.nodes;
         let fs = (0..=self.last).flat_map(|observation| {
-            let entries = self.tables.at(observation);
-            let open = open[observation].iter().map(move |state| (*state, observation * n_states + *state as usize));
+            let open = open[observation].iter().map(move |state| observation * n_states + *state as usize);
             // A list that was not gone through to the end may name some that are not open any more.
-            open.filter(|(_, at)| are_open[*at]).map(move |(state, at)| {
-                let Estimate { distance, cost_to_go } = self.tables.estimate(entries, state);
-                costs[at] + distance + cost_to_go
-            })
+            open.filter(|at| nodes[*at].is_open).map(|at| nodes[at].f(costs[at]))
         });
         fs.fold(self.limit, f64::min)
     }
 
     /// Looks for a cheaper mapping among the nodes of the last layer that were reached.
     fn end(&mut self) {
-        let entries = self.tables.at(self.last);
-        let LayeredNodes { n_states, costs, are_open, open, .. } = &mut *self.nodes;
+        let LayeredNodes { n_states, costs, nodes, open } = &mut *self.nodes;
         for state in open[self.last].drain(..) {
             let at = self.last * *n_states + state as usize;
-            are_open[at] = false;
-            let cost = costs[at] + self.tables.estimate(entries, state).distance;
+            nodes[at].is_open = false;
+            let cost = costs[at] + nodes[at].estimate.distance;
             if cost < self.limit {
                 self.limit = cost * (1.0 - self.rounding);
                 self.cheapest = Some(state);
@@ -350,48 +306,5 @@ pub(super) fn note(least: &mut [f64], f: f64) {
             break;
         }
         least.swap(at - 1, at);
-    }
-}
-
-impl LayeredNodes {
-    /// Forgets all nodes but the start states'.
-    fn prepare(&mut self, problem: &Problem<'_>) {
-        let n_observations = problem.demonstration.len();
-        self.n_states = problem.model.graph().n_states();
-        let n_nodes = n_observations * self.n_states;
-        self.costs.clear();
-        self.costs.resize(n_nodes, f64::INFINITY);
-        self.are_open.clear();
-        self.are_open.resize(n_nodes, false);
-        self.links.resize(n_nodes.max(self.links.len()), LastStep::START);
-        self.open.iter_mut().for_each(Vec::clear);
-        self.open.resize_with(n_observations.max(self.open.len()), Vec::new);
-
-        for start in problem.starts.states() {
-            self.costs[*start as usize] = 0.0;
-            self.links[*start as usize] = LastStep::START;
-            self.are_open[*start as usize] = true;
-            self.open[0].push(*start);
-        }
-    }
-
-    /// The way of `ways_out` from the start to a node.
-    fn path(&self, ways_out: &WaysOut, mut observation: usize, mut state: StateIdx) -> Vec<Move> {
-        let mut moves = Vec::with_capacity(2 * observation + 1);
-        loop {
-            let link = self.links[observation * self.n_states + state as usize];
-            let kind = link.kind();
-            let way = link.way().map(|way| ways_out.ways[way]);
-            #[expect(clippy::cast_possible_truncation, reason = "there are at most MAX_OBSERVATIONS")]
-            moves.push(Move { kind, action: way.map(|way| way.action), observation: observation as u32, state });
-            match kind {
-                MoveKind::Start => break,
-                MoveKind::Extra => {}
-                MoveKind::Match | MoveKind::Skip => observation -= 1,
-            }
-            state = way.map_or(state, |way| way.from);
-        }
-        moves.reverse();
-        moves
     }
 }

@@ -1,14 +1,16 @@
 //! Projections solved for one demonstration: tables of distances and exact costs-to-go.
 
+mod layers;
 mod room;
 mod solving;
 mod table;
 
 use std::ops::AddAssign;
 
+pub(in crate::mapping) use layers::LayerTables;
 #[cfg(test)]
 pub(in crate::mapping) use room::MAX_ENTRIES;
-pub(in crate::mapping) use room::{TableRoom, most_bytes};
+pub(in crate::mapping) use room::{TableRoom, most_bytes, most_bytes_of_all};
 pub(in crate::mapping) use solving::TableBuffers;
 pub(in crate::mapping) use table::CHUNK_LEN;
 pub(super) use table::Table;
@@ -79,10 +81,21 @@ pub(in crate::mapping) struct ChangingColumn {
 }
 
 impl ChangingColumn {
+    fn new(position: usize, offset: usize) -> Self {
+        #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
+        Self { position: position as u32, offset: offset as u32 }
+    }
+
     /// The attribute's position.
     #[inline]
     pub(in crate::mapping) fn position(self) -> usize {
         self.position as usize
+    }
+
+    /// Where its values begin in the table.
+    #[inline]
+    pub(in crate::mapping) fn offset(self) -> usize {
+        self.offset as usize
     }
 }
 

@@ -17,20 +17,28 @@ pub(in crate::mapping) fn most_bytes(
     problem: &Problem<'_>,
     room: TableRoom,
 ) -> (usize, bool) {
-    /// Two tables; beside each, the least terms take half as much at most.
-    const N_TIMES: usize = 3;
     let (used, _) = used_projections(projections, problem, TableRoom { few: room.most, ..room });
     let tabled = projections.attributes.iter().zip(&used).filter(|(_, is_used)| **is_used).map(|(own, _)| own);
-    let n_observations = problem.demonstration.len();
-    let n_classes: usize = tabled.clone().map(|own| own.n_values).sum();
-    let n_entries = Table::<Estimate>::n_entries_for(n_classes, n_observations);
-    let n_edges: usize = tabled.clone().map(|own| own.edges.n_items()).sum();
-    let n_bytes = N_TIMES * n_entries * size_of::<Estimate>()
-        + 2 * n_edges * size_of::<SharedWay>()
-        + 2 * stride_for(n_observations) * (size_of::<Estimate>() + size_of::<f64>());
+    let n_bytes = bytes_of(tabled.clone(), problem.demonstration.len());
     let has = |position| tabled.clone().any(|own| own.position == position);
     let mut active = (0..problem.model.schema().len()).filter(|position| problem.distances.is_active(*position));
     (n_bytes, active.all(has))
+}
+
+/// The same of tables for `n_observations` of all attributes, which is sooner told.
+pub(in crate::mapping) fn most_bytes_of_all(projections: &Projections, n_observations: usize) -> usize {
+    bytes_of(projections.attributes.iter(), n_observations)
+}
+
+fn bytes_of<'p>(tabled: impl Iterator<Item = &'p Projection> + Clone, n_observations: usize) -> usize {
+    /// Two tables; beside each, the least terms take half as much at most.
+    const N_TIMES: usize = 3;
+    let n_classes: usize = tabled.clone().map(|own| own.n_values).sum();
+    let n_entries = Table::<Estimate>::n_entries_for(n_classes, n_observations);
+    let n_edges: usize = tabled.map(|own| own.edges.n_items()).sum();
+    N_TIMES * n_entries * size_of::<Estimate>()
+        + 2 * n_edges * size_of::<SharedWay>()
+        + 2 * stride_for(n_observations) * (size_of::<Estimate>() + size_of::<f64>())
 }
 
 /// How large tables may be.
@@ -52,6 +60,16 @@ impl TableRoom {
         const PART: usize = 4;
         let most = MAX_ENTRIES.min(max_bytes / PART / size_of::<Estimate>());
         Self { few: most, most, max_ways: max_bytes / PART / size_of::<SharedWay>(), max_bytes }
+    }
+
+    /// Whether all tables may be made of columns of so many values, with so many ways between these.
+    pub(super) fn has_all(self, n_observations: usize, columns: impl Iterator<Item = (usize, usize)>) -> bool {
+        let stride = stride_for(n_observations);
+        let add = |n_entries: usize, (n_values, n_ways)| {
+            let n_entries = n_entries.saturating_add(stride.saturating_mul(n_values));
+            (n_ways <= self.max_ways && n_entries <= self.few).then_some(n_entries)
+        };
+        columns.into_iter().try_fold(0, add).is_some()
     }
 
     /// At first at most so many entries.

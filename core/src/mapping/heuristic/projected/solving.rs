@@ -10,6 +10,7 @@ use crate::mapping::conditions::Body;
 use crate::mapping::heuristic::projection::Projections;
 use crate::mapping::heuristic::shares::SharedWays;
 use crate::mapping::open_list::CheapestFirst;
+use crate::mapping::recurrence::Recurrence;
 use crate::mapping::{MoveKind, Problem};
 
 /// What solving takes besides its result, kept to be used again.
@@ -159,8 +160,7 @@ impl<'p> Projected<'p> {
                 let entries = self.table.of_mut(offset + *fixed as usize);
                 self.unchanged.iter_mut().zip(entries).for_each(|(sum, entry)| *sum += *entry);
             } else {
-                #[expect(clippy::cast_possible_truncation, reason = "classes are counted in u32")]
-                self.changing.push(ChangingColumn { offset: *offset as u32, position: position as u32 });
+                self.changing.push(ChangingColumn::new(position, *offset));
             }
         }
     }
@@ -221,18 +221,7 @@ impl<'p> Projected<'p> {
             if i < last || end.is_some() {
                 let least = self.least_terms[i * self.columns.len() + number];
                 let least_paid = recurrence.paid(MoveKind::Extra, self.least_distances[i]);
-                let linger = |distance: f64, cost: f64| recurrence.go_on(MoveKind::Extra, distance - least, cost);
-                for value in 0..n_values {
-                    let cost = linger(here[value].distance, here[value].cost_to_go);
-                    relax(predecessors, value, cost, least_paid, here, open);
-                }
-                while let Some(CheapestFirst { cost, id: value }) = open.pop() {
-                    meter.spend_or_stop(1)?;
-                    let entry = here[value as usize];
-                    if cost <= entry.cost_to_go {
-                        relax(predecessors, value as usize, linger(entry.distance, cost), least_paid, here, open);
-                    }
-                }
+                settle(recurrence, predecessors, here, Extras { least, least_paid }, open, meter)?;
             }
             for (value, entry) in here.iter().enumerate() {
                 self.table.at_mut(offset + value, i).cost_to_go = entry.cost_to_go;
@@ -241,6 +230,39 @@ impl<'p> Projected<'p> {
         }
         Ok(())
     }
+}
+
+/// How extra actions at an observation are paid.
+#[derive(Clone, Copy)]
+pub(super) struct Extras {
+    /// The least term of the column, which is paid
+    pub(super) least: f64,
+    /// with those of all others: so much.
+    pub(super) least_paid: f64,
+}
+
+/// Lets extra actions make the costs-to-go of a column at an observation cheaper.
+pub(super) fn settle(
+    recurrence: Recurrence,
+    predecessors: &SharedWays,
+    here: &mut [Estimate],
+    Extras { least, least_paid }: Extras,
+    open: &mut BinaryHeap<CheapestFirst>,
+    meter: &mut Meter<'_>,
+) -> Result<(), Interrupted> {
+    let linger = |distance: f64, cost: f64| recurrence.go_on(MoveKind::Extra, distance - least, cost);
+    for value in 0..here.len() {
+        let cost = linger(here[value].distance, here[value].cost_to_go);
+        relax(predecessors, value, cost, least_paid, here, open);
+    }
+    while let Some(CheapestFirst { cost, id: value }) = open.pop() {
+        meter.spend_or_stop(1)?;
+        let entry = here[value as usize];
+        if cost <= entry.cost_to_go {
+            relax(predecessors, value as usize, linger(entry.distance, cost), least_paid, here, open);
+        }
+    }
+    Ok(())
 }
 
 /// Offers every value an extra action into `value`, which costs `cost` from its arrival on, without `least_paid` of the distance.

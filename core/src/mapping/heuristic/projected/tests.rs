@@ -4,7 +4,7 @@ use proptest::prelude::*;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::interrupt::Uninterrupted;
+use crate::interrupt::{Meter, Uninterrupted};
 use crate::mapping::by_definition::{
     any_conditions, compiled, distance, fitted, least_costs, moves, nodes, optimum, problem, with_conditions,
 };
@@ -79,6 +79,46 @@ proptest! {
             for (next, to, cost) in moves(&problem, i, state) {
                 let next_h = estimate_of(&projected, next, problem.model.states().row(to)).cost_to_go;
                 prop_assert!(h <= cost + next_h + close, "consistent at ({i}, {state})");
+            }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, failure_persistence: None, ..ProptestConfig::default() })]
+
+    /// Problems one after the other in the same memory, of the same model.
+    #[test]
+    fn tables_of_small_problems_have_the_same_bits(
+        (model, seen) in model_and_seen(),
+        conditions in prop::collection::vec(any_conditions(), 3),
+    ) {
+        let document = model;
+        let model = compiled(&document);
+        let projections = Projections::new(&model, usize::MAX, &mut Uninterrupted).unwrap();
+        let (room, mut tables) = (TableRoom::within(usize::MAX), LayerTables::default());
+        for conditions in conditions {
+            let mut request = with_conditions(seen.clone(), &document, &conditions);
+            request["end_weight"] = json!(0);
+            let problem = problem(&model, &request);
+            let are_solved =
+                tables.solve(&projections, &problem, room, &mut Meter::new(&mut Uninterrupted, 1)).unwrap();
+            let solved = Projected::solve(&projections, &problem, room, &mut TableBuffers::default(), &mut Uninterrupted).unwrap();
+            let projected = solved.unwrap();
+            prop_assert_eq!(are_solved, projected.are_all_in_columns());
+            if !are_solved {
+                continue;
+            }
+            prop_assert_eq!(tables.changing_columns(), projected.changing_columns());
+            for (i, state) in nodes(&problem) {
+                let row = problem.model.states().row(state);
+                if !projected.speaks_of(row) {
+                    continue;
+                }
+                let (entries, mut sum) = tables.at(i);
+                tables.classes(row).for_each(|class| sum += entries[class as usize]);
+                prop_assert_eq!(sum, estimate_of(&projected, i, row), "at ({}, {})", i, state);
+                prop_assert_eq!(tables.cost_to_go(i, row), projected.cost_to_go(i, row));
             }
         }
     }
