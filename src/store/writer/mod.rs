@@ -1,8 +1,8 @@
 //! The one writer, which groups commits.
 //!
 //! A commit costs a sync of the disk, whatever it holds. So the writer takes everything that waits, up to a limit, applies it in one
-//! transaction, and answers all of it after the commit. Meanwhile the next group gathers: groups grow with the load, and no timer is needed.
-//! The writer has a thread of its own, so that what everybody waits for does not wait for a turn among everybody's tasks. Small and large requests wait in lines of their own. A group takes all small requests, but
+//! transaction, and answers all of it after the commit. After a group of several it yields once, so that ready tasks can enqueue: groups
+//! grow with the load, and no timer is needed. Small and large requests wait in lines of their own. A group takes all small requests, but
 //! only about a MiB of large ones, so that small requests never wait long behind large ones. Observations, which are most requests, are
 //! written to `arrivals` with a commit, and moved to their table later. A group of observations alone, or of policies alone, takes a
 //! single statement, and one of rewards alone two, outside of a transaction, as each statement costs the driver a change of threads.
@@ -18,11 +18,9 @@ mod verb;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::thread;
 use std::time::Duration;
 
 use sqlx::{Connection, SqliteConnection};
-use tokio::runtime::Handle;
 use tokio::sync::mpsc::error::TrySendError;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
@@ -43,9 +41,6 @@ pub(super) use verb::{Verb, Writing};
 
 /// Most small requests in a transaction. Beyond this a group gains nothing, and its waiters wait longer.
 const MAX_GROUP: usize = 256;
-
-/// After a group of so many, other threads are let go first: those who were told soon come again, and all of them should be in the next one.
-const LARGE_GROUP: usize = 16;
 
 /// How long those who ask wait to get in line.
 const LINE_TIMEOUT: Duration = Duration::from_secs(5);
@@ -86,12 +81,8 @@ impl ModelsGeneration {
 }
 
 impl Writer {
-    /// Starts the writer, with its connection if there is one yet, on a thread of its own that counts among `tasks`. It ends once it was closed
-    /// or dropped, and all that waited has been written.
-    ///
-    /// # Panics
-    ///
-    /// If the system has no thread for it.
+    /// Starts the writer in `tasks`, with its connection if there is one yet. It ends once it was closed or dropped, and all that waited has
+    /// been written.
     pub(super) fn start(
         database: Database,
         connection: Option<SqliteConnection>,
@@ -99,22 +90,7 @@ impl Writer {
         tasks: &TaskTracker,
     ) -> Self {
         let (writer, lines) = Self::with_lines();
-        let open = writer.open(database, connection, readers, tasks);
-        let (running, runtime) = (tasks.track_future(open.run(lines)), Handle::current());
-        let run = move || runtime.block_on(running);
-        thread::Builder::new().name("etude-writer".to_owned()).spawn(run).expect("a thread for the writer");
-        writer
-    }
-
-    /// Who writes what is asked by this handle.
-    fn open(
-        &self,
-        database: Database,
-        connection: Option<SqliteConnection>,
-        readers: Arc<Readers>,
-        tasks: &TaskTracker,
-    ) -> Open {
-        Open {
+        let open = Open {
             database,
             connection,
             readers,
@@ -124,8 +100,10 @@ impl Writer {
             arrivals: Arrivals::default(),
             was_interrupted: true,
             trouble: None,
-            models_generation: self.models_generation.clone(),
-        }
+            models_generation: writer.models_generation.clone(),
+        };
+        tasks.spawn(open.run(lines));
+        writer
     }
 
     /// A handle without a writer.
@@ -245,8 +223,17 @@ struct Open {
 impl Open {
     async fn run(mut self, mut lines: Lines) {
         let mut group = Vec::with_capacity(MAX_GROUP);
-        while lines.take(&mut group).await {
-            let is_large = group.len() >= LARGE_GROUP;
+        let mut n_told = 0;
+        loop {
+            if n_told > 1 {
+                // It yields once, so that those who were told can enqueue. One alone would come alone again, and to yield for it wakes threads
+                // that find nothing to do.
+                tokio::task::yield_now().await;
+            }
+            if !lines.take(&mut group).await {
+                break;
+            }
+            n_told = group.len();
             match self.commit(&mut group).await {
                 Ok(()) => group.drain(..).for_each(|job| job.tell(Ok(()))),
                 Err(StoreError::Unavailable(unavailable)) => {
@@ -271,9 +258,6 @@ impl Open {
                 }
             }
             self.finish_checkpoint().await;
-            if is_large {
-                thread::yield_now();
-            }
         }
         self.close().await;
     }

@@ -83,14 +83,12 @@ async fn who_has_waited_behind_a_locked_database_does_not_wait_as_long_once_more
     let mut other = Database::new(&path, Locking::None).unwrap().connect().await.unwrap();
     let held = other.begin_with("BEGIN IMMEDIATE").await.unwrap();
     let readers = database.readers().unwrap();
-    let (writer, lines) = Writer::with_lines();
+    let writer = Writer::start(database, Some(connection), readers, &TaskTracker::new());
     let sizes = [0; MAX_GROUP + 1].into_iter().chain([1 << 20; 2]);
     let mut sent: Vec<_> = sizes.map(|n_bytes| Box::pin(writer.add_policies(policy("p", n_bytes)))).collect();
     for sent in &mut sent {
         assert!(poll!(sent).is_pending());
     }
-    // On this thread, so that all of them are told before the first one goes on.
-    tokio::spawn(writer.open(database, Some(connection), readers, &TaskTracker::new()).run(lines));
     let is_locked =
         |written: Result<(), StoreError>| matches!(written, Err(StoreError::Unavailable(Unavailable::Locked)));
     assert!(is_locked(sent.remove(0).await));
@@ -105,8 +103,6 @@ async fn what_an_owner_still_has_in_line_is_refused_once_another_has_resumed_the
     let store = open(directory.path()).await;
     let session = NewSession::plain("s", Timestamp::UNIX_EPOCH);
     assert_eq!(store.open_session(session).await.unwrap(), Opened::Yes);
-    let mut other = Database::new(&directory.path().join("etude.db"), Locking::None).unwrap().connect().await.unwrap();
-    let held = other.begin_with("BEGIN IMMEDIATE").await.unwrap();
     let mut others: Vec<_> = ["a", "b", "c"].map(|id| Box::pin(store.writer.add_policies(policy(id, 1 << 20)))).into();
     for other in &mut others {
         assert!(poll!(other).is_pending());
@@ -128,10 +124,7 @@ async fn what_an_owner_still_has_in_line_is_refused_once_another_has_resumed_the
     };
     let mut late = Box::pin(store.append_observations(new(Owner::FIRST)));
     assert!(poll!(&mut late).is_pending(), "it is behind what is large");
-    let mut taken = Box::pin(store.take_session("s", at));
-    assert!(poll!(&mut taken).is_pending(), "the database is locked");
-    held.rollback().await.unwrap();
-    let Taken::Open(taken) = taken.await.unwrap() else { panic!("it is open") };
+    let Taken::Open(taken) = store.take_session("s", at).await.unwrap() else { panic!("it is open") };
     assert_eq!(taken.n_observations, 0);
     assert_eq!(late.await.unwrap(), Err(SessionRefusal::Superseded));
     assert_eq!(store.touch_session("s", Owner::FIRST, at).await.unwrap(), Err(SessionRefusal::Superseded));
@@ -171,18 +164,6 @@ async fn an_owner_that_another_process_has_superseded_adds_and_ends_nothing() {
     assert_eq!(stores[1].append_observations(new(taken.owner, 1)).await.unwrap(), Ok(()));
     assert_eq!(stores[1].end_session(end(taken.owner)).await.unwrap(), Ok(()));
     assert_eq!(stores[0].append_observations(new(taken.owner, 2)).await.unwrap(), Err(SessionRefusal::NotOpen));
-}
-
-#[test]
-fn what_is_written_waits_for_nobodys_turn() {
-    let runtime = || tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    let directory = tempfile::tempdir().unwrap();
-    // Whoever is in its line has no turn while nobody runs it.
-    let (busy, other) = (runtime(), runtime());
-    let store = busy.block_on(open(directory.path()));
-    let written = store.writer.add_policies(policy("p", 0));
-    let written = other.block_on(async { tokio::time::timeout(Duration::from_mins(1), written).await });
-    written.unwrap().unwrap();
 }
 
 #[tokio::test]
