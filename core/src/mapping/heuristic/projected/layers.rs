@@ -27,6 +27,8 @@ pub(in crate::mapping) struct LayerTables {
     n_classes: usize,
     /// Shape `[n_observations, n_classes]`.
     entries: Vec<Estimate>,
+    /// The least term of each column. Shape `[n_observations, n_columns]`.
+    least_terms: Vec<f64>,
     /// Sums, per observation, of the columns that no action changes. Shape `[n_observations]`.
     unchanged: Vec<Estimate>,
     /// The columns that actions change, in order.
@@ -60,8 +62,6 @@ struct LayerColumn {
     is_constant: bool,
     /// The value that all states have that a search may come to, if no action of the body changes it.
     fixed: Option<ValueIdx>,
-    /// The least term at the observation in hand.
-    least: f64,
 }
 
 impl LayerTables {
@@ -97,6 +97,7 @@ impl LayerTables {
         }
         self.entries.resize(n_observations * self.n_classes, Estimate::default());
         self.unchanged.resize(n_observations, Estimate::default());
+        self.least_terms.resize(n_observations * self.columns.len(), 0.0);
         self.open.clear();
         for observation in (0..n_observations).rev() {
             meter.spend_or_stop(self.n_classes as u64)?;
@@ -136,7 +137,6 @@ impl LayerTables {
                 ways: first_way..self.ways.len(),
                 is_constant: own.is_constant(&problem.body),
                 fixed: None,
-                least: 0.0,
             });
             self.n_classes += own.n_values;
         }
@@ -154,9 +154,10 @@ impl LayerTables {
         let (before, after) = self.entries.split_at_mut((observation + 1) * self.n_classes);
         let (here, after) = (&mut before[observation * self.n_classes..], &*after);
         let mut least_distance = 0.0;
-        for (column, terms) in self.columns.iter_mut().zip(problem.distances.active()) {
-            column.least = column.write_terms(terms, observation, here);
-            least_distance += column.least;
+        let least_terms = &mut self.least_terms[observation * self.columns.len()..][..self.columns.len()];
+        for ((column, terms), least) in self.columns.iter().zip(problem.distances.active()).zip(&mut *least_terms) {
+            *least = column.write_terms(terms, observation, here);
+            least_distance += *least;
         }
         if observation < problem.last() {
             for (here, next) in here.iter_mut().zip(after) {
@@ -171,8 +172,8 @@ impl LayerTables {
                 }
             }
             let least_paid = recurrence.paid(MoveKind::Extra, least_distance);
-            for column in &self.columns {
-                let extras = Extras { least: column.least, least_paid };
+            for (column, least) in self.columns.iter().zip(least_terms) {
+                let extras = Extras { least: *least, least_paid };
                 if !pass(recurrence, &self.ways[column.ways.clone()], here, extras) {
                     let here = &mut here[column.offset..][..column.n_values];
                     settle(recurrence, &column.shared, here, extras, &mut self.open, meter)?;
@@ -208,10 +209,16 @@ impl LayerTables {
         (&self.entries[observation * self.n_classes..][..self.n_classes], self.unchanged[observation])
     }
 
+    /// The least term of each column at an observation.
+    pub(super) fn least_terms(&self, observation: usize) -> &[f64] {
+        &self.least_terms[observation * self.columns.len()..][..self.columns.len()]
+    }
+
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
         self.columns.iter().map(|column| size_of::<LayerColumn>() + column.shared.size_bytes()).sum::<usize>()
             + (self.entries.capacity() + self.unchanged.capacity()) * size_of::<Estimate>()
+            + self.least_terms.capacity() * size_of::<f64>()
             + self.ways.capacity() * size_of::<ClassWay>()
             + self.open.capacity() * size_of::<CheapestFirst>()
     }

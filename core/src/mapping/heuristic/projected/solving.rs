@@ -2,6 +2,7 @@
 
 use std::collections::BinaryHeap;
 
+use super::layers::LayerTables;
 use super::room::{TableRoom, used_projections};
 use super::table::Table;
 use super::{ChangingColumn, Column, Estimate, Projected};
@@ -23,6 +24,8 @@ pub(in crate::mapping) struct TableBuffers {
     /// The body whose ways they are.
     body: Body,
     layer: ColumnLayer,
+    /// The tables of small problems.
+    layers: LayerTables,
 }
 
 /// The entries of a column in the making.
@@ -39,11 +42,19 @@ struct ColumnLayer {
 /// Most edges of all projections with tables whose ways are kept: 1.5 MB. To gather more takes little of the time that their tables take.
 const MAX_KEPT_EDGES: usize = 1 << 16;
 
+/// Most entries of tables that are solved observation by observation, and then put in order: 1 MB, as that takes twice the memory.
+const MAX_SMALL_ENTRIES: usize = 1 << 16;
+
+/// And most of them at an observation. It takes half the time that it takes to solve the columns one after the other where they are to be; a little
+/// more on a grid that has 632.
+const MAX_SMALL_WIDTH: usize = 1 << 8;
+
 impl TableBuffers {
     /// How much memory is kept, in bytes.
     pub(in crate::mapping) fn kept_bytes(&self) -> usize {
         let ColumnLayer { least, here, next, open } = &self.layer;
-        self.ways.iter().map(SharedWays::size_bytes).sum::<usize>()
+        self.layers.kept_bytes()
+            + self.ways.iter().map(SharedWays::size_bytes).sum::<usize>()
             + least.capacity() * size_of::<f64>()
             + (here.capacity() + next.capacity()) * size_of::<Estimate>()
             + open.capacity() * size_of::<CheapestFirst>()
@@ -64,6 +75,18 @@ impl<'p> Projected<'p> {
         buffers: &mut TableBuffers,
         interrupt: &mut dyn Interrupt,
     ) -> Result<Option<Self>, Cancelled> {
+        Self::solve_by(projections, problem, room, buffers, MAX_SMALL_ENTRIES, interrupt)
+    }
+
+    /// The same, where tables of up to so many entries are solved observation by observation.
+    pub(super) fn solve_by(
+        projections: &'p Projections,
+        problem: &'p Problem<'p>,
+        room: TableRoom,
+        buffers: &mut TableBuffers,
+        max_small_entries: usize,
+        interrupt: &mut dyn Interrupt,
+    ) -> Result<Option<Self>, Cancelled> {
         /// How many classes are looked at between two looks at the interrupt: tens of microseconds.
         const POLL_EVERY: u64 = 1 << 11;
         let (used, n_left_out) = used_projections(projections, problem, room);
@@ -79,11 +102,41 @@ impl<'p> Projected<'p> {
         projected.table = Table::filled_with(Estimate::default(), width, n_observations);
         projected.least_terms = vec![0.0; n_observations * projected.columns.len()];
         projected.least_distances = vec![0.0; n_observations];
-        match projected.fill(projections, &used, buffers, &mut Meter::new(interrupt, POLL_EVERY)) {
+        let meter = &mut Meter::new(interrupt, POLL_EVERY);
+        let is_small = width <= MAX_SMALL_WIDTH && width * n_observations <= max_small_entries;
+        let are_layers_solved = if is_small && problem.end.is_none() && projected.are_all_in_columns() {
+            buffers.layers.solve(projections, problem, room, meter)
+        } else {
+            Ok(false)
+        };
+        let filled = match are_layers_solved {
+            Ok(true) => {
+                projected.take(&buffers.layers);
+                Ok(())
+            }
+            Ok(false) => projected.fill(projections, &used, buffers, meter),
+            Err(interrupted) => Err(interrupted),
+        };
+        match filled {
             Ok(()) => Ok(Some(projected)),
             Err(Interrupted::OutOfTime) => Ok(None),
             Err(Interrupted::Cancelled(cancelled)) => Err(cancelled),
         }
+    }
+
+    /// Takes over what was solved observation by observation, of the same columns.
+    fn take(&mut self, layers: &LayerTables) {
+        for observation in 0..self.problem.demonstration.len() {
+            let (entries, unchanged) = layers.at(observation);
+            for (class, entry) in entries.iter().enumerate() {
+                *self.table.at_mut(class, observation) = *entry;
+            }
+            self.unchanged[observation] = unchanged;
+            let least = layers.least_terms(observation);
+            self.least_terms[observation * least.len()..][..least.len()].copy_from_slice(least);
+            self.least_distances[observation] = least.iter().fold(0.0, |sum, least| sum + least);
+        }
+        layers.changing_columns().clone_into(&mut self.changing);
     }
 
     /// Fills the tables, of the projections that are `used`.

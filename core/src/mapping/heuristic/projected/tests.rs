@@ -103,8 +103,15 @@ proptest! {
             let problem = problem(&model, &request);
             let are_solved =
                 tables.solve(&projections, &problem, room, &mut Meter::new(&mut Uninterrupted, 1)).unwrap();
-            let solved = Projected::solve(&projections, &problem, room, &mut TableBuffers::default(), &mut Uninterrupted).unwrap();
-            let projected = solved.unwrap();
+            let projected = |max_small_entries| {
+                let mut buffers = TableBuffers::default();
+                let interrupt = &mut Uninterrupted;
+                let solved =
+                    Projected::solve_by(&projections, &problem, room, &mut buffers, max_small_entries, interrupt);
+                solved.unwrap().unwrap()
+            };
+            prop_assert_eq!(format!("{:?}", projected(usize::MAX)), format!("{:?}", projected(0)));
+            let projected = projected(0);
             prop_assert_eq!(are_solved, projected.are_all_in_columns());
             if !are_solved {
                 continue;
