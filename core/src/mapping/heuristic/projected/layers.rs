@@ -3,8 +3,8 @@
 use std::collections::BinaryHeap;
 use std::ops::Range;
 
+use super::extras::{Extras, settle};
 use super::room::TableRoom;
-use super::solving::{Extras, settle};
 use super::{ChangingColumn, Estimate};
 use crate::interrupt::{Interrupted, Meter};
 use crate::mapping::conditions::Body;

@@ -1,5 +1,6 @@
 //! Projections solved for one demonstration: tables of distances and exact costs-to-go.
 
+mod extras;
 mod layers;
 mod room;
 mod solving;
