@@ -32,8 +32,8 @@ use etude_core::mapping::{Demonstration, Options, Policy, WellFormed};
 const SOME_TIME: Duration = Duration::from_micros(50);
 
 impl Session {
-    /// Takes the states from `seq` on into what is coming, given their text: an array. Says whether it did. It does if they come next, and
-    /// nothing is wrong with them; all else is left to [`Self::take_in`], which takes several times as long.
+    /// Takes the states from `seq` on into what is coming, given their text: an array. Says whether it did. It does if they come next, take
+    /// little memory, and nothing is wrong with them; all else is left to [`Self::take_in`], which takes several times as long.
     pub fn take_in_next(&self, coming: &mut Coming, seq: u32, states: &str) -> bool {
         let n_received = coming.frames.last().map_or(self.n_received, |last| last.n_received);
         let model = self.mapper.model();
@@ -41,10 +41,11 @@ impl Session {
         if self.has_ended() || seq != n_received || self.perception.is_some() {
             return false;
         }
-        let well_formed = WellFormed {
-            max_len: most.saturating_sub(n_received as usize),
-            ..WellFormed::in_text(model.schema(), states.len())
-        };
+        // A text of three bytes is an observation of all attributes.
+        let n_uncounted = UNCOUNTED_BYTES / Demonstration::bytes_of(model.schema(), 1) as u64;
+        let max_len =
+            most.saturating_sub(n_received as usize).min(usize::try_from(n_uncounted).unwrap_or(usize::MAX).max(1));
+        let well_formed = WellFormed { max_len, ..WellFormed::in_text(model.schema(), states.len()) };
         let Ok(demonstration) = well_formed.read(states) else { return false };
         let Some(items) = states.trim().strip_prefix('[').and_then(|states| states.strip_suffix(']')) else {
             return false;

@@ -116,3 +116,18 @@ async fn who_resumes_a_session_does_not_wait_for_ever_for_its_model() {
     let resumed = etude.resume_session(&id, caller()).await;
     assert!(matches!(resumed, Err(SessionError::Service(ServiceError::Compiling { .. }))), "{resumed:?}");
 }
+
+#[tokio::test]
+async fn a_short_text_of_many_wide_observations_is_left_to_who_checks_their_size() {
+    let directory = tempfile::tempdir().unwrap();
+    let tasks = TaskTracker::new();
+    let (etude, session) = observed(directory.path(), &tasks).await;
+    let is_taken = |n: usize| {
+        let mut coming = Coming::default();
+        session.take_in_next(&mut coming, 1200, &format!("[{}]", vec!["{}"; n].join(",")))
+    };
+    // Each takes 7 KB.
+    assert!(is_taken(1) && is_taken(9));
+    assert!(!is_taken(10) && !is_taken(5000));
+    etude.close().await;
+}
