@@ -1,19 +1,17 @@
 //! Objects taken apart into their members, each of which stays text until it is known what to read it as.
 
 use std::borrow::Cow;
-use std::fmt;
 
-use serde::de::{Deserializer, Error as _, MapAccess, Visitor};
-use serde_json::value::RawValue;
 use serde_json::{Map, Value};
 
-use super::parsing::{TWICE, parse};
+use super::parsing::parse;
 use super::size::parsed_bytes;
 
 /// The members of an object, as text.
 ///
 /// A request is mostly its demonstration, which is read several times as fast once its model is known. So its members are told apart
-/// first, in one pass that copies nothing; then what is short is parsed, and what is long is deserialized into what it is.
+/// first, by their quotes and brackets alone: in one pass that copies nothing and takes a fraction of the time of reading. Whether a
+/// member is JSON, finds whoever reads it.
 #[derive(Debug)]
 pub struct Members<'t> {
     names: &'static [&'static str],
@@ -27,10 +25,23 @@ impl<'t> Members<'t> {
     #[must_use]
     pub fn split(text: &'t str, names: &'static [&'static str]) -> Option<Self> {
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
-        let mut deserializer = serde_json::Deserializer::from_str(text);
-        let members = deserializer.deserialize_map(Split(names)).ok()?;
-        deserializer.end().ok()?;
-        Some(members)
+        let mut rest = Rest { text, at: 0 };
+        let mut texts = vec![None; names.len()];
+        rest.mark(b"{")?;
+        let mut mark = b',';
+        while mark != b'}' {
+            let name = match rest.value()? {
+                name if name.contains('\\') => serde_json::from_str::<String>(name).ok()?.into(),
+                name => Cow::Borrowed(name.strip_prefix('"')?.strip_suffix('"')?),
+            };
+            let position = names.iter().position(|known| *known == name)?;
+            rest.mark(b":")?;
+            if texts[position].replace(rest.value()?).is_some() {
+                return None;
+            }
+            mark = rest.mark(b",}")?;
+        }
+        rest.is_blank().then_some(Self { names, texts })
     }
 
     /// Takes the text of the member called `name` out.
@@ -64,34 +75,114 @@ impl<'t> Members<'t> {
     }
 }
 
-struct Split(&'static [&'static str]);
+/// What is left of a text.
+struct Rest<'t> {
+    text: &'t str,
+    at: usize,
+}
 
-impl<'de> Visitor<'de> for Split {
-    type Value = Members<'de>;
-
-    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str("an object")
+impl<'t> Rest<'t> {
+    fn skip_blanks(&mut self) {
+        let blanks = self.text.as_bytes()[self.at..].iter().take_while(|byte| b" \t\n\r".contains(byte));
+        self.at += blanks.count();
     }
 
-    fn visit_map<A: MapAccess<'de>>(self, mut members: A) -> Result<Self::Value, A::Error> {
-        let Self(names) = self;
-        let mut texts = vec![None; names.len()];
-        while let Some(name) = members.next_key::<Cow<'de, str>>()? {
-            let position = names.iter().position(|known| *known == name);
-            let position = position.ok_or_else(|| A::Error::custom("unknown member"))?;
-            if texts[position].replace(members.next_value::<&'de RawValue>()?.get()).is_some() {
-                return Err(A::Error::custom(TWICE));
+    fn is_blank(mut self) -> bool {
+        self.skip_blanks();
+        self.at == self.text.len()
+    }
+
+    /// Takes what comes next, blanks aside, if it is one of `marks`.
+    fn mark(&mut self, marks: &[u8]) -> Option<u8> {
+        self.skip_blanks();
+        let mark = *self.text.as_bytes().get(self.at)?;
+        self.at += 1;
+        marks.contains(&mark).then_some(mark)
+    }
+
+    /// Takes the text of the value that comes next, blanks aside.
+    fn value(&mut self) -> Option<&'t str> {
+        self.skip_blanks();
+        let from = self.at;
+        let rest = &self.text.as_bytes()[from..];
+        match rest.first()? {
+            b'"' => self.skip_string()?,
+            b'{' | b'[' => self.skip_brackets()?,
+            // A number or a word.
+            _ => self.at += rest.iter().take_while(|byte| !b" \t\n\r,:}]".contains(byte)).count(),
+        }
+        (from < self.at).then(|| &self.text[from..self.at])
+    }
+
+    /// Goes past the bracket that is here and the one that closes it, of whatever kind.
+    fn skip_brackets(&mut self) -> Option<()> {
+        let bytes = self.text.as_bytes();
+        let mut depth = 0_usize;
+        loop {
+            match bytes.get(self.at)? {
+                b'"' => {
+                    self.skip_string()?;
+                    continue;
+                }
+                b'{' | b'[' => depth += 1,
+                b'}' | b']' => depth -= 1,
+                _ => {}
+            }
+            self.at += 1;
+            if depth == 0 {
+                return Some(());
             }
         }
-        Ok(Members { names, texts })
+    }
+
+    /// Goes past the string that begins here.
+    fn skip_string(&mut self) -> Option<()> {
+        let bytes = self.text.as_bytes();
+        self.at += 1;
+        loop {
+            match bytes.get(self.at)? {
+                b'"' => break,
+                b'\\' => self.at += 2,
+                _ => self.at += 1,
+            }
+        }
+        self.at += 1;
+        Some(())
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
     use serde_json::json;
 
     use super::*;
+
+    /// What texts of objects are put together of.
+    const PIECES: [&str; 22] = [
+        r#""model":"#,
+        r#""start":"#,
+        r#" "st\u0061rt" : "#,
+        r#""other":"#,
+        ",",
+        ", ",
+        ":",
+        " ",
+        "{",
+        "}",
+        "[",
+        "]",
+        "7",
+        "-1.5e3",
+        "null",
+        r#""""#,
+        r#""a\"b,{""#,
+        r#""\\""#,
+        r#""\u00e9é""#,
+        r#""x":[1,{"y":"]"}]"#,
+        "\"",
+        "\\",
+    ];
 
     const NAMES: [&str; 3] = ["model", "demonstration", "start"];
 
@@ -112,13 +203,60 @@ mod tests {
 
     #[test]
     fn what_is_no_object_of_these_members_is_left_to_be_explained() {
-        let twice = r#"{"model":"b","start":{},"model":"a"}"#;
-        for text in ["", "[]", "7", r#"{"model":"a"} x"#, r#"{"model":"a""#, r#"{"hurry":1}"#, r#"{"model":01}"#, twice]
-        {
+        for text in [
+            "",
+            "[]",
+            "7",
+            "{}",
+            r#"{"model""#,
+            r#"{"model":"#,
+            r#"{"model":}"#,
+            r#"{"model":"a""#,
+            r#"{"model":"a\"#,
+            r#"{"model":"a},"#,
+            r#"{"model":"a",}"#,
+            r#"{"model":"a" "start":7}"#,
+            r#"{"model","start":7}"#,
+            r#"{"model":"a"} x"#,
+            r#"{"start":[{"x":1}}"#,
+            r#"{"start":[[]]]}"#,
+            r#"{model:"a"}"#,
+            r#"{"mod\el":"a"}"#,
+            r#"{"hurry":1}"#,
+            r#"{"model":"b","start":{},"model":"a"}"#,
+        ] {
             assert!(Members::split(text, &NAMES).is_none(), "{text}");
         }
-        for text in [r#"{"start":1e999}"#, r#"{"start":{"x":1,"x":1}}"#] {
-            assert_eq!(Members::split(text, &NAMES).unwrap().parse(), None);
+    }
+
+    #[test]
+    fn whether_a_member_is_json_finds_whoever_reads_it() {
+        for text in [
+            r#"{"start":1e999}"#,
+            r#"{"start":{"x":1,"x":1}}"#,
+            r#"{"model":01}"#,
+            r#"{"model":yes}"#,
+            r#"{"model":"\q"}"#,
+            "{\"model\":\"a\nb\"}",
+            r#"{"start":[1,2}}"#,
+            r#"{"start":[1 2]}"#,
+            r#"{"start":[],"model":a"b}"#,
+        ] {
+            assert_eq!(Members::split(text, &NAMES).unwrap().parse(), None, "{text}");
+        }
+    }
+
+    proptest! {
+        /// Against the parser: whatever it reads as an object of these members is told apart as it reads them, and what it does not read is
+        /// told apart by nobody who reads all members.
+        #[test]
+        fn members_are_those_that_a_parser_reads(pieces in prop::collection::vec(prop::sample::select(&PIECES[..]), 0..12)) {
+            let text = format!("{{{}}}", pieces.concat());
+            let parsed = parse(text.as_bytes()).ok().filter(|value| {
+                value.as_object().is_some_and(|members| !members.is_empty() && members.keys().all(|name| NAMES.contains(&&**name)))
+            });
+            let split = Members::split(&text, &NAMES).and_then(|members| members.parse());
+            prop_assert_eq!(split, parsed, "{}", text);
         }
     }
 }
