@@ -105,22 +105,29 @@ pub(super) struct LayerEstimates<'t> {
 
 impl LayerEstimates<'_> {
     /// What the node of a state costs.
-    #[inline]
+    #[expect(clippy::inline_always, reason = "it is what a search does most")]
+    #[inline(always)]
     pub(super) fn of(&self, state: StateIdx) -> Estimate {
         let [mut first, mut second] = self.tables.joined[state as usize].map(|look| self.sums[look as usize]);
         if !self.tables.left.is_empty() {
-            let n_left = self.tables.parts.each_ref().map(|part| part.left.len());
-            let left = &self.tables.left[state as usize * (n_left[0] + n_left[1])..];
-            let (of_first, left) = left.split_at(n_left[0]);
-            for look in of_first {
-                first += self.sums[*look as usize];
-            }
-            for look in &left[..n_left[1]] {
-                second += self.sums[*look as usize];
-            }
+            self.add_left(state, &mut first, &mut second);
         }
         first += second;
         first
+    }
+
+    /// Adds what the columns of a state come to that are left of each part.
+    #[cold]
+    fn add_left(&self, state: StateIdx, first: &mut Estimate, second: &mut Estimate) {
+        let n_left = self.tables.parts.each_ref().map(|part| part.left.len());
+        let left = &self.tables.left[state as usize * (n_left[0] + n_left[1])..];
+        let (of_first, left) = left.split_at(n_left[0]);
+        for look in of_first {
+            *first += self.sums[*look as usize];
+        }
+        for look in &left[..n_left[1]] {
+            *second += self.sums[*look as usize];
+        }
     }
 }
 
