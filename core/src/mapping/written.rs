@@ -151,13 +151,13 @@ impl<'a> WrittenPolicy<'a> {
             }
             if let Some(n_terms) = step.n_terms {
                 term_bytes = 0;
-                for (position, _) in terms.by_ref().take(n_terms as usize) {
-                    term_bytes += pieces.name(*position as usize)?.len() + NUMBER_BYTES;
+                for term in terms.by_ref().take(n_terms as usize) {
+                    term_bytes += pieces.name(term.attribute as usize)?.len() + NUMBER_BYTES;
                 }
             }
             let action = step.action.map(|place| pieces.action(place)).transpose()?;
             // Once in its step, and once among the actions.
-            let action_bytes = action.map_or(0, |(name, cost)| 2 * name.len() + cost.len());
+            let action_bytes = action.map_or(0, |action| 2 * action.name.len() + action.cost.len());
             n_bytes = n_bytes.saturating_add(STEP_BYTES + state_bytes + term_bytes + action_bytes);
         }
         Ok(n_bytes)
@@ -178,7 +178,7 @@ impl<'a> WrittenPolicy<'a> {
         writer.raw(r#""actions":["#);
         for (n, place) in short.steps.iter().filter_map(|step| step.action).enumerate() {
             writer.raw(if n == 0 { "" } else { "," });
-            writer.raw(pieces.action(place)?.0);
+            writer.raw(pieces.action(place)?.name);
         }
         writer.raw(r#"],"steps":["#);
         let (mut changed, mut values) = (short.changed.iter(), short.values.as_str());
@@ -249,19 +249,39 @@ pub struct ShortSteps<'a> {
     changed: Vec<(u32, u32)>,
     /// JSON, one after the other.
     values: String,
-    /// Attributes, and the terms of the distance that are not 0.
-    terms: Vec<(u32, f64)>,
+    /// The terms of the distance that are not 0.
+    terms: Vec<Term>,
 }
 
-/// A step. It has its number and its move from those before it.
+/// What an attribute adds to the distance of a step.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+struct Term {
+    attribute: u32,
+    #[serde(with = "short_float")]
+    paid: f64,
+}
+
+/// Floats as the numbers that their bits are from the last one on: round ones are small, and take two or three bytes.
+mod short_float {
+    use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+    #[expect(clippy::trivially_copy_pass_by_ref, reason = "so serde calls it")]
+    pub(super) fn serialize<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
+        value.to_bits().swap_bytes().serialize(serializer)
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+        Ok(f64::from_bits(u64::deserialize(deserializer)?.swap_bytes()))
+    }
+}
+
+/// A step. It has its number and its move from those before it, and its cost from all their action costs and terms.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 struct ShortStep {
     observation: u32,
     /// Its place among the actions.
     action: Option<u32>,
     state_index: u32,
-    /// Of the steps up to and including this one.
-    cost: f64,
     n_changed: u32,
     /// `None` if the terms are those of the step before.
     n_terms: Option<u32>,
@@ -284,7 +304,6 @@ impl<'a> ShortSteps<'a> {
             terms: Vec::with_capacity(n_steps),
         };
         let mut values = Vec::with_capacity(n_changed * VALUE_BYTES);
-        let mut sum = CostSum::default();
         let mut is_exact = vec![false; problem.demonstration.len()];
         let mut places = FxHashMap::default();
         // Of the step before: its row, and where its terms stand.
@@ -304,9 +323,9 @@ impl<'a> ShortSteps<'a> {
             let i = step.observation as usize;
             let own_terms = problem.distances.terms(i, row).map(|(position, term)| {
                 let paid = recurrence.paid(step.kind, term);
-                (count(position), paid)
+                Term { attribute: count(position), paid }
             });
-            short.terms.extend(own_terms.filter(|(_, term)| *term > 0.0));
+            short.terms.extend(own_terms.filter(|term| term.paid > 0.0));
             is_exact[i] |= short.terms.len() == from && (problem.pays_at(step) || problem.is_met(i, states, row));
             let n_terms = if short.terms[from..] == short.terms[terms.clone()] {
                 short.terms.truncate(from);
@@ -315,7 +334,6 @@ impl<'a> ShortSteps<'a> {
                 terms = from..short.terms.len();
                 Some(count(terms.len()))
             };
-            sum.add(*action_cost, distance(&short.terms[terms.clone()]));
             let action = step.action.map(|action| {
                 *places.entry((action, action_cost.to_bits())).or_insert_with(|| {
                     short.actions.push((&model.action(action).name, *action_cost));
@@ -326,7 +344,6 @@ impl<'a> ShortSteps<'a> {
                 observation: problem.number_of(step.observation),
                 action,
                 state_index: step.state,
-                cost: sum.total(),
                 n_changed: count(short.changed.len() - n_before),
                 n_terms,
             });
@@ -339,22 +356,18 @@ impl<'a> ShortSteps<'a> {
     /// About how many bytes they take in a format in which small numbers take one.
     #[must_use]
     pub fn n_bytes(&self) -> usize {
-        /// Most numbers take one, costs eight.
-        const STEP_BYTES: usize = 16;
+        /// Most numbers take one.
+        const STEP_BYTES: usize = 8;
         const ACTION_BYTES: usize = 24;
+        /// At most.
+        const TERM_BYTES: usize = 11;
         self.actions.len() * ACTION_BYTES
             + self.steps.len() * STEP_BYTES
             + self.changed.len() * 2
             + self.values.len()
-            + self.terms.len() * 9
+            + self.terms.len() * TERM_BYTES
             + STEP_BYTES
     }
-}
-
-/// The sum of the terms of a distance, in their order.
-fn distance(terms: &[(u32, f64)]) -> f64 {
-    // Not `sum`, of which nothing is -0.
-    terms.iter().fold(0.0, |sum, (_, term)| sum + term)
 }
 
 /// A number of things of which a policy has far fewer than 2^32.
@@ -371,8 +384,21 @@ struct Pieces {
     text: Vec<u8>,
     /// By attribute, where its name is, as that of a member of an object.
     names: Vec<Range<usize>>,
-    /// By action, where its name and its cost are.
-    actions: Vec<(Range<usize>, Range<usize>)>,
+    /// By action, where its name and its cost are, and that cost.
+    actions: Vec<(Range<usize>, Range<usize>, f64)>,
+}
+
+/// An action that was taken.
+struct ActionPiece<'p> {
+    /// JSON, as is the next.
+    name: &'p [u8],
+    cost: &'p [u8],
+    paid: f64,
+}
+
+impl ActionPiece<'_> {
+    /// What stands for one in a step without any.
+    const NONE: Self = Self { name: b"null", cost: b"0.0", paid: 0.0 };
 }
 
 impl Pieces {
@@ -391,7 +417,7 @@ impl Pieces {
             pieces.names.push(name.start..name.end + 1);
         }
         for (name, cost) in actions {
-            let action = (pieces.add(name)?, pieces.add(cost)?);
+            let action = (pieces.add(name)?, pieces.add(cost)?, *cost);
             pieces.actions.push(action);
         }
         Ok(pieces)
@@ -409,10 +435,10 @@ impl Pieces {
         Ok(&self.text[name.clone()])
     }
 
-    /// The name and the cost of the action at `place`.
-    fn action(&self, place: u32) -> Result<(&[u8], &[u8]), WriteError> {
-        let (name, cost) = self.actions.get(place as usize).ok_or(WriteError::Missing("an action"))?;
-        Ok((&self.text[name.clone()], &self.text[cost.clone()]))
+    /// The action at `place`.
+    fn action(&self, place: u32) -> Result<ActionPiece<'_>, WriteError> {
+        let (name, cost, paid) = self.actions.get(place as usize).ok_or(WriteError::Missing("an action"))?;
+        Ok(ActionPiece { name: &self.text[name.clone()], cost: &self.text[cost.clone()], paid: *paid })
     }
 }
 
@@ -424,8 +450,11 @@ struct AnswerWriter<'p> {
     values: Vec<StateValue<'p>>,
     /// The members of the state; empty where they are to be written anew.
     state: Vec<u8>,
-    /// The members that tell the distance.
-    distance: Vec<u8>,
+    /// The distance, and the members that tell it.
+    distance: f64,
+    distance_text: Vec<u8>,
+    /// Of the steps so far.
+    cost: CostSum,
     n_steps: u32,
 }
 
@@ -449,7 +478,9 @@ impl<'p> AnswerWriter<'p> {
             pieces,
             values: vec![StateValue::default(); pieces.names.len()],
             state: Vec::with_capacity(state_bytes),
-            distance: Vec::with_capacity(STEP_BYTES),
+            distance: 0.0,
+            distance_text: Vec::with_capacity(STEP_BYTES),
+            cost: CostSum::default(),
             n_steps: 0,
         };
         writer.set_terms(&[])?;
@@ -492,26 +523,30 @@ impl<'p> AnswerWriter<'p> {
     }
 
     /// From the next step on, these are the terms of the distance.
-    fn set_terms(&mut self, terms: &[(u32, f64)]) -> Result<(), WriteError> {
-        self.distance.clear();
-        self.distance.extend_from_slice(br#""distance":"#);
-        serde_json::to_writer(&mut self.distance, &distance(terms))?;
-        self.distance.extend_from_slice(br#","distance_by_attribute":{"#);
-        for (n, (position, term)) in terms.iter().enumerate() {
+    fn set_terms(&mut self, terms: &[Term]) -> Result<(), WriteError> {
+        // Not `sum`, of which nothing is -0.
+        self.distance = terms.iter().fold(0.0, |sum, term| sum + term.paid);
+        let text = &mut self.distance_text;
+        text.clear();
+        text.extend_from_slice(br#""distance":"#);
+        serde_json::to_writer(&mut *text, &self.distance)?;
+        text.extend_from_slice(br#","distance_by_attribute":{"#);
+        for (n, term) in terms.iter().enumerate() {
             if n > 0 {
-                self.distance.push(b',');
+                text.push(b',');
             }
-            self.distance.extend_from_slice(self.pieces.name(*position as usize)?);
-            serde_json::to_writer(&mut self.distance, term)?;
+            text.extend_from_slice(self.pieces.name(term.attribute as usize)?);
+            serde_json::to_writer(&mut *text, &term.paid)?;
         }
-        self.distance.push(b'}');
+        text.push(b'}');
         Ok(())
     }
 
     /// Writes the next step.
     fn step(&mut self, step: &ShortStep, kind: MoveKind) -> Result<(), WriteError> {
         let action = step.action.map(|place| self.pieces.action(place)).transpose()?;
-        let (action, action_cost) = action.unwrap_or((b"null", b"0.0"));
+        let action = action.unwrap_or(ActionPiece::NONE);
+        self.cost.add(action.paid, self.distance);
         if self.state.is_empty() {
             self.write_state()?;
         }
@@ -523,15 +558,15 @@ impl<'p> AnswerWriter<'p> {
             MoveKind::Extra => r#","move":"extra","action":"#,
             MoveKind::Skip => r#","move":"skip","action":"#,
         });
-        self.raw(action);
+        self.raw(action.name);
         self.raw(r#","state":{"#);
         self.text.extend_from_slice(&self.state);
         self.member(r#"},"state_index":"#, step.state_index)?;
         self.raw(r#","action_cost":"#);
-        self.raw(action_cost);
+        self.raw(action.cost);
         self.raw(",");
-        self.text.extend_from_slice(&self.distance);
-        self.member(r#","cost":"#, step.cost)?;
+        self.text.extend_from_slice(&self.distance_text);
+        self.member(r#","cost":"#, self.cost.total())?;
         self.raw("}");
         self.n_steps += 1;
         Ok(())
