@@ -44,7 +44,8 @@ pub(super) async fn make_policy(
 ) -> Result<Response, Problem> {
     let body = read_json(request, &context).await?;
     let made = match key {
-        None => context.etude.make_policy(body, caller).await?,
+        // Boxed, as the router moves what it awaits several times.
+        None => Box::pin(context.etude.make_policy(body, caller)).await?,
         Some(key) => Box::pin(context.etude.make_policy_once(&key, body, caller)).await?,
     };
     let status = if made.id.is_some() { StatusCode::CREATED } else { StatusCode::OK };
