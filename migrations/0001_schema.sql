@@ -84,7 +84,7 @@ CREATE TABLE policies (
     learner        TEXT,
     status         TEXT    NOT NULL,
     summary        TEXT    NOT NULL, -- JSON: the policy without its steps
-    steps          BLOB    NOT NULL, -- the steps in short (postcard)
+    steps          BLOB    NOT NULL, -- the steps in short (postcard), from which their costs follow
     checksum       INTEGER NOT NULL, -- CRC-32 of the summary (high half) and of the steps (low half)
     refined_by     TEXT,             -- the id of the policy that refines it
     created_at_ms  INTEGER NOT NULL

@@ -44,7 +44,7 @@ pub(super) async fn note(writing: &mut Writing<'_>, NoteAlive { now, every }: No
     let query = sqlx::query_scalar(
         "SELECT MAX(at_ms) FROM
              (SELECT last_alive_ms AS at_ms FROM service
-              UNION ALL SELECT MAX(active_at_ms) FROM sessions WHERE status = 'open')",
+              UNION ALL SELECT MAX(active_at_ms) FROM sessions INDEXED BY sessions_by_activity WHERE status = 'open')",
     );
     let last_ms: Option<i64> = query.fetch_one(&mut *connection).await?;
     let gap_ms = last_ms.map_or(0, |last_ms| now_ms.saturating_sub(last_ms));

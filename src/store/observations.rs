@@ -140,15 +140,24 @@ pub(super) struct OpenSession {
     pub(super) n_observations: u32,
 }
 
+// In these two, the sign before `status` keeps SQLite from going through all open sessions by the index of that, rather than by their ids.
+
+const FIND_OPEN: &str = "SELECT id, owner, n_observations FROM sessions
+     WHERE +status = 'open' AND id IN (SELECT value FROM json_each($1))";
+
+/// Only what comes next, and only once, whatever is retried or raced.
+const COUNT_NEXT: &str = "UPDATE sessions
+     SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 3)
+     FROM json_each($1) AS new
+     WHERE sessions.id = new.value ->> 0 AND +status = 'open' AND n_observations = new.value ->> 1
+     RETURNING sessions.id";
+
 /// The open ones among the sessions with these ids (JSON: an array), with how many observations their table has of each.
 pub(super) async fn find_open(
     connection: &mut SqliteConnection,
     ids: &str,
 ) -> Result<Vec<(String, OpenSession)>, StoreError> {
-    let query = sqlx::query_as::<_, (String, u32, u32)>(
-        "SELECT id, owner, n_observations FROM sessions
-         WHERE status = 'open' AND id IN (SELECT value FROM json_each($1))",
-    );
+    let query = sqlx::query_as::<_, (String, u32, u32)>(FIND_OPEN);
     let open = query.bind(ids).fetch_all(connection).await?.into_iter();
     Ok(open.map(|(id, owner, n_observations)| (id, OpenSession { owner: Owner(owner), n_observations })).collect())
 }
@@ -157,17 +166,10 @@ pub(super) async fn find_open(
 /// statements, however many there are: each one costs the driver a change of threads.
 pub(super) async fn add(connection: &mut SqliteConnection, group: &[&Arrived]) -> Result<Vec<bool>, StoreError> {
     let rows = group.iter().map(|new| json!([new.session_id, new.seq, new.n_states, new.at.as_millisecond()]));
-    // Only what comes next, and only once, whatever is retried or raced.
-    let updated = sqlx::query_scalar::<_, String>(
-        "UPDATE sessions
-         SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 3)
-         FROM json_each($1) AS new
-         WHERE sessions.id = new.value ->> 0 AND status = 'open' AND n_observations = new.value ->> 1
-         RETURNING sessions.id",
-    )
-    .bind(Value::Array(rows.collect()).to_string())
-    .fetch_all(&mut *connection)
-    .await?;
+    let updated = sqlx::query_scalar::<_, String>(COUNT_NEXT)
+        .bind(Value::Array(rows.collect()).to_string())
+        .fetch_all(&mut *connection)
+        .await?;
     let updated: HashSet<String> = updated.into_iter().collect();
     let is_updated: Vec<bool> = group.iter().map(|new| updated.contains(&new.session_id)).collect();
     let added = group.iter().zip(&is_updated).filter(|(_, is_updated)| **is_updated).map(|(new, _)| *new);
@@ -210,4 +212,30 @@ async fn insert<R>(
         query.build().persistent(false).execute(&mut *connection).await?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use sqlx::sqlite::SqliteConnectOptions;
+    use sqlx::{ConnectOptions, Row};
+    use tokio_util::task::TaskTracker;
+
+    use super::*;
+    use crate::store::Store;
+
+    /// However many sessions are open, those that are asked for are found by their ids.
+    #[tokio::test]
+    async fn what_comes_for_a_session_does_not_look_at_the_others_that_are_open() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("etude.db");
+        let _store = Store::open(&path, &TaskTracker::new()).await.unwrap();
+        let mut connection = SqliteConnectOptions::new().filename(&path).connect().await.unwrap();
+        for statement in [FIND_OPEN, COUNT_NEXT] {
+            let explain = sqlx::AssertSqlSafe(format!("EXPLAIN QUERY PLAN {statement}"));
+            let plan = sqlx::query(explain).bind("[]").fetch_all(&mut connection).await.unwrap();
+            let looks: Vec<String> = plan.iter().map(|row| row.get("detail")).collect();
+            let by_id = "SEARCH sessions USING INDEX sqlite_autoindex_sessions_1 (id=?)";
+            assert!(looks.iter().any(|look| look == by_id), "{looks:?}");
+        }
+    }
 }

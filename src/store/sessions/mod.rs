@@ -336,7 +336,8 @@ impl Store {
     /// If the database failed.
     pub async fn timed_sessions(&self) -> Result<Vec<String>, StoreError> {
         let query = sqlx::query_scalar(
-            "SELECT id FROM sessions WHERE status = 'open' AND lookahead_ms IS NOT NULL ORDER BY sequence",
+            "SELECT id FROM sessions INDEXED BY sessions_by_time
+             WHERE status = 'open' AND lookahead_ms IS NOT NULL ORDER BY sequence",
         );
         Ok(query.fetch_all(&mut *self.reader().await?).await?)
     }
