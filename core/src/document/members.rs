@@ -1,6 +1,7 @@
 //! Objects taken apart into their members, each of which stays text until it is known what to read it as.
 
 use std::borrow::Cow;
+use std::slice;
 
 use serde_json::{Map, Value};
 
@@ -25,7 +26,7 @@ impl<'t> Members<'t> {
     #[must_use]
     pub fn split(text: &'t str, names: &'static [&'static str]) -> Option<Self> {
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
-        let mut rest = Rest { text, at: 0 };
+        let mut rest = Rest::of(text);
         let mut texts = vec![None; names.len()];
         rest.mark(b"{")?;
         let mut mark = b',';
@@ -78,76 +79,82 @@ impl<'t> Members<'t> {
 /// What is left of a text.
 struct Rest<'t> {
     text: &'t str,
-    at: usize,
+    left: slice::Iter<'t, u8>,
 }
 
 impl<'t> Rest<'t> {
+    fn of(text: &'t str) -> Self {
+        Self { text, left: text.as_bytes().iter() }
+    }
+
+    fn at(&self) -> usize {
+        self.text.len() - self.left.len()
+    }
+
+    fn peek(&self) -> Option<u8> {
+        self.left.as_slice().first().copied()
+    }
+
+    fn skip_while(&mut self, is_skipped: impl Fn(u8) -> bool) {
+        while self.peek().is_some_and(&is_skipped) {
+            self.left.next();
+        }
+    }
+
     fn skip_blanks(&mut self) {
-        let blanks = self.text.as_bytes()[self.at..].iter().take_while(|byte| b" \t\n\r".contains(byte));
-        self.at += blanks.count();
+        self.skip_while(|byte| b" \t\n\r".contains(&byte));
     }
 
     fn is_blank(mut self) -> bool {
         self.skip_blanks();
-        self.at == self.text.len()
+        self.left.len() == 0
     }
 
     /// Takes what comes next, blanks aside, if it is one of `marks`.
     fn mark(&mut self, marks: &[u8]) -> Option<u8> {
         self.skip_blanks();
-        let mark = *self.text.as_bytes().get(self.at)?;
-        self.at += 1;
-        marks.contains(&mark).then_some(mark)
+        self.left.next().copied().filter(|mark| marks.contains(mark))
     }
 
     /// Takes the text of the value that comes next, blanks aside.
     fn value(&mut self) -> Option<&'t str> {
         self.skip_blanks();
-        let from = self.at;
-        let rest = &self.text.as_bytes()[from..];
-        match rest.first()? {
-            b'"' => self.skip_string()?,
-            b'{' | b'[' => self.skip_brackets()?,
+        let from = self.at();
+        match self.peek()? {
+            b'"' | b'{' | b'[' => self.skip_brackets()?,
             // A number or a word.
-            _ => self.at += rest.iter().take_while(|byte| !b" \t\n\r,:}]".contains(byte)).count(),
+            _ => self.skip_while(|byte| !b" \t\n\r,:}]".contains(&byte)),
         }
-        (from < self.at).then(|| &self.text[from..self.at])
+        Some(&self.text[from..self.at()]).filter(|value| !value.is_empty())
     }
 
-    /// Goes past the bracket that is here and the one that closes it, of whatever kind.
+    /// Goes past a string, or past a bracket and the one that closes it, of whatever kind.
     fn skip_brackets(&mut self) -> Option<()> {
-        let bytes = self.text.as_bytes();
         let mut depth = 0_usize;
         loop {
-            match bytes.get(self.at)? {
-                b'"' => {
-                    self.skip_string()?;
-                    continue;
-                }
+            match self.left.next()? {
+                b'"' => self.skip_to_quote()?,
                 b'{' | b'[' => depth += 1,
                 b'}' | b']' => depth -= 1,
-                _ => {}
+                _ => continue,
             }
-            self.at += 1;
             if depth == 0 {
                 return Some(());
             }
         }
     }
 
-    /// Goes past the string that begins here.
-    fn skip_string(&mut self) -> Option<()> {
-        let bytes = self.text.as_bytes();
-        self.at += 1;
+    /// Goes past the quote that ends a string.
+    fn skip_to_quote(&mut self) -> Option<()> {
         loop {
-            match bytes.get(self.at)? {
-                b'"' => break,
-                b'\\' => self.at += 2,
-                _ => self.at += 1,
+            match self.left.next()? {
+                b'"' => return Some(()),
+                b'\\' => {
+                    self.left.next()?;
+                }
+                _ => {}
             }
         }
-        self.at += 1;
-        Some(())
     }
 }
 

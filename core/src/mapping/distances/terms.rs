@@ -48,7 +48,7 @@ impl Terms {
         let mut n_entries_left = MAX_TABLE_ENTRIES;
         let weighted = schema.attributes().iter().zip(weights.as_slice()).enumerate();
         let mut observed = DistinctValues::default();
-        let mut attributes = Vec::new();
+        let mut attributes = Vec::with_capacity(schema.len());
         for (position, (attribute, weight)) in weighted.filter(|(_, (_, weight))| **weight > 0.0) {
             let domain = states.domain(position);
             let rows = observed.number(demonstration, conditions, position);
