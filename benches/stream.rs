@@ -1,5 +1,5 @@
-//! Streaming: round trips beside a bare echo and what the disk can do, memory, and recovery. What the core takes is measured by
-//! `lookahead`.
+//! Streaming: round trips beside a bare echo, beside one that does the least that a service must, and beside what the disk can do;
+//! memory, and recovery. What the core takes is measured by `lookahead`.
 //!
 //! `cargo bench --bench stream` runs all of it, `cargo bench --bench stream -- round-trips memory many recovery` the parts named.
 //! Rounds of what is compared are interleaved, so that a machine that slows down slows all of them down. Client and
@@ -18,8 +18,9 @@ use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use axum::extract::WebSocketUpgrade;
+use axum::extract::{State, WebSocketUpgrade};
 use axum::routing::get;
+use etude_core::attribute::Value as AttributeValue;
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
 use etude_core::mapping::{Conditions, Mapper, OnlineMapping};
@@ -28,6 +29,7 @@ use futures_util::{SinkExt, StreamExt};
 use serde_json::{Value, json};
 use sqlx::Connection;
 use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{mpsc, oneshot};
 use tokio_tungstenite::tungstenite::Message;
 use tokio_tungstenite::{MaybeTlsStream, WebSocketStream};
 use worlds::World;
@@ -43,11 +45,11 @@ fn main() -> Result<(), Failure> {
     let parts: Vec<String> = std::env::args().skip(1).filter(|part| !part.starts_with('-')).collect();
     let is_wanted = |name: &str| parts.is_empty() || parts.iter().any(|part| part == name);
     tokio::runtime::Runtime::new()?.block_on(async {
-        if parts == [SERVE_ECHO] {
-            return serve_echo().await;
+        if parts.first().is_some_and(|part| part == SERVE_ECHO) {
+            return serve_echo(parts.get(1).map(String::as_str)).await;
         }
         if is_wanted("round-trips") {
-            for world in [corridor(), worlds::example("figure-4")] {
+            for world in [CORRIDOR, FIGURE_4].map(world) {
                 for n_connections in [1, 100] {
                     round_trips(&world, n_connections).await?;
                 }
@@ -175,10 +177,62 @@ impl Stream {
     }
 }
 
-/// Sends each message back as often as its first digit says, in one write.
-async fn echo(upgrade: WebSocketUpgrade) -> axum::response::Response {
-    upgrade.on_upgrade(async |mut socket| {
+/// What a service cannot do without: it keeps what comes, and searches.
+struct Least {
+    mapper: Arc<Mapper>,
+    observations: Vec<Vec<Option<AttributeValue>>>,
+    keeper: mpsc::Sender<oneshot::Sender<()>>,
+}
+
+impl Least {
+    /// For `world`, with a writer that takes what waits into one commit, as a row.
+    async fn start(world: &World) -> Result<Self, Failure> {
+        const MOST_AT_ONCE: usize = 256;
+        let mapper = mapper(world)?;
+        let schema = mapper.model().schema();
+        let read = |state| schema.read_observation(&Place::root(state), &mut Faults::default()).ok_or("faults");
+        let observations = world.demonstration.as_array().into_iter().flatten().map(read).collect::<Result<_, _>>()?;
+        let (mut connection, directory) = rows().await?;
+        let (keeper, mut waiting) = mpsc::channel::<oneshot::Sender<()>>(2 * MOST_AT_ONCE);
+        tokio::spawn(async move {
+            let (_directory, mut group) = (directory, Vec::new());
+            while waiting.recv_many(&mut group, MOST_AT_ONCE).await > 0 {
+                let row = LINE.repeat(group.len());
+                let insert = sqlx::query("INSERT INTO t (observation) VALUES ($1)").bind(row);
+                insert.execute(&mut connection).await.expect("a row can be written");
+                for kept in group.drain(..) {
+                    // Whoever is gone does not want to know.
+                    let _ = kept.send(());
+                }
+                tokio::task::yield_now().await;
+            }
+        });
+        Ok(Self { mapper, observations, keeper })
+    }
+
+    /// Returns once a line is on disk.
+    async fn keep(&self) -> Option<()> {
+        let (kept, is_kept) = oneshot::channel();
+        self.keeper.send(kept).await.ok()?;
+        is_kept.await.ok()
+    }
+}
+
+/// Sends each message back as often as its first digit says, in one write; if it is to do the least that a service does, once that is done.
+async fn echo(State(least): State<Option<Arc<Least>>>, upgrade: WebSocketUpgrade) -> axum::response::Response {
+    upgrade.on_upgrade(async move |mut socket| {
+        let mut followed = least.as_deref().map(|Least { mapper, observations, .. }| {
+            let weights = mapper.model().schema().weights();
+            let online = OnlineMapping::new(mapper, weights, Conditions::default(), NonZeroU32::new(8));
+            (online, observations.iter().cycle())
+        });
         while let Some(Ok(message)) = socket.recv().await {
+            if let (Some(least), Some((online, observations))) = (&least, &mut followed) {
+                let steps = observations.next().map(|next| online.observe(next, None, &mut Uninterrupted).is_ok());
+                if steps != Some(true) || least.keep().await.is_none() {
+                    return;
+                }
+            }
             let digit = message.to_text().ok().and_then(|text| text.chars().next()?.to_digit(10));
             for _ in 0..digit.unwrap_or(1) {
                 if socket.feed(message.clone()).await.is_err() {
@@ -217,8 +271,13 @@ impl Echoed {
 /// What this program does when it is started by [`Echo::start`].
 const SERVE_ECHO: &str = "serve-echo";
 
-/// The echo, alone in a process as the service is; it ends with its standard input.
-async fn serve_echo() -> Result<(), Failure> {
+/// The echo, alone in a process as the service is; it ends with its standard input. With the name of a world, it does the least that a
+/// service does there.
+async fn serve_echo(name: Option<&str>) -> Result<(), Failure> {
+    let least = match name {
+        Some(name) => Some(Arc::new(Least::start(&world(name)).await?)),
+        None => None,
+    };
     let listener = TcpListener::bind("127.0.0.1:0").await?;
     println!("{}", listener.local_addr()?);
     std::thread::spawn(|| {
@@ -226,7 +285,7 @@ async fn serve_echo() -> Result<(), Failure> {
         let _ = std::io::stdin().read(&mut [0]);
         std::process::exit(0);
     });
-    Ok(axum::serve(listener, axum::Router::new().route("/", get(echo))).await?)
+    Ok(axum::serve(listener, axum::Router::new().route("/", get(echo)).with_state(least)).await?)
 }
 
 struct Echo {
@@ -235,9 +294,9 @@ struct Echo {
 }
 
 impl Echo {
-    fn start() -> Result<Self, Failure> {
+    fn start(name: Option<&str>) -> Result<Self, Failure> {
         let mut command = Command::new(std::env::current_exe()?);
-        let mut child = command.arg(SERVE_ECHO).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
+        let mut child = command.arg(SERVE_ECHO).args(name).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
         let mut address = String::new();
         BufReader::new(child.stdout.take().ok_or("no output")?).read_line(&mut address)?;
         Ok(Self { child, address: address.trim().to_owned() })
@@ -252,10 +311,18 @@ impl Drop for Echo {
     }
 }
 
+const CORRIDOR: &str = "corridor";
+const FIGURE_4: &str = "figure-4";
+
+/// One of these.
+fn world(name: &str) -> World {
+    if name == CORRIDOR { corridor() } else { worlds::example(name) }
+}
+
 /// A line of four states: next to nothing to be mapped.
 fn corridor() -> World {
     World {
-        name: "corridor".to_owned(),
+        name: CORRIDOR.to_owned(),
         model: json!({
             "attributes": [{"name": "x", "kind": "number"}],
             "actions": [{"name": "forward", "cost": 1}],
@@ -277,17 +344,19 @@ fn texts(world: &World) -> Arc<Vec<String>> {
 async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure> {
     let service = Service::start(world).await?;
     let (texts, states) = (texts(world), Arc::new(world.demonstration.as_array().cloned().unwrap_or_default()));
-    let echo = Echo::start()?;
+    let echoing = [Echo::start(None)?, Echo::start(Some(&world.name))?];
     let mapper = mapper(world)?;
     let mut streams = Vec::new();
-    let mut echoes = Vec::new();
+    let mut echoes = [Vec::new(), Vec::new()];
     for _ in 0..n_connections {
         streams.push(Stream::open(&service.address, &texts).await?);
-        let socket = tokio_tungstenite::connect_async(format!("ws://{}/", echo.address)).await?.0;
-        echoes.push(Echoed { socket, n_messages: 1.0, rest: 0.0 });
+        for (echo, echoes) in echoing.iter().zip(&mut echoes) {
+            let socket = tokio_tungstenite::connect_async(format!("ws://{}/", echo.address)).await?.0;
+            echoes.push(Echoed { socket, n_messages: 1.0, rest: 0.0 });
+        }
     }
     // By what is measured; the service comes first.
-    let mut rates: [Vec<f64>; 5] = Default::default();
+    let mut rates: [Vec<f64>; 6] = Default::default();
     let (mut cpu_us, mut n_for_each) = (Vec::new(), Vec::new());
     for _ in 0..N_ROUNDS {
         let cpu_before_s = service.cpu_s()?;
@@ -302,7 +371,7 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
             .iter()
             .fold((0, 0), |(messages, sent), stream| (messages + stream.n_messages, sent + stream.n_sent));
         let for_each = f64::from(u32::try_from(n_messages)?) / f64::from(u32::try_from(n_sent)?);
-        for echoed in &mut echoes {
+        for echoed in echoes.iter_mut().flatten() {
             echoed.n_messages = for_each;
         }
         n_for_each.push(for_each);
@@ -311,17 +380,19 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
             echoed.round_trip().await?;
             Ok(echoed)
         };
-        let (rate, back) = per_second(echoes, round).await?;
-        echoes = back;
-        rates[1].push(rate);
-        rates[2].push(rows_per_second(n_connections).await?);
+        for (echoes, rates) in echoes.iter_mut().zip(&mut rates[1..]) {
+            let (rate, back) = per_second(std::mem::take(echoes), round).await?;
+            *echoes = back;
+            rates.push(rate);
+        }
+        rates[3].push(rows_per_second(n_connections).await?);
         let (mapper, states) = (Arc::clone(&mapper), Arc::clone(&states));
         let blocking = tokio::task::spawn_blocking(move || {
             Ok::<_, Failure>((lines_per_second(n_connections)?, observations_per_second(&mapper, &states)?))
         });
         let (lines, observations) = blocking.await??;
-        rates[3].push(lines);
-        rates[4].push(observations);
+        rates[4].push(lines);
+        rates[5].push(observations);
     }
     println!("\n{}, {n_connections} at a time: a second, and the service's as a multiple", world.name);
     let row = |name: &str, rates: &[f64], ratios: &[f64]| {
@@ -334,6 +405,7 @@ async fn round_trips(world: &World, n_connections: usize) -> Result<(), Failure>
     row("round trips of the service", &rates[0], &[]);
     let names = [
         "round trips of an echo, as many messages".to_owned(),
+        "  that searches and keeps a line of each".to_owned(),
         format!("rows into SQLite, {n_connections} a commit"),
         format!("lines into a file, {n_connections} a sync"),
         "observations mapped, on one core".to_owned(),
@@ -410,17 +482,9 @@ where
 /// A line such as an observation that is to be kept.
 const LINE: &str = r#"["01a20166-6aab-731d-84f8-704a7d58ef84",7,1,[{"x":3,"y":0,"heading":"east","gold":0,"arrows":1}],1790000000000]"#;
 
-/// What SQLite can do: rows per second, `n_rows` a durable commit, one commit after the other, set up as the service sets
-/// its own up. With a row each this is what bounds a single connection.
+/// What SQLite can do: rows per second, `n_rows` a durable commit, one commit after the other. With a row each this is what bounds a single connection.
 async fn rows_per_second(n_rows: usize) -> Result<f64, Failure> {
-    let directory = tempfile::tempdir()?;
-    let options = sqlx::sqlite::SqliteConnectOptions::new()
-        .filename(directory.path().join("rows.db"))
-        .create_if_missing(true)
-        .journal_mode(sqlx::sqlite::SqliteJournalMode::Wal)
-        .synchronous(sqlx::sqlite::SqliteSynchronous::Full);
-    let mut connection = sqlx::SqliteConnection::connect_with(&options).await?;
-    sqlx::query("CREATE TABLE t (n INTEGER PRIMARY KEY, observation TEXT)").execute(&mut connection).await?;
+    let (mut connection, _directory) = rows().await?;
     let insert = format!("INSERT INTO t (observation) VALUES {}", vec!["($1)"; n_rows].join(", "));
     let started = Instant::now();
     let mut n_inserted = 0_u32;
@@ -429,6 +493,19 @@ async fn rows_per_second(n_rows: usize) -> Result<f64, Failure> {
         n_inserted += u32::try_from(n_rows)?;
     }
     Ok(f64::from(n_inserted) / started.elapsed().as_secs_f64())
+}
+
+/// A database of rows, set up as the service sets its own up, and where it is.
+async fn rows() -> Result<(sqlx::SqliteConnection, tempfile::TempDir), Failure> {
+    let directory = tempfile::tempdir()?;
+    let options = sqlx::sqlite::SqliteConnectOptions::new()
+        .filename(directory.path().join("rows.db"))
+        .create_if_missing(true)
+        .journal_mode(sqlx::sqlite::SqliteJournalMode::Wal)
+        .synchronous(sqlx::sqlite::SqliteSynchronous::Full);
+    let mut connection = sqlx::SqliteConnection::connect_with(&options).await?;
+    sqlx::query("CREATE TABLE t (n INTEGER PRIMARY KEY, observation TEXT)").execute(&mut connection).await?;
+    Ok((connection, directory))
 }
 
 /// What the disk can do: lines per second appended to a bare file, `n_lines` a sync, one sync after the other.
