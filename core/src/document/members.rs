@@ -42,7 +42,8 @@ impl<'t> Members<'t> {
             }
             mark = rest.mark(b",}")?;
         }
-        rest.is_blank().then_some(Self { names, texts })
+        rest.skip_blanks();
+        rest.peek().is_none().then_some(Self { names, texts })
     }
 
     /// Takes the text of the member called `name` out.
@@ -103,11 +104,6 @@ impl<'t> Rest<'t> {
 
     fn skip_blanks(&mut self) {
         self.skip_while(|byte| b" \t\n\r".contains(&byte));
-    }
-
-    fn is_blank(mut self) -> bool {
-        self.skip_blanks();
-        self.left.len() == 0
     }
 
     /// Takes what comes next, blanks aside, if it is one of `marks`.
