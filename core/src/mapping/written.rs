@@ -261,7 +261,8 @@ struct Term {
     paid: f64,
 }
 
-/// Floats as the numbers that their bits are from the last one on: round ones are small, and take two or three bytes.
+/// A float as an integer with its bytes in reverse order. The last bytes of a round float are zero; so the integer is small, and takes two or
+/// three bytes where small integers take few.
 mod short_float {
     use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
