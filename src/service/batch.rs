@@ -78,7 +78,7 @@ impl Etude {
         let Some(names) = names else { return Ok(None) };
         let deadline = self.deadline(&names, caller.arrived);
         let place = place.waiting_until(deadline);
-        let named = self.find(&names, faults, &place, deadline).await?;
+        let Some(named) = self.find_for(body, &names, &place, deadline).await? else { return Ok(None) };
         let means = (self.memory.clone(), self.clock.clone(), self.ids.clone());
         let read = move |_: &mut dyn Interrupt| Ok(Batch::read(&sent, &names, named, means));
         let Some(batch) = place.run(None, read).await?? else { return Ok(None) };

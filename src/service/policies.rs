@@ -120,7 +120,7 @@ impl Etude {
         let Some(names) = names else { return Ok(None) };
         let deadline = self.deadline(&names, caller.arrived);
         let place = place.waiting_until(deadline);
-        let named = self.find(&names, faults, &place, deadline).await?;
+        let Some(named) = self.find_for(body, &names, &place, deadline).await? else { return Ok(None) };
         let stamp = names.stamp(stamp, &named);
         let model = named.mapper.model();
         let is_small = body.len() <= MAX_INLINE_BYTES;

@@ -12,6 +12,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use serde::de::IgnoredAny;
 use serde_json::Value;
 use tokio_util::bytes::Bytes;
 
@@ -231,6 +232,22 @@ impl Etude {
         arrived.checked_add(time_until_finish(deadline))
     }
 
+    /// Finds what the request in `body` names, in which nothing was wrong so far. Nothing if the body is not JSON, which is told before what
+    /// is unknown.
+    pub(super) async fn find_for(
+        &self,
+        body: &Bytes,
+        names: &Names,
+        place: &Admission,
+        deadline: Option<Instant>,
+    ) -> Result<Option<Named>, ServiceError> {
+        match self.find(names, Faults::default(), place, deadline).await {
+            Ok(named) => Ok(Some(named)),
+            Err(error) if is_json(body, place).await? => Err(error),
+            Err(_) => Ok(None),
+        }
+    }
+
     /// Finds what the request names. `faults` are those found so far; what is unknown is one more, if there are any others.
     pub(super) async fn find(
         &self,
@@ -346,6 +363,16 @@ pub(super) async fn parse(
     let parse = move || document::parse(&body);
     let document = if n_bytes <= MAX_INLINE_BYTES { parse()? } else { place.run_reading(n_bytes, parse).await?? };
     Ok((document, held))
+}
+
+/// Whether a body is JSON, by its `place` in the pool if it is large. Nothing is kept of it.
+async fn is_json(body: &Bytes, place: &Admission) -> Result<bool, PoolError> {
+    let read = |body: &[u8]| serde_json::from_slice::<IgnoredAny>(body).is_ok();
+    if body.len() <= MAX_INLINE_BYTES {
+        return Ok(read(body));
+    }
+    let (n_bytes, body) = (body.len(), body.clone());
+    place.run_reading(n_bytes, move || read(&body)).await
 }
 
 /// The weights from which a request starts: the means of its learner, or the model's own.

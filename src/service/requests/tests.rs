@@ -1,10 +1,12 @@
+use jiff::Timestamp;
 use serde_json::json;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::*;
 use crate::memory::UNCOUNTED_BYTES;
-use crate::service::{Client, PoolSettings};
+use crate::service::{Client, PoolSettings, Settings};
+use etude_core::document::ParseError;
 use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Definition, Limits};
 
@@ -80,4 +82,31 @@ async fn a_small_body_that_becomes_much_is_counted() {
     let (_, held) = parse(body.clone().into(), &place, &memory).await.unwrap();
     assert!(body.len() < MAX_INLINE_BYTES && held.unwrap().n_bytes() > 5000 * 600);
     assert!(parse(body.into(), &place, &Memory::with_room(1 << 20)).await.is_err());
+}
+
+/// As long as a body is not JSON, nobody can rely on what it names.
+#[tokio::test]
+async fn a_body_that_is_not_json_is_told_so_whatever_it_names() {
+    let directory = tempfile::tempdir().unwrap();
+    let settings = Settings::of_test(directory.path());
+    let etude = Etude::open(&settings, &TaskTracker::new(), CancellationToken::new()).await.unwrap();
+    let caller = Caller { client: Client::LOCAL, arrived: etude.clock.instant(), now: Timestamp::UNIX_EPOCH };
+    let blanks = " ".repeat(MAX_INLINE_BYTES);
+    for (states, is_json) in
+        [("{x}", false), ("01", false), ("[1,2}", false), (&*format!("{blanks}{{x}}"), false), ("{}", true)]
+    {
+        let policy = format!(r#"{{"model":"none","demonstration":[{states}]}}"#);
+        let batch = format!(r#"{{"model":"none","items":[{{"demonstration":[{states}]}}]}}"#);
+        for error in [
+            etude.make_policy(policy, caller).await.unwrap_err(),
+            etude.make_policies(batch, caller).await.unwrap_err(),
+        ] {
+            let is_told = match error {
+                ServiceError::Parse(ParseError::Syntax { .. }) => !is_json,
+                ServiceError::Unknown { .. } => is_json,
+                _ => false,
+            };
+            assert!(is_told, "{states}: {error:?}");
+        }
+    }
 }
