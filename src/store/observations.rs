@@ -197,11 +197,11 @@ pub(super) async fn add(connection: &mut SqliteConnection, group: &[&Arrived]) -
 }
 
 /// Inserts rows, many in a statement.
-async fn insert<R>(
+pub(super) async fn insert<'r, R>(
     connection: &mut SqliteConnection,
     into: &str,
-    rows: &[R],
-    bind: impl Fn(Separated<'_, Sqlite, &'static str>, &R),
+    rows: &'r [R],
+    bind: impl Fn(Separated<'_, Sqlite, &'static str>, &'r R),
 ) -> Result<(), StoreError> {
     /// SQLite takes 32,766 values in a statement.
     const MAX_ROWS: usize = 1000;

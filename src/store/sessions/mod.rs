@@ -20,8 +20,8 @@ use super::{Page, Store, StoreError, corrupt, timestamp};
 use etude_core::attribute::ByAttribute;
 use etude_core::mapping::Conditions;
 pub use reads::{StoredObservations, StoredSteps};
-pub(super) use verbs::SettleObservations;
 use verbs::{ExpireSessions, TakeSession, TouchSession};
+pub(super) use verbs::{SettleObservations, open_all};
 
 /// How far a session has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -151,6 +151,13 @@ pub struct NewSession {
     pub created_at: Timestamp,
 }
 
+impl NewSession {
+    /// How many bytes there are to be written, roughly, beside a row of usual size.
+    pub(super) fn n_bytes(&self) -> usize {
+        self.trial.as_ref().map_or(0, NewTrial::n_bytes)
+    }
+}
+
 #[cfg(test)]
 impl NewSession {
     /// A session of the model "m" that neither learns nor explores.
@@ -207,7 +214,7 @@ impl Store {
     /// If the database failed.
     pub async fn open_session(&self, session: NewSession) -> Result<Opened, StoreError> {
         let trial = session.trial.as_ref().map(|trial| (trial.learner, trial.number));
-        let opened = self.writer.write(session).await?;
+        let opened = self.writer.open_session(session).await?;
         if let (Opened::NumberTaken, Some((learner, _))) = (opened, trial) {
             self.trial_numbers.forget(learner);
         }

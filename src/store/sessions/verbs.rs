@@ -6,7 +6,7 @@ use sqlx::{Row, SqliteConnection};
 
 use super::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, Taken, read_session};
 use crate::store::alive::{self, Down, NoteAlive};
-use crate::store::observations::{Owner, SessionRefusal};
+use crate::store::observations::{self, Owner, SessionRefusal};
 use crate::store::policies::{NewPolicy, NewRefinement};
 use crate::store::trials::{self, Opened};
 use crate::store::writer::{Verb, Writing};
@@ -46,26 +46,6 @@ impl Verb for SettleObservations {
     async fn apply(&self, _: &mut Writing<'_>) -> Result<(), StoreError> {
         // Was done before.
         Ok(())
-    }
-}
-
-impl Verb for NewSession {
-    type Answer = Opened;
-
-    fn n_bytes(&self) -> usize {
-        self.trial.as_ref().map_or(0, NewTrial::n_bytes)
-    }
-
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Opened, StoreError> {
-        if let Some(trial) = &self.trial {
-            let opened = trials::open_all(writing.connection, &[trial]).await?;
-            if let Some(refused) = opened.into_iter().find(|opened| *opened != Opened::Yes) {
-                return Ok(refused);
-            }
-        }
-        insert(writing.connection, self).await?;
-        writing.arrivals.opened(&self.id);
-        Ok(Opened::Yes)
     }
 }
 
@@ -156,30 +136,48 @@ async fn refusal(connection: &mut SqliteConnection, id: &str) -> Result<SessionR
     Ok(if is_open { SessionRefusal::Superseded } else { SessionRefusal::NotOpen })
 }
 
-async fn insert(connection: &mut SqliteConnection, session: &NewSession) -> Result<(), StoreError> {
-    let created_at_ms = session.created_at.as_millisecond();
-    sqlx::query(
-        "INSERT INTO sessions
-             (id, model, model_hash, weights, lookahead, conditions, learner, weights_version, trial_id,
-              status, owner, n_observations, created_at_ms, active_at_ms, lookahead_ms, observe)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, 'open', $11, 0, $10, $10, $12, $13)",
-    )
-    .bind(&session.id)
-    .bind(&session.model)
-    .bind(&session.model_hash)
-    .bind(serde_json::to_string(&session.weights).map_err(corrupt("sessions", "weights"))?)
-    .bind(session.lookahead)
-    .bind(serde_json::to_string(&session.conditions).map_err(corrupt("sessions", "conditions"))?)
-    .bind(&session.learner)
-    .bind(session.weights_version.map(as_integer))
-    .bind(session.trial.as_ref().map(|trial| &trial.id))
-    .bind(created_at_ms)
-    .bind(Owner::FIRST.0)
-    .bind(session.lookahead_ms.map(as_integer))
-    .bind(&session.observe)
-    .execute(connection)
-    .await?;
-    Ok(())
+/// Opens sessions, and the trials of those that explore. Takes one statement for all that do not: whoever opens many at once is not to keep others
+/// from being written.
+pub(in crate::store) async fn open_all(
+    connection: &mut SqliteConnection,
+    sessions: &[&NewSession],
+) -> Result<Vec<Opened>, StoreError> {
+    let explored: Vec<&NewTrial> = sessions.iter().filter_map(|session| session.trial.as_ref()).collect();
+    let mut explored = trials::open_all(connection, &explored).await?.into_iter();
+    let opened =
+        sessions.iter().map(|session| session.trial.as_ref().and_then(|_| explored.next()).unwrap_or(Opened::Yes));
+    let opened: Vec<Opened> = opened.collect();
+    let new: Vec<&NewSession> = sessions
+        .iter()
+        .zip(&opened)
+        .filter(|(_, opened)| **opened == Opened::Yes)
+        .map(|(session, _)| *session)
+        .collect();
+    insert(connection, &new).await?;
+    Ok(opened)
+}
+
+async fn insert(connection: &mut SqliteConnection, sessions: &[&NewSession]) -> Result<(), StoreError> {
+    let in_json = |session: &&NewSession| {
+        let weights = serde_json::to_string(&session.weights).map_err(corrupt("sessions", "weights"))?;
+        let conditions = serde_json::to_string(&session.conditions).map_err(corrupt("sessions", "conditions"))?;
+        Ok((weights, conditions))
+    };
+    let in_json = sessions.iter().map(in_json).collect::<Result<Vec<_>, StoreError>>()?;
+    let rows: Vec<_> = sessions.iter().zip(in_json).collect();
+    let into = "INSERT INTO sessions
+        (id, model, model_hash, weights, lookahead, conditions, learner, weights_version, trial_id,
+         status, owner, n_observations, created_at_ms, active_at_ms, lookahead_ms, observe) ";
+    observations::insert(connection, into, &rows, |mut row, (session, (weights, conditions))| {
+        let created_at_ms = session.created_at.as_millisecond();
+        row.push_bind(&session.id).push_bind(&session.model).push_bind(&session.model_hash).push_bind(weights);
+        row.push_bind(session.lookahead).push_bind(conditions).push_bind(&session.learner);
+        row.push_bind(session.weights_version.map(as_integer));
+        row.push_bind(session.trial.as_ref().map(|trial| &trial.id));
+        row.push("'open'").push_bind(Owner::FIRST.0).push("0").push_bind(created_at_ms).push_bind(created_at_ms);
+        row.push_bind(session.lookahead_ms.map(as_integer)).push_bind(&session.observe);
+    })
+    .await
 }
 
 async fn expire(connection: &mut SqliteConnection, before: Timestamp) -> Result<Vec<ExpiredSession>, StoreError> {

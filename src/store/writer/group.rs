@@ -5,8 +5,8 @@ use sqlx::{Connection, SqliteConnection};
 use super::verb::{Effects, Job, Writing};
 use crate::store::arrivals::Arrivals;
 use crate::store::observations::SessionRefusal;
-use crate::store::trials::{NewReward, NewTrial, RewardAnswer};
-use crate::store::{NewObservations, NewPolicy, StoreError, policies, refinements, trials};
+use crate::store::trials::{NewReward, NewTrial, Opened, RewardAnswer};
+use crate::store::{NewObservations, NewPolicy, NewSession, StoreError, policies, refinements, sessions, trials};
 
 /// Applies `group`: durable when this returns.
 pub(super) async fn write(
@@ -18,6 +18,7 @@ pub(super) async fn write(
     if append_at_once(connection, arrivals, group).await?
         || add_policies_at_once(connection, group).await?
         || accept_rewards_at_once(connection, group).await?
+        || open_sessions_at_once(connection, arrivals, group).await?
     {
         return Ok(Effects::default());
     }
@@ -92,7 +93,7 @@ fn answer_policies(group: &mut [Job]) {
     }
 }
 
-/// Applies `group` in one transaction: observations, policies and trials first, rewards last, each kind together. As nobody was answered yet, the
+/// Applies `group` in one transaction: observations, policies, trials and sessions first, rewards last, each kind together. As nobody was answered yet, the
 /// requests of a group may be applied in any order.
 async fn transact(
     connection: &mut SqliteConnection,
@@ -105,6 +106,7 @@ async fn transact(
     append(&mut transaction, arrivals, group).await?;
     policies::add_all(&mut transaction, &added_policies(group)).await?;
     open_trials(&mut transaction, group).await?;
+    open_sessions(&mut transaction, arrivals, group).await?;
     for job in &mut *group {
         match job {
             Job::Policies(asked) => {
@@ -116,7 +118,7 @@ async fn transact(
                 let (connection, effects) = (&mut *transaction, &mut effects);
                 verb.apply(&mut Writing { connection, arrivals, effects, was_interrupted }).await?;
             }
-            Job::Observations(_) | Job::Trial(_) | Job::Reward(_) => {}
+            Job::Observations(_) | Job::Trial(_) | Job::Session(_) | Job::Reward(_) => {}
         }
     }
     answer_policies(group);
@@ -162,6 +164,42 @@ async fn open_trials(transaction: &mut SqliteConnection, group: &mut [Job]) -> R
     let new: Vec<&NewTrial> = asked.iter().map(|asked| &*asked.request).collect();
     let answers = trials::open_all(transaction, &new).await?;
     for (asked, answer) in asked.iter_mut().zip(answers) {
+        asked.answer = Some(answer);
+    }
+    Ok(())
+}
+
+/// Opens sessions in one statement, if there is nothing else in the group and none of them explores. Says whether it did; it has done nothing
+/// otherwise.
+async fn open_sessions_at_once(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &mut [Job],
+) -> Result<bool, StoreError> {
+    let are_all = group.iter().all(|job| matches!(job, Job::Session(asked) if asked.request.trial.is_none()));
+    if are_all {
+        open_sessions(connection, arrivals, group).await?;
+    }
+    Ok(are_all)
+}
+
+/// Opens the sessions in `group`.
+async fn open_sessions(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &mut [Job],
+) -> Result<(), StoreError> {
+    let asked = group.iter_mut().filter_map(|job| match job {
+        Job::Session(asked) => Some(asked),
+        _ => None,
+    });
+    let mut asked: Vec<_> = asked.collect();
+    let new: Vec<&NewSession> = asked.iter().map(|asked| &*asked.request).collect();
+    let answers = sessions::open_all(connection, &new).await?;
+    for (asked, answer) in asked.iter_mut().zip(answers) {
+        if answer == Opened::Yes {
+            arrivals.opened(&asked.request.id);
+        }
         asked.answer = Some(answer);
     }
     Ok(())

@@ -4,8 +4,8 @@
 //! transaction, and answers all of it after the commit. After a group of several it yields once, so that ready tasks can enqueue: groups
 //! grow with the load, and no timer is needed. Small and large requests wait in lines of their own. A group takes all small requests, but
 //! only about a MiB of large ones, so that small requests never wait long behind large ones. Observations, which are most requests, are
-//! written to `arrivals` with a commit, and moved to their table later. A group of observations alone, or of policies alone, takes a
-//! single statement, and one of rewards alone two, outside of a transaction, as each statement costs the driver a change of threads.
+//! written to `arrivals` with a commit, and moved to their table later. A group of observations alone, of policies alone, or of sessions
+//! alone that are opened, takes a single statement, and one of rewards alone two, outside of a transaction, as each statement costs the driver a change of threads.
 //!
 //! After an error the state of the connection is unknown: a transaction may still be open. So the connection is closed, and the next
 //! group opens another. A write is acknowledged only if the file that was written to still has the database's name.
@@ -33,7 +33,7 @@ use super::observations::NewObservations;
 use super::observations::SessionRefusal;
 use super::policies::AddPolicies;
 use super::trials::{NewReward, NewTrial, Opened, RewardAnswer};
-use super::{StoreError, Unavailable, count, database};
+use super::{NewSession, StoreError, Unavailable, count, database};
 pub(super) use lines::MAX_LARGE_BYTES;
 use lines::{Lines, MAX_SMALL_BYTES};
 use verb::{Asked, Job};
@@ -173,6 +173,16 @@ impl Writer {
     pub(super) async fn open_trial(&self, trial: NewTrial) -> Result<Opened, StoreError> {
         let (asked, answered) = Asked::new(Box::new(trial));
         self.send(Job::Trial(asked), answered).await
+    }
+
+    /// Opens a session, and its trial if it explores.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed.
+    pub(super) async fn open_session(&self, session: NewSession) -> Result<Opened, StoreError> {
+        let (asked, answered) = Asked::new(Box::new(session));
+        self.send(Job::Session(asked), answered).await
     }
 
     /// Accepts a reward, unless its trial has one.

@@ -13,7 +13,7 @@ use super::*;
 use crate::store::database::{Locking, N_READERS};
 use crate::store::policies::NewPolicy;
 use crate::store::sessions::SettleObservations;
-use crate::store::{NewObservations, NewSession, Opened, Owner, SessionEnd, Store, Taken};
+use crate::store::{NewObservations, NewSession, NewTrial, Opened, Owner, SessionEnd, Store, Taken};
 
 fn policy(id: &str, n_bytes: usize) -> AddPolicies {
     let steps = vec![0; n_bytes];
@@ -131,6 +131,42 @@ async fn what_an_owner_still_has_in_line_is_refused_once_another_has_resumed_the
     assert_eq!(store.append_observations(new(taken.owner)).await.unwrap(), Ok(()));
     assert_eq!(store.append_observations(new(Owner::FIRST)).await.unwrap(), Err(SessionRefusal::Superseded));
     assert_eq!(store.session("s").await.unwrap().unwrap().n_observations, 1);
+}
+
+/// Those of a group are opened by one statement; one that cannot be is refused alone.
+#[tokio::test]
+async fn sessions_that_are_opened_together_are_as_if_they_had_come_one_after_the_other() {
+    const MANY: usize = 40;
+    let directory = tempfile::tempdir().unwrap();
+    let store = open(directory.path()).await;
+    let session = |id: &str| NewSession::plain(id, Timestamp::UNIX_EPOCH);
+    assert_eq!(store.open_session(session("17")).await.unwrap(), Opened::Yes);
+    let exploring = NewSession { trial: Some(NewTrial::plain(7, 1)), ..session("explores") };
+    let all = (0..MANY).map(|n| session(&n.to_string())).chain([exploring]);
+    let opened = join_all(all.map(|session| store.open_session(session))).await;
+    for (n, opened) in opened.into_iter().enumerate() {
+        match n {
+            17 => assert!(opened.is_err(), "there is one with its id"),
+            MANY => assert_eq!(opened.unwrap(), Opened::NoLearner),
+            _ => assert_eq!(opened.unwrap(), Opened::Yes),
+        }
+    }
+    assert_eq!(store.session("explores").await.unwrap(), None);
+    for n in 0..MANY {
+        let new = NewObservations {
+            session_id: n.to_string(),
+            owner: Owner::FIRST,
+            seq: 0,
+            n_states: 1,
+            states: "[1]".to_owned(),
+            at: Timestamp::UNIX_EPOCH,
+            service_time: None,
+            steps: None,
+        };
+        assert_eq!(store.append_observations(new).await.unwrap(), Ok(()), "{n}");
+        let row = store.session(&n.to_string()).await.unwrap().unwrap();
+        assert_eq!((row.model.as_str(), row.n_observations, row.lookahead), ("m", 1, None));
+    }
 }
 
 /// Another process stands for another server: what this one knows in memory must not count.

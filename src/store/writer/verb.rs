@@ -11,7 +11,7 @@ use crate::store::arrivals::Arrivals;
 use crate::store::observations::SessionRefusal;
 use crate::store::policies::AddPolicies;
 use crate::store::trials::{NewReward, NewTrial, Opened, RewardAnswer};
-use crate::store::{NewObservations, StoreError};
+use crate::store::{NewObservations, NewSession, StoreError};
 
 /// Something to be written by itself, whatever else is in the transaction.
 pub(in crate::store) trait Verb: fmt::Debug + Send + Sync + 'static {
@@ -54,6 +54,7 @@ pub(super) enum Job {
     Observations(Asked<NewObservations, Result<(), SessionRefusal>>),
     Policies(Asked<AddPolicies, ()>),
     Trial(Asked<Box<NewTrial>, Opened>),
+    Session(Asked<Box<NewSession>, Opened>),
     Reward(Asked<NewReward, RewardAnswer>),
     Other(Box<dyn AnyVerb>),
 }
@@ -64,6 +65,7 @@ impl Job {
             Self::Observations(asked) => asked.request.n_bytes(),
             Self::Policies(asked) => asked.request.n_bytes(),
             Self::Trial(asked) => asked.request.n_bytes(),
+            Self::Session(asked) => asked.request.n_bytes(),
             Self::Reward(_) => 0,
             Self::Other(verb) => verb.n_bytes(),
         }
@@ -75,6 +77,7 @@ impl Job {
             Self::Observations(asked) => asked.tell(committed),
             Self::Policies(asked) => asked.tell(committed),
             Self::Trial(asked) => asked.tell(committed),
+            Self::Session(asked) => asked.tell(committed),
             Self::Reward(asked) => asked.tell(committed),
             Self::Other(verb) => verb.tell(committed),
         }
