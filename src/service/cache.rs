@@ -1,5 +1,7 @@
 //! Models that are ready to be searched, as many as fit.
 
+use std::cmp::Reverse;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
@@ -20,6 +22,8 @@ use etude_core::mapping::Mapper;
 #[derive(Debug)]
 pub(super) struct MapperCache {
     cache: Cache<ModelKey, Kept, SizeBytes>,
+    /// How often something was asked for.
+    n_asked: AtomicU64,
     oversized: Mutex<Option<(ModelKey, Arc<Mapper>)>>,
 }
 
@@ -29,12 +33,8 @@ struct Kept {
     mapper: Arc<Mapper>,
     /// What it took when it was put in. Long searches add to it, but the cache counts on a weight that stays the same.
     size_bytes: u64,
-}
-
-impl From<Arc<Mapper>> for Kept {
-    fn from(mapper: Arc<Mapper>) -> Self {
-        Self { size_bytes: mapper.size_bytes() as u64 + 1, mapper }
-    }
+    /// How often something had been asked for when this was asked for last.
+    used: Arc<AtomicU64>,
 }
 
 #[derive(Clone, Debug)]
@@ -56,11 +56,12 @@ impl MapperCache {
         options.estimated_items_capacity(Self::EXPECTED_ITEMS).weight_capacity(max_bytes).shards(1);
         let options = options.build().expect("the sizes are given");
         let cache = Cache::with_options(options, SizeBytes, DefaultHashBuilder::default(), DefaultLifecycle::default());
-        Self { cache, oversized: Mutex::default() }
+        Self { cache, n_asked: AtomicU64::new(0), oversized: Mutex::default() }
     }
 
-    /// Evicts large models that nobody searches now until `n_bytes` are given back; none if all of them together have less. Returns them, so
-    /// that the caller frees them where nobody waits. Small models stay, as many requests would have to compile them again.
+    /// Evicts large models that nobody searches now until `n_bytes` are given back; none if all of them together have less. Those go first that
+    /// have taken the most for the longest: what is searched all the time would only be compiled again. Returns them, so that the caller frees
+    /// them where nobody waits. Small models stay, as many requests would have to compile them again.
     #[must_use]
     pub(super) fn make_room(&self, n_bytes: u64) -> Vec<Arc<Mapper>> {
         let mut oversized = self.oversized.lock().unwrap_or_else(PoisonError::into_inner);
@@ -69,16 +70,21 @@ impl MapperCache {
         // One reference is the cache's, one is the iterator's.
         let idle =
             self.cache.iter().filter(|(_, kept)| kept.size_bytes > SMALL_BYTES && Arc::strong_count(&kept.mapper) == 2);
-        let idle: Vec<(ModelKey, u64)> = idle.map(|(key, kept)| (key, kept.size_bytes)).collect();
-        if oversized_bytes + idle.iter().map(|(_, size)| size).sum::<u64>() < n_bytes {
+        let now = self.n_asked.load(Ordering::Relaxed);
+        let wasted = |kept: &Kept| {
+            u128::from(kept.size_bytes) * u128::from(1 + now - kept.used.load(Ordering::Relaxed).min(now))
+        };
+        let mut idle: Vec<_> = idle.map(|(key, kept)| (wasted(&kept), key, kept.size_bytes)).collect();
+        if oversized_bytes + idle.iter().map(|(_, _, size_bytes)| size_bytes).sum::<u64>() < n_bytes {
             return Vec::new();
         }
+        idle.sort_unstable_by_key(|(wasted, ..)| Reverse(*wasted));
         let mut gone = Vec::new();
         if oversized_bytes > 0 {
             gone.extend(oversized.take().map(|(_, mapper)| mapper));
         }
         let mut n_left = n_bytes.saturating_sub(oversized_bytes);
-        for (key, size_bytes) in idle {
+        for (_, key, size_bytes) in idle {
             if n_left == 0 {
                 break;
             }
@@ -90,7 +96,9 @@ impl MapperCache {
 
     /// Puts in a model that has just been compiled. Frees what makes room for it.
     pub(super) fn insert(&self, key: &ModelKey, mapper: &Arc<Mapper>) {
-        self.cache.insert(key.clone(), Arc::clone(mapper).into());
+        let (size_bytes, used) =
+            (mapper.size_bytes() as u64 + 1, Arc::new(self.n_asked.load(Ordering::Relaxed).into()));
+        self.cache.insert(key.clone(), Kept { mapper: Arc::clone(mapper), size_bytes, used });
         self.keep_if_oversized(key, mapper);
     }
 
@@ -104,7 +112,10 @@ impl MapperCache {
 
     /// The model with this key, if it is there.
     pub(super) fn get(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
-        self.cache.get(key).map(|kept| kept.mapper).or_else(|| self.oversized(key))
+        let n_asked = self.n_asked.fetch_add(1, Ordering::Relaxed) + 1;
+        let Some(kept) = self.cache.get(key) else { return self.oversized(key) };
+        kept.used.store(n_asked, Ordering::Relaxed);
+        Some(kept.mapper)
     }
 
     fn oversized(&self, key: &ModelKey) -> Option<Arc<Mapper>> {
@@ -199,6 +210,28 @@ mod tests {
         let gone = cache.make_room(n_bytes);
         assert!(gone.iter().all(|mapper| Arc::strong_count(mapper) == 1) && gone.len() == 1);
         assert!(cache.get(&key("large")).is_none() && cache.get(&key("searched")).is_some());
+    }
+
+    #[test]
+    fn what_has_taken_the_most_for_the_longest_makes_room_first() {
+        let (large, larger) = (60, 70);
+        let n_bytes = mapper(large).size_bytes() as u64;
+        let cache = MapperCache::new(20 * n_bytes);
+        let keep = |name: &str, side| cache.insert(&key(name), &mapper(side));
+        let goes = || {
+            let gone = cache.make_room(n_bytes / 2);
+            let is_there = |name: &&str| cache.cache.peek(&key(name)).is_some();
+            (gone.len(), ["searched", "other", "larger"].into_iter().filter(is_there).collect::<Vec<_>>())
+        };
+        keep("searched", large);
+        keep("other", large);
+        keep("larger", larger);
+        assert_eq!(goes(), (1, vec!["searched", "other"]), "as long as the others");
+        keep("larger", larger);
+        for _ in 0..10 {
+            drop((cache.get(&key("searched")), cache.get(&key("larger"))));
+        }
+        assert_eq!(goes(), (1, vec!["searched", "larger"]), "longer than the others");
     }
 
     #[test]
