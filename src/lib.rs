@@ -11,12 +11,13 @@
 //! used without the rest. This one is the service and the program around it. Each module uses only those to its left, which a test holds:
 //!
 //! ```text
-//! etude_core <- clock, compressed, memory, telemetry, picture <- experiment <- store <- service <- stream <- http <- config <- server <- cli
+//! etude_core <- client, clock, compressed, memory, telemetry, picture <- experiment <- store <- service <- stream <- http <- config <- server <- cli
 //! ```
 //!
 //! | module | is |
 //! |---|---|
 //! | [`etude_core`] | the core, with an architecture of its own |
+//! | [`client`] | who is served, and lines in which clients have their turns |
 //! | [`clock`] | what time it is, and new ids, as the server hands them in |
 //! | `compressed` | data that was compressed, read as it comes |
 //! | [`memory`] | the one budget of memory |
@@ -47,7 +48,8 @@
 //! `store::writer`, which gives the model its next hash with the batch. It is made a table when somebody searches it. What was counted is stored from time to
 //! time, beside the batches, which alone are true: a service that starts counts only what came since.
 //!
-//! What is large takes its memory from [`memory`] before it begins, and whose turn it is to use a thread is told by `service::pool`. A
+//! What is large takes its memory from [`memory`] before it begins. Clients take turns wherever they might wait for one another: `http::rounds`
+//! tells whose connection is served next, `store` who reads next, and `service::pool` whose turn it is to search, compile or read a large body. A
 //! model that is not at hand is made ready by `service::compiler`, once, however many ask for it.
 //!
 //! A trial goes the same way through `service::trials`, with weights that a [`etude_core::learning::Learner`] draws. Its reward is accepted
@@ -55,6 +57,7 @@
 //! version of the weights.
 
 pub mod cli;
+pub mod client;
 pub mod clock;
 mod compressed;
 pub mod config;

@@ -17,7 +17,7 @@ use tokio_util::task::TaskTracker;
 
 use crate::clock::{Clock, Ids};
 use crate::config::ServeConfig;
-use crate::http::{self, Access, ConnectionLimits, Context};
+use crate::http::{self, Access, ConnectionLimits, Context, Rounds};
 use crate::memory::Memory;
 use crate::service::Etude;
 use crate::service::ServiceError;
@@ -69,6 +69,7 @@ pub struct Server {
     router: axum::Router,
     tasks: TaskTracker,
     streams: TaskTracker,
+    rounds: Rounds,
     stopping: CancellationToken,
     abort: CancellationToken,
     connections: ConnectionLimits,
@@ -99,6 +100,7 @@ impl Server {
         tasks.spawn(Arc::clone(&etude).expire_until(stopping.clone()));
         tasks.spawn(Arc::clone(&etude).attend_until(stopping.clone()));
         let streams = TaskTracker::new();
+        let rounds = Rounds::new(tokio::runtime::Handle::current().metrics().num_workers());
         tasks.spawn(Arc::clone(&etude).learn_periodically(config.learn_every, stopping.clone()));
         let stream_limits = config.stream_limits();
         let router = http::router(Context {
@@ -112,6 +114,7 @@ impl Server {
             stream_limits,
             stream_rooms: Rooms::new(etude.memory(), stream_limits),
             streams: streams.clone(),
+            rounds: rounds.clone(),
             tasks: tasks.clone(),
         });
         Ok(Self {
@@ -121,6 +124,7 @@ impl Server {
             router,
             tasks,
             streams,
+            rounds,
             stopping,
             abort,
             connections: config.connection_limits(),
@@ -143,8 +147,19 @@ impl Server {
     /// Serves until `stop` completes, then lets requests end within the drain time, aborts what is left, and closes the
     /// database.
     pub async fn run(self, stop: impl Future<Output = ()> + Send + 'static) {
-        let Self { listener, address, etude, router, tasks, streams, stopping, abort, connections, drain_timeout } =
-            self;
+        let Self {
+            listener,
+            address,
+            etude,
+            router,
+            tasks,
+            streams,
+            rounds,
+            stopping,
+            abort,
+            connections,
+            drain_timeout,
+        } = self;
         tracing::info!(%address, "listening on http://{address}");
         tracing::info!("to read about it and try it: http://{address}/docs/");
         let announce = async {
@@ -153,7 +168,7 @@ impl Server {
             stopping.cancel();
         };
         let serving = async {
-            tokio::join!(announce, http::serve(listener, router, connections, &stopping));
+            tokio::join!(announce, http::serve(listener, router, &rounds, connections, &stopping));
             // Websockets are no longer the listener's.
             streams.close();
             streams.wait().await;

@@ -19,9 +19,10 @@ use super::collected::Collected;
 use super::encoding::{BodyError, DecodedLimit, Encoding};
 use super::form::{essence, form_of, format_of};
 use super::problem::{Problem, ProblemKind};
+use crate::client::Client;
 use crate::clock::timer_now;
 use crate::memory::Held;
-use crate::service::{Client, ModelForm, ModelText, OpenText, PipeWriter, ServiceError, pipe};
+use crate::service::{ModelForm, ModelText, OpenText, PipeWriter, ServiceError, pipe};
 use etude_core::document::Quoted;
 use etude_core::model::{Format, ImportFormat};
 

@@ -3,7 +3,8 @@
 use std::convert::Infallible;
 
 use super::SharedContext;
-use crate::service::{Caller, Client};
+use crate::client::Client;
+use crate::service::Caller;
 use axum::extract::FromRequestParts;
 use axum::http::request::Parts;
 

@@ -37,9 +37,11 @@ use tower::ServiceExt;
 use super::answer::UNCOUNTED_BYTES;
 use super::places::{Activity, Busy, ConnectionPlace, Places};
 use super::problem::{Problem, ProblemKind};
+use super::rounds::Rounds;
 use super::stalled::Stalled;
+use crate::client::Client;
 use crate::clock::timer_now;
-use crate::service::{self, Client};
+use crate::service;
 
 /// How much a connection may read ahead, also of a request's head: held by each, and not counted.
 const READ_AHEAD_BYTES: usize = 32 * 1024;
@@ -85,9 +87,15 @@ pub struct ConnectionLimits {
     pub slow_reader_timeout: Duration,
 }
 
-/// Serves `router` on whatever connects, within `limits`, until `stopping` is cancelled and the requests that run then are answered.
+/// Serves `router` on whatever connects, in `rounds` and within `limits`, until `stopping` is cancelled and the requests that run then are answered.
 /// Connections are closed at once if the returned future is dropped.
-pub async fn serve(listener: TcpListener, router: Router, limits: ConnectionLimits, stopping: &CancellationToken) {
+pub async fn serve(
+    listener: TcpListener,
+    router: Router,
+    rounds: &Rounds,
+    limits: ConnectionLimits,
+    stopping: &CancellationToken,
+) {
     let mut builder = http1::Builder::new();
     // Without a timer there is no timeout.
     builder.timer(TokioTimer::new()).header_read_timeout(limits.head_timeout).max_buf_size(READ_AHEAD_BYTES);
@@ -105,7 +113,8 @@ pub async fn serve(listener: TcpListener, router: Router, limits: ConnectionLimi
                         prepare(&stream);
                         let activity = Arc::clone(place.activity());
                         let socket = Stalled::new(stream, limits.slow_reader_timeout, place);
-                        connections.spawn(serve_connection(builder.clone(), socket, activity, client, router.clone(), end));
+                        let serving = serve_connection(builder.clone(), socket, activity, client, router.clone(), end);
+                        connections.spawn(rounds.run(client, serving));
                         continue;
                     }
                     refused.note();

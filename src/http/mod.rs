@@ -32,6 +32,7 @@ mod problem;
 mod reports;
 mod request_id;
 mod requests;
+mod rounds;
 mod stalled;
 mod stream;
 mod tags;
@@ -50,13 +51,15 @@ use utoipa::openapi::Tag;
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
-use crate::service::{Client, Etude};
+use crate::client::Client;
+use crate::service::Etude;
 use crate::stream::frames::ServerFrame;
 use crate::stream::{Limits, Room, Rooms};
 pub use access::Access;
 pub(crate) use access::{allowed_host, allowed_origin};
 pub use connections::{ConnectionLimits, serve};
 use problem::{Problem, ProblemKind};
+pub use rounds::Rounds;
 
 /// What handlers work with.
 pub struct Context {
@@ -80,6 +83,8 @@ pub struct Context {
     pub stream_rooms: Rooms,
     /// The streams that run.
     pub streams: TaskTracker,
+    /// In which they are served.
+    pub rounds: Rounds,
     /// Whatever else runs.
     pub tasks: TaskTracker,
 }

@@ -10,8 +10,8 @@ use tokio::sync::oneshot;
 use tokio::time::Instant;
 
 use super::stalled::Watcher;
+use crate::client::Client;
 use crate::clock::timer_now;
-use crate::service::Client;
 
 /// Most connections that are examined to find one that makes room. It bounds the work for a newcomer when all places are taken.
 const MAX_LOOKED_AT: usize = 1024;

@@ -64,7 +64,7 @@ pub(super) async fn websocket(
     let upgrade = WebSocketUpgrade::from_request_parts(&mut parts, &()).await;
     let upgrade = upgrade.map_err(|rejection| Problem::new(ProblemKind::UpgradeRequired, rejection.body_text()))?;
     let room = context.admit_stream(client)?;
-    let (streams, span) = (context.streams.clone(), tracing::Span::current());
+    let (streams, rounds, span) = (context.streams.clone(), context.rounds.clone(), tracing::Span::current());
     let serving = async move {
         // It fails where the connection has ended.
         if let Ok(socket) = upgraded.await {
@@ -73,7 +73,7 @@ pub(super) async fn websocket(
         }
         drop(room);
     };
-    streams.spawn(serving.instrument(span));
+    streams.spawn(rounds.run(client, serving.instrument(span)));
     // The one that it has leads nowhere.
     Ok(upgrade.protocols([PROTOCOL]).on_upgrade(async |_| ()))
 }
@@ -140,14 +140,14 @@ pub(super) async fn ndjson(
     let room = context.admit_stream(client)?;
     let body = ndjson::begin_reading(request).await;
     let (lines, answer) = mpsc::channel(1);
-    let (streams, span) = (context.streams.clone(), tracing::Span::current());
+    let (streams, rounds, span) = (context.streams.clone(), context.rounds.clone(), tracing::Span::current());
     let serving = async move {
         let limits = context.stream_limits;
         ndjson::serve(&context.etude, client, limits, body, lines, &room, &context.stopping).await;
         drop(room);
     };
     // The answer is read while the request is still being sent, so this runs beside it.
-    streams.spawn(serving.instrument(span));
+    streams.spawn(rounds.run(client, serving.instrument(span)));
     let mut response = Body::from_stream(ReceiverStream::new(answer)).into_response();
     response.headers_mut().insert(CONTENT_TYPE, HeaderValue::from_static("application/x-ndjson"));
     response.extensions_mut().insert(IsStream);

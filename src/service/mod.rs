@@ -43,7 +43,7 @@ use std::time::Duration;
 use jiff::{Timestamp, Unit};
 
 pub use batch::{MAX_BATCH_ITEMS, MadePolicies};
-pub use caller::{Caller, Client};
+pub use caller::Caller;
 pub use definitions::{DefinitionReader, ModelForm, ModelText, OpenText};
 pub use error::{Outage, OutageKind, ServiceError};
 pub use experience::{BatchText, ExperienceAnswer};

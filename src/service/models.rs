@@ -14,7 +14,8 @@ use super::hash::hash_of;
 use super::limited::LimitedTime;
 use super::pool::Places;
 use super::told::revision;
-use super::{Caller, Client, Etude, Name, PoolError, ServiceError, as_stored};
+use super::{Caller, Etude, Name, PoolError, ServiceError, as_stored};
+use crate::client::Client;
 use crate::memory::{Held, NoRoom, SMALL_BYTES};
 use crate::store::{
     Deletion, ModelKey, ModelRegistration, ModelSize, ModelSummary, NewDefinition, NewModel, NewPieces, Page, Replaces,

@@ -225,9 +225,10 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
+    use crate::client::Client;
     use crate::clock::Clock;
     use crate::memory::{Memory, SMALL_BYTES};
-    use crate::service::{Client, ModelText, Name, Settings};
+    use crate::service::{ModelText, Name, Settings};
     use crate::store::RequestKey;
     use etude_core::interrupt::Uninterrupted;
     use etude_core::mapping::Mapper;

@@ -92,8 +92,9 @@ mod tests {
     use tokio_util::task::TaskTracker;
 
     use super::*;
+    use crate::client::Client;
     use crate::clock::Clock;
-    use crate::service::{Client, ModelText, Settings};
+    use crate::service::{ModelText, Settings};
     use etude_core::model::Format;
 
     fn caller() -> Caller {

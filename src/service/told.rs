@@ -14,7 +14,8 @@ use tokio_util::task::TaskTracker;
 
 use super::definitions::{DefinitionReader, check_hash, corrupt_definition, unknown};
 use super::hash::{hash_of, hex};
-use super::{Client, SearchPool, ServiceError};
+use super::{SearchPool, ServiceError};
+use crate::client::Client;
 use crate::memory::{Held, Memory, NoRoom};
 use crate::store::{ModelRecord, ModelSize, NewBatch, Revision, Store, StoredBatch, StoredDefinition, pack_batch};
 use etude_core::document::{self, Faults, Place};

@@ -12,6 +12,7 @@
 
 mod files;
 mod readers;
+mod turns;
 
 use std::fs::{self, File, OpenOptions};
 use std::io::ErrorKind;
@@ -21,13 +22,12 @@ use std::sync::Arc;
 
 use sqlx::sqlite::{SqlitePool, SqliteSynchronous};
 use sqlx::{ConnectOptions, Connection, SqliteConnection};
-use tokio::sync::RwLock;
 
 use super::{Depth, StoreError, Unavailable, schema};
 use files::{Identity, MODE, is_read_only, probe_aside, resolve, unavailable};
 #[cfg(test)]
 pub(super) use readers::N_READERS;
-pub(super) use readers::{Readers, checkpoint};
+pub(super) use readers::{Reader, Readers, checkpoint};
 use readers::{look_at, options, readers};
 
 /// Size of the log, in pages of 4 KiB, from which on a commit copies it itself. That is rare, as a reader copies it beside the writer
@@ -113,7 +113,7 @@ impl Database {
         let Some(readers) = self.readers.clone().filter(|_| !self.is_looked_at) else {
             let (connection, pool) = self.open().await?;
             if let Some(pool) = pool {
-                self.readers = Some(Arc::new(Readers { pool: RwLock::new(pool) }));
+                self.readers = Some(Arc::new(Readers::new(pool)));
             }
             return Ok(connection);
         };
@@ -185,7 +185,7 @@ impl Database {
     /// If the database cannot be read, or would have to be changed first.
     pub(super) async fn read_only(&mut self, depth: Depth) -> Result<(), StoreError> {
         let pool = self.look_at(depth).await?;
-        self.readers = Some(Arc::new(Readers { pool: RwLock::new(pool) }));
+        self.readers = Some(Arc::new(Readers::new(pool)));
         Ok(())
     }
 

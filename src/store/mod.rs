@@ -40,7 +40,7 @@ use std::time::{Duration, Instant};
 use crate::clock::Clock;
 use alive::{Down, NoteAlive};
 pub use batches::{AcceptedBatch, NewBatch, Revision, StoredBatch, pack_batch};
-use database::{Database, Locking, Readers};
+use database::{Database, Locking, Reader, Readers};
 use definitions::Sweeper;
 pub use definitions::{NewPieces, PIECE_BYTES};
 pub use deletions::Needed;
@@ -61,8 +61,6 @@ pub use sessions::{
     StoredObservations, StoredSteps, Taken,
 };
 
-use sqlx::Sqlite;
-use sqlx::pool::PoolConnection;
 pub use tallies::StoredTally;
 use tokio_util::task::TaskTracker;
 use trials::TrialNumbers;
@@ -163,7 +161,7 @@ impl Store {
     }
 
     /// A connection that reads.
-    async fn reader(&self) -> Result<PoolConnection<Sqlite>, StoreError> {
+    async fn reader(&self) -> Result<Reader, StoreError> {
         self.readers.one().await
     }
 

@@ -14,9 +14,8 @@ use super::outlet::Outlet;
 use super::problem::StreamProblem;
 use super::queue::{Queued, Receiver, Sender, Weighed};
 use super::room::{SMALL_FRAME_BYTES, Taken};
-use crate::service::{
-    AcceptedReward, Caller, Client, Ended, Etude, Resumed, RewardState, ServiceError, Session, SessionError,
-};
+use crate::client::Client;
+use crate::service::{AcceptedReward, Caller, Ended, Etude, Resumed, RewardState, ServiceError, Session, SessionError};
 use etude_core::mapping::PassedStates;
 
 /// The protocol's name; also the websocket subprotocol.

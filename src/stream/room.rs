@@ -7,8 +7,9 @@ use std::time::Duration;
 
 use super::limits::Limits;
 use super::queue::QUEUE_BYTES;
+use crate::client::Client;
 use crate::memory::{Held, Memory, NoRoom};
-use crate::service::{Client, Places};
+use crate::service::Places;
 
 /// How much is read from a socket at a time. The websocket fills as much with zeros whenever it looks whether something has come, which is
 /// several times for an observation of some 200 bytes; a larger frame is read in several parts.

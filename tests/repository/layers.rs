@@ -17,7 +17,7 @@ const CORE: [&[&str]; 7] = [
 
 /// Modules of the service.
 const SERVICE: [&[&str]; 10] = [
-    &["clock", "compressed", "memory", "telemetry", "picture"],
+    &["client", "clock", "compressed", "memory", "telemetry", "picture"],
     &["experiment"],
     &["store"],
     &["service"],

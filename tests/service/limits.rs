@@ -2,9 +2,10 @@
 
 use crate::harness::service::{Service, answer, example, flags, long_way, to_and_fro};
 use crate::harness::waiting::until;
+use etude::client::Client;
 use etude::clock::{Clock, Ids};
 use etude::memory::SMALL_BYTES;
-use etude::service::{Caller, Client, Etude, ModelText, Name, Registered, ServiceError};
+use etude::service::{Caller, Etude, ModelText, Name, Registered, ServiceError};
 use etude_core::model::Format;
 use jiff::Timestamp;
 use reqwest::Method;

@@ -13,7 +13,8 @@ use tokio_util::sync::CancellationToken;
 
 use super::pause::Pause;
 use super::{CLOSE_TIMEOUT, Inlet};
-use crate::service::{Client, Etude};
+use crate::client::Client;
+use crate::service::Etude;
 use crate::stream::{
     self, Closed, Incoming, Limits, Outgoing, QUEUE_BYTES, Receiver, Room, SMALL_FRAME_BYTES, Taken, queue,
 };

@@ -16,9 +16,10 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::*;
+use crate::client::Client;
 use crate::clock::{Clock, Ids, timer_now};
 use crate::config::ServeConfig;
-use crate::service::{Client, Etude, ModelText, Name};
+use crate::service::{Etude, ModelText, Name};
 use crate::stream::{Limits, Rooms};
 use etude_core::model::Format;
 

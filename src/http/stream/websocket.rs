@@ -16,8 +16,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::metered::Metered;
 use super::{CLOSE_TIMEOUT, Inlet};
+use crate::client::Client;
 use crate::clock::timer_now;
-use crate::service::{Client, Etude};
+use crate::service::Etude;
 use crate::stream::{
     self, Closed, Crowded, Incoming, Limits, Outgoing, QUEUE_BYTES, READ_BUFFER_BYTES, Receiver, Room,
     SMALL_FRAME_BYTES, WRITE_BUFFER_BYTES, queue,

@@ -3,9 +3,10 @@
 use std::sync::Arc;
 
 use super::{Asked, Compiler};
+use crate::client::Client;
+use crate::service::ServiceError;
 use crate::service::pool::Admission;
 use crate::service::told::Wanted;
-use crate::service::{Client, ServiceError};
 use crate::store::ModelKey;
 use etude_core::interrupt::Interrupt;
 use etude_core::mapping::Mapper;

@@ -30,7 +30,7 @@ use tokio::runtime::Handle;
 use tokio_util::sync::{CancellationToken, DropGuard};
 use tokio_util::task::TaskTracker;
 
-use super::Client;
+use crate::client::Client;
 use crate::clock::Clock;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
 use place::PoolPlace;

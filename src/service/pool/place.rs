@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::threads::Threads;
 use super::turns::{Class, Level, Turns};
-use crate::service::Client;
+use crate::client::Client;
 
 /// How long a job, or all jobs of a request together, may run before it is long. Most are over by then.
 pub(super) const MOMENT: Duration = Duration::from_millis(10);

@@ -7,8 +7,8 @@ use tokio::sync::oneshot;
 
 use super::PoolSettings;
 use super::turns::{Class, LENT_AFTER, Level, Ticket, Turns};
+use crate::client::Client;
 use crate::clock::Clock;
-use crate::service::Client;
 
 /// Threads that jobs take turns on.
 #[derive(Debug)]

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use rustc_hash::FxHashMap;
 
-use crate::service::Client;
+use crate::client::Client;
 
 /// Threads that only short jobs use. There is more than one, as a short job may run longer than it should before it is noticed.
 const N_SHORT_THREADS: usize = 2;

@@ -11,8 +11,8 @@ use tokio_util::sync::CancellationToken;
 use super::place::{MOMENT, PoolPlace, level};
 use super::threads::{Threads, Turn, Waiting};
 use super::turns::Class;
+use crate::client::Client;
 use crate::clock::Clock;
-use crate::service::Client;
 use etude_core::interrupt::{Interrupt, Signal};
 
 /// How long a long job keeps its thread while those of other clients wait. Long beside the change of threads that it costs.

@@ -3,7 +3,8 @@ use serde_json::{Value, json};
 use tokio_util::task::TaskTracker;
 
 use super::*;
-use crate::service::{Caller, Client, ModelText, Name};
+use crate::client::Client;
+use crate::service::{Caller, ModelText, Name};
 use crate::store::{NewPolicy, PolicyFilter};
 use etude_core::model::Format;
 

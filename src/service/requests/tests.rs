@@ -4,8 +4,9 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::*;
+use crate::client::Client;
 use crate::memory::UNCOUNTED_BYTES;
-use crate::service::{Client, PoolSettings, Settings};
+use crate::service::{PoolSettings, Settings};
 use etude_core::document::ParseError;
 use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Definition, Limits};

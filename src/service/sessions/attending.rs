@@ -17,7 +17,8 @@ use tokio_util::sync::CancellationToken;
 
 use super::left::{Due, RETRY_AFTER};
 use super::{Etude, Session, SessionError};
-use crate::service::{Client, PoolError, ServiceError};
+use crate::client::Client;
+use crate::service::{PoolError, ServiceError};
 
 /// So many are taken up at the same time; the others wait. Each takes the memory of its mapping.
 const MAX_AT_ONCE: usize = 64;

@@ -2,9 +2,10 @@ use serde_json::json;
 use tokio_util::task::TaskTracker;
 
 use super::*;
+use crate::client::Client;
 use crate::clock::{Clock, Ids};
 use crate::memory::Memory;
-use crate::service::{Client, ModelText, Name, PoolSettings, Settings, TimeLimits};
+use crate::service::{ModelText, Name, PoolSettings, Settings, TimeLimits};
 use etude_core::model::{Format, Limits};
 
 const NOW: Timestamp = Timestamp::UNIX_EPOCH;

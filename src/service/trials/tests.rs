@@ -3,8 +3,9 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::*;
+use crate::client::Client;
 use crate::clock::Clock;
-use crate::service::{Client, ModelText, Settings};
+use crate::service::{ModelText, Settings};
 use crate::store::Store;
 use etude_core::model::Format;
 

@@ -20,7 +20,7 @@ use crate::harness::service::{Service, flags, long_way, to_and_fro};
 use crate::harness::waiting::within;
 
 /// Whoever speaks the protocol without a connection.
-const CLIENT: etude::service::Client = etude::service::Client::LOCAL;
+const CLIENT: etude::client::Client = etude::client::Client::LOCAL;
 
 /// The application that was a service, without the service.
 async fn without_service(service: Service, abort: &CancellationToken) -> (Etude, TempDir) {

@@ -5,7 +5,8 @@ use tokio_util::task::TaskTracker;
 
 use super::super::tests::receive;
 use super::*;
-use crate::service::{Caller, Client, Coming, ModelText, Name, Settings};
+use crate::client::Client;
+use crate::service::{Caller, Coming, ModelText, Name, Settings};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
 use etude_core::model::{Definition, Format, Limits, Model};

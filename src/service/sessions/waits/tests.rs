@@ -13,8 +13,9 @@ use super::super::kept::Kept;
 use super::super::tests::receive;
 use super::super::{Received, Resumed, Session};
 use super::*;
+use crate::client::Client;
 use crate::clock::Clock;
-use crate::service::{Caller, Client, Etude, ModelText, Name, Settings};
+use crate::service::{Caller, Etude, ModelText, Name, Settings};
 use etude_core::mapping::{CommittedStep, PassedStates};
 use etude_core::model::{Format, Limits};
 
