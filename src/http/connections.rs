@@ -1,7 +1,7 @@
 //! Connections: let in, served, and ended in good order.
 //!
 //! ```text
-//! accept -> a place? -- yes -> served until it ends, is idle for too long, or makes room for another
+//! accept -> a place? -- yes -> served in rounds until it ends, is idle for too long, or makes room for another
 //!              |
 //!              +- no -> whoever has been without a request longest makes room; if nobody is, the newcomer is answered 503
 //! ```
@@ -87,8 +87,8 @@ pub struct ConnectionLimits {
     pub slow_reader_timeout: Duration,
 }
 
-/// Serves `router` on whatever connects, in `rounds` and within `limits`, until `stopping` is cancelled and the requests that run then are answered.
-/// Connections are closed at once if the returned future is dropped.
+/// Serves `router` on whatever connects, in `rounds` and within `limits`, until `stopping` is cancelled and the requests that run then are
+/// answered. Connections are closed at once if the returned future is dropped.
 pub async fn serve(
     listener: TcpListener,
     router: Router,

@@ -83,7 +83,7 @@ pub struct Context {
     pub stream_rooms: Rooms,
     /// The streams that run.
     pub streams: TaskTracker,
-    /// In which they are served.
+    /// In which connections and streams are served.
     pub rounds: Rounds,
     /// Whatever else runs.
     pub tasks: TaskTracker,

@@ -110,7 +110,7 @@ impl Task {
         self.state.compare_exchange(from, to, Ordering::AcqRel, Ordering::Acquire).is_ok()
     }
 
-    /// Takes a turn for it, which waits, or has it wait for one. Says whether it has one.
+    /// Takes a turn for it, or has it line up where none is free. Says whether it has one.
     fn take_turn(self: &Arc<Self>) -> bool {
         let mut rounds = self.rounds.state();
         if rounds.n_free == 0 {
@@ -163,7 +163,7 @@ impl Wake for Task {
 pub(super) struct InTurn<F> {
     task: Arc<Task>,
     waker: Waker,
-    /// Whether the runtime was given it before it had its first turn.
+    /// Whether it waited for its first turn when it was given to the runtime, which then polls it before whoever is granted a turn earlier.
     is_queued: bool,
     future: Pin<Box<F>>,
 }
@@ -175,7 +175,7 @@ impl<F: Future> Future for InTurn<F> {
         let Self { task, waker, is_queued, future } = &mut *self;
         task.runtime.register(context.waker());
         if std::mem::take(is_queued) {
-            // It has come before those who were granted a turn earlier. If it was granted one meanwhile, it goes behind them.
+            // If it was granted a turn meanwhile, it goes behind those who were granted one before.
             if task.state.load(Ordering::Acquire) == GRANTED {
                 context.waker().wake_by_ref();
             }

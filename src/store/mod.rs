@@ -18,6 +18,7 @@ mod database;
 mod definitions;
 mod deletions;
 mod error;
+mod insertion;
 mod learners;
 mod models;
 mod observations;

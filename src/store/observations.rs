@@ -6,10 +6,10 @@ use std::time::Duration;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
-use sqlx::query_builder::{QueryBuilder, Separated};
-use sqlx::{Sqlite, SqliteConnection};
+use sqlx::SqliteConnection;
 
 use super::StoreError;
+use super::insertion::insert_rows;
 
 /// Who drives a session: whoever opened it, or has resumed it since. Only the newest one may add to it or end it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -176,42 +176,24 @@ pub(super) async fn add(connection: &mut SqliteConnection, group: &[&Arrived]) -
     let added: Vec<&Arrived> = added.collect();
     let observed: Vec<_> = added.iter().copied().filter(|new| new.n_states > 0).collect();
     let into = "INSERT INTO observations (session_id, seq, n_states, states, times) ";
-    insert(connection, into, &observed, |mut row, new| {
+    insert_rows(connection, into, &observed, |mut row, new| {
         let times = (!new.times.is_empty()).then(|| json!(new.times).to_string());
         row.push_bind(&new.session_id).push_bind(new.seq).push_bind(new.n_states);
         row.push_bind(&new.states).push_bind(times);
     })
     .await?;
     let roots: Vec<_> = added.iter().filter_map(|new| Some((&new.session_id, new.steps.last()?))).collect();
-    insert(connection, "INSERT OR REPLACE INTO roots (session_id, root) ", &roots, |mut row, (id, new)| {
+    insert_rows(connection, "INSERT OR REPLACE INTO roots (session_id, root) ", &roots, |mut row, (id, new)| {
         row.push_bind(*id).push_bind(&new.root);
     })
     .await?;
     let steps = added.iter().flat_map(|new| new.steps.iter().map(|steps| (&new.session_id, steps)));
     let steps: Vec<_> = steps.collect();
-    insert(connection, "INSERT INTO steps (session_id, first_step, steps) ", &steps, |mut row, (id, new)| {
+    insert_rows(connection, "INSERT INTO steps (session_id, first_step, steps) ", &steps, |mut row, (id, new)| {
         row.push_bind(*id).push_bind(new.first).push_bind(&new.steps);
     })
     .await?;
     Ok(is_updated)
-}
-
-/// Inserts rows, many in a statement.
-pub(super) async fn insert<'r, R>(
-    connection: &mut SqliteConnection,
-    into: &str,
-    rows: &'r [R],
-    bind: impl Fn(Separated<'_, Sqlite, &'static str>, &'r R),
-) -> Result<(), StoreError> {
-    /// SQLite takes 32,766 values in a statement.
-    const MAX_ROWS: usize = 1000;
-    for rows in rows.chunks(MAX_ROWS) {
-        let mut query = QueryBuilder::new(into);
-        query.push_values(rows, &bind);
-        // Hardly two are alike.
-        query.build().persistent(false).execute(&mut *connection).await?;
-    }
-    Ok(())
 }
 
 #[cfg(test)]

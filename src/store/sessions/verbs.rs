@@ -6,7 +6,8 @@ use sqlx::{Row, SqliteConnection};
 
 use super::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, Taken, read_session};
 use crate::store::alive::{self, Down, NoteAlive};
-use crate::store::observations::{self, Owner, SessionRefusal};
+use crate::store::insertion::insert_rows;
+use crate::store::observations::{Owner, SessionRefusal};
 use crate::store::policies::{NewPolicy, NewRefinement};
 use crate::store::trials::{self, Opened};
 use crate::store::writer::{Verb, Writing};
@@ -168,7 +169,7 @@ async fn insert(connection: &mut SqliteConnection, sessions: &[&NewSession]) -> 
     let into = "INSERT INTO sessions
         (id, model, model_hash, weights, lookahead, conditions, learner, weights_version, trial_id,
          status, owner, n_observations, created_at_ms, active_at_ms, lookahead_ms, observe) ";
-    observations::insert(connection, into, &rows, |mut row, (session, (weights, conditions))| {
+    insert_rows(connection, into, &rows, |mut row, (session, (weights, conditions))| {
         let created_at_ms = session.created_at.as_millisecond();
         row.push_bind(&session.id).push_bind(&session.model).push_bind(&session.model_hash).push_bind(weights);
         row.push_bind(session.lookahead).push_bind(conditions).push_bind(&session.learner);

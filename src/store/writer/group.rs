@@ -93,8 +93,8 @@ fn answer_policies(group: &mut [Job]) {
     }
 }
 
-/// Applies `group` in one transaction: observations, policies, trials and sessions first, rewards last, each kind together. As nobody was answered yet, the
-/// requests of a group may be applied in any order.
+/// Applies `group` in one transaction: observations, policies, trials and sessions first, rewards last, each kind together. As nobody was
+/// answered yet, the requests of a group may be applied in any order.
 async fn transact(
     connection: &mut SqliteConnection,
     arrivals: &mut Arrivals,
