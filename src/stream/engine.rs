@@ -15,6 +15,7 @@ use super::problem::StreamProblem;
 use super::queue::{Queued, Receiver, Sender, Weighed};
 use super::room::{SMALL_FRAME_BYTES, Taken};
 use crate::client::Client;
+use crate::clock::timer_now;
 use crate::service::{AcceptedReward, Caller, Ended, Etude, Resumed, RewardState, ServiceError, Session, SessionError};
 use etude_core::mapping::PassedStates;
 
@@ -111,31 +112,35 @@ impl Connection<'_> {
             })
             .await?;
         let mut n_bytes_in_a_row = 0;
+        // Set anew when it goes off, not with each frame.
+        let mut alarm = pin!(tokio::time::sleep(self.limits.idle_after));
         loop {
             if n_bytes_in_a_row >= BYTES_IN_A_ROW {
                 n_bytes_in_a_row = 0;
                 tokio::task::yield_now().await;
             }
-            let came = {
-                let next = self.next.take();
+            let mut next = self.next.take();
+            let idle_at = timer_now() + self.limits.idle_after;
+            let came = loop {
                 let coming = async {
-                    match next {
+                    match next.take() {
                         Some(next) => Some(next),
                         None => incoming.recv().await,
                     }
                 };
-                let mut coming = pin!(tokio::time::timeout(self.limits.idle_after, coming));
-                loop {
-                    tokio::select! {
-                        // What has come by the time that a step is due decides, not what waits to be received.
-                        biased;
-                        () = self.is_due() => self.decide().await?,
-                        came = &mut coming => break came,
+                tokio::select! {
+                    // What has come by the time that a step is due decides, not what waits to be received.
+                    biased;
+                    () = self.is_due() => self.decide().await?,
+                    came = coming => break came,
+                    () = &mut alarm => {
+                        if timer_now() >= idle_at {
+                            let problem = StreamProblem::new("idle", "nothing came for too long");
+                            return Err(Over::because(Closed::NotAllowed, problem));
+                        }
+                        alarm.as_mut().reset(idle_at);
                     }
                 }
-            };
-            let Ok(came) = came else {
-                return Err(Over::because(Closed::NotAllowed, StreamProblem::new("idle", "nothing came for too long")));
             };
             let Some(came) = came else { return Ok(Closed::ByClient) };
             let n_bytes = came.item.n_bytes();

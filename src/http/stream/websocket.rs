@@ -1,8 +1,9 @@
 //! The stream protocol over a websocket: a message is a frame.
 
 use axum::body::Bytes;
-use futures_util::stream::{SplitSink, SplitStream};
-use futures_util::{SinkExt, StreamExt};
+use futures_util::future::{BoxFuture, abortable};
+use futures_util::stream::{FuturesUnordered, SplitSink, SplitStream};
+use futures_util::{FutureExt, SinkExt, StreamExt};
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::sync::{SetOnce, mpsc};
 use tokio::time::MissedTickBehavior;
@@ -44,7 +45,7 @@ pub(super) async fn serve<S>(
     room: &Room,
     stopping: &CancellationToken,
 ) where
-    S: AsyncRead + AsyncWrite + Unpin,
+    S: AsyncRead + AsyncWrite + Send + Unpin,
 {
     let config = WebSocketConfig::default()
         // What is larger is answered without being read.
@@ -59,8 +60,8 @@ pub(super) async fn serve<S>(
     let (came, mut incoming) = queue(QUEUE_BYTES);
     let (outgoing, goes) = queue(QUEUE_BYTES);
     let (pinger, pings) = mpsc::channel(1);
-    // Lost: the client is not there any more, or cannot be spoken to. Ended: nothing more will come.
-    let (lost, ended) = (SetOnce::new(), CancellationToken::new());
+    // The client is not there any more, or cannot be spoken to.
+    let lost = SetOnce::new();
     let speaking = async {
         // A search that still runs ends with the client.
         let is_lost = async { *lost.wait().await };
@@ -75,36 +76,49 @@ pub(super) async fn serve<S>(
             tokio::time::sleep(CLOSE_TIMEOUT).await;
         }
     };
-    let talking = async {
-        let is_written = tokio::select! {
-            // In the order in which a frame passes, so that it passes in one go.
-            biased;
-            () = speaking => false,
-            () = write(sink, goes, pings, room) => true,
-        };
-        // The client's half of the closing handshake, for which a shutdown does not wait.
-        if is_written {
-            tokio::select! {
-                () = ended.cancelled() => {}
-                () = stopping.cancelled() => {}
-                () = tokio::time::sleep(CLOSE_TIMEOUT) => {}
-            }
-        }
-    };
     let listening = async {
         let read = read(source, Inlet { came, room }, pinger, limits).await;
         if let Some(closed) = read {
             // It is set here only.
             let _ = lost.set(closed);
         }
-        ended.cancel();
-        std::future::pending::<()>().await;
+    };
+    let (speaking, speaker) = abortable(speaking);
+    // Each is polled only when it was woken, which is most of what an observation takes here.
+    let parts: [BoxFuture<'_, Part>; 3] = [
+        listening.map(|()| Part::Listening).boxed(),
+        speaking.map(|_| Part::Speaking).boxed(),
+        write(sink, goes, pings, room).map(|()| Part::Writing).boxed(),
+    ];
+    let mut parts = FuturesUnordered::from_iter(parts);
+    let mut is_heard_out = false;
+    loop {
+        match parts.next().await {
+            Some(Part::Listening) => is_heard_out = true,
+            Some(Part::Writing) => break,
+            Some(Part::Speaking) | None => return,
+        }
+    }
+    speaker.abort();
+    // The client's half of the closing handshake, for which a shutdown does not wait.
+    let hearing = async {
+        while !is_heard_out && let Some(part) = parts.next().await {
+            is_heard_out = part == Part::Listening;
+        }
     };
     tokio::select! {
-        biased;
-        () = listening => {}
-        () = talking => {}
+        () = hearing => {}
+        () = stopping.cancelled() => {}
+        () = tokio::time::sleep(CLOSE_TIMEOUT) => {}
     }
+}
+
+/// What a connection does, all at the same time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Part {
+    Listening,
+    Speaking,
+    Writing,
 }
 
 /// Passes on what comes, until nobody wants it; then reads on for the client's goodbye. Pings are answered by reading. Gives why the
