@@ -34,6 +34,10 @@ use readers::{look_at, options, readers};
 /// before. But a reader cannot copy the end of the log while others write, and the log begins anew only once all of it was copied.
 const MAX_LOG_PAGES: &str = "16384";
 
+/// How much of the database the writer keeps in memory: 8 MiB. To bring what has arrived to its table, it changes some 700 pages at once, which do
+/// not fit into the 2 MiB that SQLite keeps by itself, and were read and written again and again.
+const WRITER_CACHE: &str = "-8192";
+
 /// Whether others are kept from the database.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Locking {
@@ -142,7 +146,8 @@ impl Database {
     /// Opens a connection that writes, and with the first one the readers.
     async fn open(&mut self) -> Result<(SqliteConnection, Option<SqlitePool>), StoreError> {
         let writing = options(&self.path).synchronous(SqliteSynchronous::Full);
-        let mut connection = writing.pragma("wal_autocheckpoint", MAX_LOG_PAGES).connect().await?;
+        let writing = writing.pragma("wal_autocheckpoint", MAX_LOG_PAGES).pragma("cache_size", WRITER_CACHE);
+        let mut connection = writing.connect().await?;
         match self.prepare(&mut connection).await {
             Ok(pool) => Ok((connection, pool)),
             Err(error) => {
