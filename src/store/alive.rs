@@ -29,16 +29,20 @@ impl Verb for NoteAlive {
 
     const READS_OBSERVATIONS: bool = true;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Down, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Down, StoreError> {
         note(writing, *self).await
     }
 }
 
 /// Notes a sign of life, once everything has arrived in its table. The first one since the service was started, or since something
 /// could not be written, ends a time without service in any case.
-pub(super) async fn note(writing: &mut Writing<'_>, NoteAlive { now, every }: NoteAlive) -> Result<Down, StoreError> {
-    let connection = &mut *writing.connection;
+pub(super) async fn note(
+    writing: &mut Writing<'_, '_>,
+    NoteAlive { now, every }: NoteAlive,
+) -> Result<Down, StoreError> {
     writing.effects.has_noted_life = true;
+    let was_interrupted = writing.was_interrupted;
+    let connection = writing.connection().await?;
     let now_ms = now.as_millisecond();
     // What came for a session is a sign of life too.
     let query = sqlx::query_scalar(
@@ -49,7 +53,7 @@ pub(super) async fn note(writing: &mut Writing<'_>, NoteAlive { now, every }: No
     let last_ms: Option<i64> = query.fetch_one(&mut *connection).await?;
     let gap_ms = last_ms.map_or(0, |last_ms| now_ms.saturating_sub(last_ms));
     let usual_ms = as_integer(u64::try_from(every.as_millis()).unwrap_or(u64::MAX)).saturating_mul(2);
-    let was_down = gap_ms > 0 && (writing.was_interrupted || gap_ms > usual_ms);
+    let was_down = gap_ms > 0 && (was_interrupted || gap_ms > usual_ms);
     if was_down {
         let moved = sqlx::query(
             "UPDATE sessions SET active_at_ms = MIN(active_at_ms + $1, $2) WHERE status = 'open' AND active_at_ms < $2",

@@ -9,17 +9,18 @@
 //! group --accept--> arrivals (one row a commit: durable) --settle, now and then or before a read--> sessions, observations
 //! ```
 //!
-//! How many observations a session has is known from memory meanwhile. That holds as long as nobody else writes to
-//! the database, of which SQLite tells: then everything is settled, and what was known is forgotten.
+//! How many observations a session has, and what is in `arrivals`, is known from memory meanwhile. That holds as long as nobody else
+//! writes to the database, of which SQLite tells: then everything is read and settled, and what was known is forgotten.
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::fmt::Write;
 
 use serde::Deserialize;
 use serde_json::value::RawValue;
-use sqlx::SqliteConnection;
+use sqlx::{Row, SqliteConnection};
 
 use super::observations::{self, Arrived, NewObservations, OpenSession, Owner, ServiceTime, SessionRefusal};
+use super::statements::Statements;
 use super::{StoreError, corrupt};
 
 /// Once `arrivals` has more bytes than this, they are settled with the next commit. A larger table would save little, and settling it would
@@ -32,6 +33,8 @@ pub(super) struct Arrivals {
     /// Open sessions, by id: who owns them and how many observations they have, those in `arrivals` included. Every session with
     /// observations in `arrivals` is among them.
     open: HashMap<String, OpenSession>,
+    /// What is in the table, by session.
+    arrived: BTreeMap<String, Arrived>,
     /// Size of the table.
     n_bytes: usize,
     /// SQLite's number that changes when others write (`data_version`). `None` if nothing is known, neither of sessions nor of the table.
@@ -77,8 +80,8 @@ impl Arrivals {
     }
 
     /// Forgets everything if others have written since; within a transaction that writes.
-    pub(super) async fn check(&mut self, connection: &mut SqliteConnection) -> Result<(), StoreError> {
-        if self.is_known() && self.data_version != Some(data_version(connection).await?) {
+    pub(super) async fn check(&mut self, statements: &mut Statements<'_>) -> Result<(), StoreError> {
+        if self.is_known() && self.data_version != Some(data_version(statements).await?) {
             self.forget();
         }
         Ok(())
@@ -87,14 +90,14 @@ impl Arrivals {
     /// Takes those of `group` that come next in open sessions, from their owners.
     pub(super) async fn accept(
         &mut self,
-        connection: &mut SqliteConnection,
+        statements: &mut Statements<'_>,
         group: &[&NewObservations],
     ) -> Result<Accepted, StoreError> {
         let ids = group.iter().map(|new| &new.session_id);
         let unknown: HashSet<_> = ids.filter(|id| !self.open.contains_key(*id)).collect();
         if !unknown.is_empty() {
             let ids = serde_json::to_string(&unknown).map_err(corrupt("sessions", "id"))?;
-            self.open.extend(observations::find_open(connection, &ids).await?);
+            self.open.extend(observations::find_open(statements.connection().await?, &ids).await?);
         }
         let mut row = String::new();
         let mut answers = Vec::with_capacity(group.len());
@@ -136,11 +139,12 @@ impl Arrivals {
         Ok(())
     }
 
-    /// Adds the row with the accepted observations by one statement without a transaction; durable when this returns. Says whether it was
+    /// Adds the row with the accepted observations of `group` by one statement without a transaction; durable when this returns. Says whether it was
     /// added; it was not if others have written meanwhile.
     pub(super) async fn add_at_once(
         &mut self,
         connection: &mut SqliteConnection,
+        group: &[&NewObservations],
         accepted: &Accepted,
     ) -> Result<bool, StoreError> {
         let Some(row) = &accepted.row else { return Ok(true) };
@@ -154,39 +158,64 @@ impl Arrivals {
         .bind(&accepted.steps)
         .execute(connection)
         .await?;
-        self.n_bytes += accepted.n_bytes();
-        Ok(added.rows_affected() == 1)
+        let is_added = added.rows_affected() == 1;
+        if is_added {
+            self.note(group, accepted);
+        }
+        Ok(is_added)
     }
 
-    /// Adds the row of what was accepted, within a transaction.
+    /// Adds what was accepted of `group`, within a transaction: to where it belongs, with everything before it, if it `are_read` or it is time;
+    /// else as a row.
     pub(super) async fn add(
         &mut self,
-        connection: &mut SqliteConnection,
+        statements: &mut Statements<'_>,
+        group: &[&NewObservations],
         accepted: &Accepted,
+        are_read: bool,
     ) -> Result<(), StoreError> {
+        self.note(group, accepted);
+        if are_read || self.is_full() {
+            return self.settle(statements).await;
+        }
         if let Some(row) = &accepted.row {
-            let query = sqlx::query("INSERT INTO arrivals (observations, steps) VALUES ($1, $2)");
-            query.bind(row).bind(&accepted.steps).execute(connection).await?;
-            self.n_bytes += accepted.n_bytes();
+            statements.add("INSERT INTO arrivals (observations, steps) VALUES (?, ?)").bind(row).bind(&accepted.steps);
         }
         Ok(())
     }
 
+    /// Notes what was added of `group`.
+    fn note(&mut self, group: &[&NewObservations], accepted: &Accepted) {
+        self.n_bytes += accepted.n_bytes();
+        for (new, _) in group.iter().zip(&accepted.answers).filter(|(_, answer)| answer.is_ok()) {
+            if !self.arrived.contains_key(&new.session_id) {
+                self.arrived.insert(new.session_id.clone(), Arrived::from(new.session_id.clone(), new.seq));
+            }
+            if let Some(arrived) = self.arrived.get_mut(&new.session_id) {
+                arrived.append(new.n_states, &new.states, new.at, new.service_time);
+                arrived.steps.extend(new.steps.clone());
+            }
+        }
+    }
+
     /// Moves everything to where it belongs, within a transaction.
-    pub(super) async fn settle(&mut self, connection: &mut SqliteConnection) -> Result<(), StoreError> {
-        let rows: Vec<ArrivalsRow> = sqlx::query_as(ROWS).fetch_all(&mut *connection).await?;
-        if !rows.is_empty() {
-            let settled = together(&rows)?;
-            let settled: Vec<&Arrived> = settled.values().collect();
-            let was_next = observations::add(connection, &settled).await?;
+    pub(super) async fn settle(&mut self, statements: &mut Statements<'_>) -> Result<(), StoreError> {
+        let arrived = if self.is_known() {
+            std::mem::take(&mut self.arrived)
+        } else {
+            read(statements.connection().await?).await?
+        };
+        if !arrived.is_empty() {
+            let settled: Vec<&Arrived> = arrived.values().collect();
+            let was_next = observations::add(statements, &settled).await?;
             for (new, _) in settled.iter().zip(was_next).filter(|(_, was_next)| !was_next) {
                 refused(&new.session_id, new.seq);
             }
-            sqlx::query("DELETE FROM arrivals").execute(&mut *connection).await?;
+            statements.add("DELETE FROM arrivals");
         }
         self.n_bytes = 0;
         if self.data_version.is_none() {
-            self.data_version = Some(data_version(connection).await?);
+            self.data_version = Some(data_version(statements).await?);
         }
         Ok(())
     }
@@ -220,8 +249,9 @@ pub(super) async fn read(reader: &mut SqliteConnection) -> Result<BTreeMap<Strin
 }
 
 /// Changes when another connection has written.
-async fn data_version(connection: &mut SqliteConnection) -> Result<i64, StoreError> {
-    Ok(sqlx::query_scalar("SELECT data_version FROM pragma_data_version").fetch_one(connection).await?)
+async fn data_version(statements: &mut Statements<'_>) -> Result<i64, StoreError> {
+    statements.add("SELECT data_version FROM pragma_data_version");
+    Ok(statements.fetch().await?.ok_or(sqlx::Error::RowNotFound)?.try_get(0)?)
 }
 
 /// An item of a row of `arrivals`.
@@ -241,19 +271,12 @@ fn together(rows: &[ArrivalsRow]) -> Result<BTreeMap<String, Arrived>, StoreErro
         let arrivals: Vec<Arrival<'_>> = serde_json::from_str(row).map_err(corrupt(TABLE, "observations"))?;
         for Arrival(session_id, seq, n_states, states, at_ms, service_time) in arrivals {
             let at = super::timestamp(TABLE, "observations", at_ms)?;
-            let new = Arrived {
-                session_id,
-                seq,
-                n_states,
-                states: states.get().to_owned(),
-                at,
-                times: service_time.map(|time| (seq, time)).into_iter().collect(),
-                steps: Vec::new(),
-            };
-            match by_session.get_mut(&new.session_id) {
-                Some(before) if before.seq + before.n_states != seq => refused(&new.session_id, seq),
-                Some(before) => before.append(new),
-                None => drop(by_session.insert(new.session_id.clone(), new)),
+            let arrived =
+                by_session.entry(session_id).or_insert_with_key(|session_id| Arrived::from(session_id.clone(), seq));
+            if arrived.seq + arrived.n_states == seq {
+                arrived.append(n_states, states.get(), at, service_time);
+            } else {
+                refused(&arrived.session_id, seq);
             }
         }
         let steps = steps.as_deref().map_or(Ok(Vec::new()), postcard::from_bytes);

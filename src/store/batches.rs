@@ -160,7 +160,7 @@ impl Verb for NewBatch {
         self.content.len()
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<bool, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<bool, StoreError> {
         let Revision { size, n_stochastic, n_unsafe } = self.revision;
         let updated = sqlx::query(
             "UPDATE models SET hash = $1, n_states = $2, n_transitions = $3, n_stochastic = $4, n_unsafe = $5
@@ -175,7 +175,7 @@ impl Verb for NewBatch {
             .bind(&self.model)
             .bind(self.experience)
             .bind(&self.hash_before)
-            .execute(&mut *writing.connection)
+            .execute(writing.connection().await?)
             .await?;
         if updated.rows_affected() == 0 {
             return Ok(false);
@@ -196,7 +196,7 @@ impl Verb for NewBatch {
             .bind(as_integer(n_stochastic))
             .bind(as_integer(n_unsafe))
             .bind(&self.content)
-            .execute(&mut *writing.connection)
+            .execute(writing.connection().await?)
             .await?;
         note_change(writing).await?;
         Ok(true)

@@ -166,8 +166,8 @@ struct BeginDefinition;
 impl Verb for BeginDefinition {
     type Answer = i64;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<i64, StoreError> {
-        begin(writing.connection).await
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<i64, StoreError> {
+        begin(writing.connection().await?).await
     }
 }
 
@@ -193,12 +193,12 @@ impl Verb for AddPiece {
         self.piece.len()
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(), StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<(), StoreError> {
         sqlx::query("INSERT INTO definition_pieces (definition_id, seq, piece) VALUES ($1, $2, $3)")
             .bind(self.definition_id)
             .bind(self.seq)
             .bind(&self.piece)
-            .execute(&mut *writing.connection)
+            .execute(writing.connection().await?)
             .await?;
         Ok(())
     }
@@ -242,23 +242,23 @@ impl Verb for SweepDefinition {
         MAX_LARGE_BYTES
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Swept, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Swept, StoreError> {
         let Self(id) = *self;
-        if is_a_models(id).fetch_one(&mut *writing.connection).await? {
+        if is_a_models(id).fetch_one(writing.connection().await?).await? {
             return Ok(Swept::All);
         }
         let removed = sqlx::query(
             "DELETE FROM definition_pieces WHERE definition_id = $1 AND seq IN
                  (SELECT seq FROM definition_pieces WHERE definition_id = $1 ORDER BY seq DESC LIMIT $2)",
         );
-        let removed = removed.bind(id).bind(N_SWEPT_AT_ONCE).execute(&mut *writing.connection).await?;
+        let removed = removed.bind(id).bind(N_SWEPT_AT_ONCE).execute(writing.connection().await?).await?;
         if removed.rows_affected() > 0
-            || super::batches::remove_some(&mut *writing.connection, id).await?
-            || super::tallies::remove_some(&mut *writing.connection, id).await?
+            || super::batches::remove_some(writing.connection().await?, id).await?
+            || super::tallies::remove_some(writing.connection().await?, id).await?
         {
             return Ok(Swept::Some);
         }
-        sqlx::query("DELETE FROM definitions WHERE id = $1").bind(id).execute(&mut *writing.connection).await?;
+        sqlx::query("DELETE FROM definitions WHERE id = $1").bind(id).execute(writing.connection().await?).await?;
         Ok(Swept::All)
     }
 }

@@ -61,8 +61,8 @@ impl Store {
 impl Verb for DeletePolicy {
     type Answer = Result<Deletion, Needed>;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Result<Deletion, Needed>, StoreError> {
-        let (Self(id), connection) = (self, &mut *writing.connection);
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Result<Deletion, Needed>, StoreError> {
+        let (Self(id), connection) = (self, writing.connection().await?);
         // What is damaged can be deleted too.
         let deleted = sqlx::query(
             "DELETE FROM policies WHERE id = $1 AND NOT EXISTS (SELECT 1 FROM trials WHERE policy_id = $1)
@@ -94,8 +94,8 @@ impl Verb for DeletePolicy {
 impl Verb for DeleteTrial {
     type Answer = Result<Deletion, Needed>;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Result<Deletion, Needed>, StoreError> {
-        let (Self(id), connection) = (self, &mut *writing.connection);
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Result<Deletion, Needed>, StoreError> {
+        let (Self(id), connection) = (self, writing.connection().await?);
         let deleted = sqlx::query_as::<_, (i64, i64)>(
             "DELETE FROM trials WHERE id = $1 AND NOT EXISTS (SELECT 1 FROM rewards WHERE trial = trials.sequence)
              RETURNING learner, number",
@@ -120,8 +120,8 @@ impl Verb for DeleteSession {
     /// So that none of them is left to be settled.
     const READS_OBSERVATIONS: bool = true;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Deletion, StoreError> {
-        let (Self(id), connection) = (self, &mut *writing.connection);
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Deletion, StoreError> {
+        let (Self(id), connection) = (self, writing.connection().await?);
         let deleted = sqlx::query_scalar("DELETE FROM sessions WHERE id = $1 RETURNING policy_id").bind(id);
         let Some(policy_id) = deleted.fetch_optional(&mut *connection).await? else { return Ok(Deletion::Unknown) };
         for query in [

@@ -2,10 +2,11 @@
 
 use futures_util::TryStreamExt;
 use jiff::Timestamp;
+use sqlx::Row;
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
 
 use super::page::{Rest, Rows};
+use super::statements::Statements;
 use super::writer::{Verb, Writing};
 use super::{Deletion, Page, Registration, Store, StoreError, as_integer, corrupt, count, page, timestamp};
 use etude_core::attribute::ByAttribute;
@@ -266,8 +267,8 @@ impl Verb for NewLearner {
         self.definition.len()
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Registration<LearnerRecord>, StoreError> {
-        let connection = &mut *writing.connection;
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Registration<LearnerRecord>, StoreError> {
+        let connection = writing.connection().await?;
         let inserted = sqlx::query(
             "INSERT INTO learners (name, hash, definition, created_at_ms) VALUES ($1, $2, $3, $4)
              ON CONFLICT (name) DO NOTHING",
@@ -283,7 +284,7 @@ impl Verb for NewLearner {
         if inserted.rows_affected() == 1 {
             let distribution = self.initial.clone();
             let first = WeightsRecord { version: 0, reward_order: 0, distribution, updated_at: self.created_at };
-            insert_weights(connection, row.sequence, &first).await?;
+            insert_weights(writing.statements, row.sequence, &first)?;
             return Ok(Registration::Created(row));
         }
         Ok(if row.hash == self.hash {
@@ -297,64 +298,53 @@ impl Verb for NewLearner {
 impl Verb for DeleteLearner {
     type Answer = Option<i64>;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Option<i64>, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Option<i64>, StoreError> {
         let query = sqlx::query_scalar("DELETE FROM learners WHERE name = $1 RETURNING sequence").bind(&self.0);
-        Ok(query.fetch_optional(&mut *writing.connection).await?)
+        Ok(query.fetch_optional(writing.connection().await?).await?)
     }
 }
 
 impl Verb for FoldRewards {
     type Answer = Fold;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Fold, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Fold, StoreError> {
         let Self { learner, weights } = self;
-        let connection = &mut *writing.connection;
-        let query = sqlx::query_scalar("SELECT MAX(version) FROM weights WHERE learner = $1").bind(learner);
-        let last: Option<i64> = query.fetch_one(&mut *connection).await?;
+        let statements = &mut *writing.statements;
+        statements.add("SELECT MAX(version) FROM weights WHERE learner = ?").bind(learner);
+        let last = statements.fetch().await?.map(|row| row.try_get::<Option<i64>, _>(0)).transpose()?.flatten();
         // Without a version, the learner is gone.
         if last.map(|last| last + 1) != Some(as_integer(weights.version)) {
             return Ok(Fold::Outdated);
         }
-        insert_weights(connection, *learner, weights).await?;
-        let folded = sqlx::query(
-            "UPDATE learners SET has_pending = EXISTS (SELECT 1 FROM rewards WHERE learner = $1 AND reward_order > $2)
-             WHERE sequence = $1",
+        insert_weights(statements, *learner, weights)?;
+        let folded = statements.add(
+            "UPDATE learners SET has_pending = EXISTS (SELECT 1 FROM rewards WHERE learner = ? AND reward_order > ?)
+             WHERE sequence = ?",
         );
-        folded.bind(learner).bind(as_integer(weights.reward_order)).execute(connection).await?;
+        folded.bind(learner).bind(as_integer(weights.reward_order)).bind(learner);
         Ok(Fold::Added)
     }
 }
 
 /// Marks learners (JSON: an array of sequence numbers) as having rewards to fold.
-pub(super) async fn mark_pending(connection: &mut SqliteConnection, learners: &str) -> Result<(), StoreError> {
-    let marked = sqlx::query(
+pub(super) fn mark_pending(statements: &mut Statements<'_>, learners: &str) {
+    let marked = statements.add(
         "UPDATE learners SET has_pending = 1
-         WHERE has_pending = 0 AND sequence IN (SELECT value FROM json_each($1))",
+         WHERE has_pending = 0 AND sequence IN (SELECT value FROM json_each(?))",
     );
-    marked.bind(learners).execute(connection).await?;
-    Ok(())
+    marked.bind(learners);
 }
 
-async fn insert_weights(
-    connection: &mut SqliteConnection,
-    learner: i64,
-    weights: &WeightsRecord,
-) -> Result<(), StoreError> {
+fn insert_weights(statements: &mut Statements<'_>, learner: i64, weights: &WeightsRecord) -> Result<(), StoreError> {
     let json = |numbers: &[f64], column| serde_json::to_string(numbers).map_err(corrupt("weights", column));
     let Distribution { mean, sd, expected_reward } = &weights.distribution;
-    sqlx::query(
+    let inserted = statements.add(
         "INSERT INTO weights (learner, version, reward_order, expected_reward, mean, sd, updated_at_ms)
-         VALUES ($1, $2, $3, $4, $5, $6, $7)",
-    )
-    .bind(learner)
-    .bind(as_integer(weights.version))
-    .bind(as_integer(weights.reward_order))
-    .bind(expected_reward)
-    .bind(json(mean, "mean")?)
-    .bind(json(sd, "sd")?)
-    .bind(weights.updated_at.as_millisecond())
-    .execute(connection)
-    .await?;
+         VALUES (?, ?, ?, ?, ?, ?, ?)",
+    );
+    inserted.bind(learner).bind(as_integer(weights.version)).bind(as_integer(weights.reward_order));
+    inserted.bind(expected_reward).bind(json(mean, "mean")?).bind(json(sd, "sd")?);
+    inserted.bind(weights.updated_at.as_millisecond());
     Ok(())
 }
 

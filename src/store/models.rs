@@ -312,8 +312,8 @@ fn read_summary(row: &SqliteRow) -> Result<ModelSummary, StoreError> {
 impl Verb for DeleteModel {
     type Answer = Option<DeletedModel>;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Option<DeletedModel>, StoreError> {
-        let deleted = delete(writing.connection, &self.0).await?;
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Option<DeletedModel>, StoreError> {
+        let deleted = delete(writing.connection().await?, &self.0).await?;
         if deleted.is_some() {
             note_change(writing).await?;
         }
@@ -327,9 +327,9 @@ async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<Option<
 }
 
 /// Counts a registration, replacement or deletion.
-pub(super) async fn note_change(writing: &mut Writing<'_>) -> Result<(), StoreError> {
+pub(super) async fn note_change(writing: &mut Writing<'_, '_>) -> Result<(), StoreError> {
     let query = "UPDATE service SET models_generation = models_generation + 1 RETURNING models_generation";
-    let row = sqlx::query(query).fetch_one(&mut *writing.connection).await?;
+    let row = sqlx::query(query).fetch_one(writing.connection().await?).await?;
     writing.effects.models_generation = Some(count(&row, "service", "models_generation")?);
     Ok(())
 }

@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use sqlx::SqliteConnection;
 
 use super::StoreError;
-use super::insertion::insert_rows;
+use super::statements::Statements;
 
 /// Who drives a session: whoever opened it, or has resumed it since. Only the newest one may add to it or end it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -113,20 +113,24 @@ pub(super) struct Arrived {
 }
 
 impl Arrived {
-    /// Appends what comes next in the same session.
-    pub(super) fn append(&mut self, mut new: Self) {
-        // Both are arrays.
-        if self.n_states > 0 && new.n_states > 0 {
+    /// Nothing yet, from `seq` on.
+    pub(super) fn from(session_id: String, seq: u32) -> Self {
+        let (n_states, states, at) = (0, "[]".to_owned(), Timestamp::UNIX_EPOCH);
+        Self { session_id, seq, n_states, states, at, times: Times::new(), steps: Vec::new() }
+    }
+
+    /// Appends the observations that come next: `states`, an array.
+    pub(super) fn append(&mut self, n_states: u32, states: &str, at: Timestamp, service_time: Option<ServiceTime>) {
+        self.times.extend(service_time.map(|time| (self.seq + self.n_states, time)));
+        if n_states > 0 {
             self.states.pop();
-            self.states.push(',');
-            self.states.push_str(&new.states[1..]);
-        } else if new.n_states > 0 {
-            self.states = new.states;
+            if self.n_states > 0 {
+                self.states.push(',');
+            }
+            self.states.push_str(&states[1..]);
         }
-        self.n_states += new.n_states;
-        self.at = self.at.max(new.at);
-        self.times.append(&mut new.times);
-        self.steps.append(&mut new.steps);
+        self.n_states += n_states;
+        self.at = self.at.max(at);
     }
 }
 
@@ -164,11 +168,11 @@ pub(super) async fn find_open(
 
 /// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. A few
 /// statements, however many there are: each one costs the driver a change of threads.
-pub(super) async fn add(connection: &mut SqliteConnection, group: &[&Arrived]) -> Result<Vec<bool>, StoreError> {
+pub(super) async fn add(statements: &mut Statements<'_>, group: &[&Arrived]) -> Result<Vec<bool>, StoreError> {
     let rows = group.iter().map(|new| json!([new.session_id, new.seq, new.n_states, new.at.as_millisecond()]));
     let updated = sqlx::query_scalar::<_, String>(COUNT_NEXT)
         .bind(Value::Array(rows.collect()).to_string())
-        .fetch_all(&mut *connection)
+        .fetch_all(statements.connection().await?)
         .await?;
     let updated: HashSet<String> = updated.into_iter().collect();
     let is_updated: Vec<bool> = group.iter().map(|new| updated.contains(&new.session_id)).collect();
@@ -176,23 +180,19 @@ pub(super) async fn add(connection: &mut SqliteConnection, group: &[&Arrived]) -
     let added: Vec<&Arrived> = added.collect();
     let observed: Vec<_> = added.iter().copied().filter(|new| new.n_states > 0).collect();
     let into = "INSERT INTO observations (session_id, seq, n_states, states, times) ";
-    insert_rows(connection, into, &observed, |mut row, new| {
+    statements.insert_rows(into, &observed, |values, new| {
         let times = (!new.times.is_empty()).then(|| json!(new.times).to_string());
-        row.push_bind(&new.session_id).push_bind(new.seq).push_bind(new.n_states);
-        row.push_bind(&new.states).push_bind(times);
-    })
-    .await?;
+        values.bind(&new.session_id).bind(new.seq).bind(new.n_states).bind(&new.states).bind(times);
+    });
     let roots: Vec<_> = added.iter().filter_map(|new| Some((&new.session_id, new.steps.last()?))).collect();
-    insert_rows(connection, "INSERT OR REPLACE INTO roots (session_id, root) ", &roots, |mut row, (id, new)| {
-        row.push_bind(*id).push_bind(&new.root);
-    })
-    .await?;
+    statements.insert_rows("INSERT OR REPLACE INTO roots (session_id, root) ", &roots, |values, (id, new)| {
+        values.bind(*id).bind(&new.root);
+    });
     let steps = added.iter().flat_map(|new| new.steps.iter().map(|steps| (&new.session_id, steps)));
     let steps: Vec<_> = steps.collect();
-    insert_rows(connection, "INSERT INTO steps (session_id, first_step, steps) ", &steps, |mut row, (id, new)| {
-        row.push_bind(*id).push_bind(new.first).push_bind(&new.steps);
-    })
-    .await?;
+    statements.insert_rows("INSERT INTO steps (session_id, first_step, steps) ", &steps, |values, (id, new)| {
+        values.bind(*id).bind(new.first).bind(&new.steps);
+    });
     Ok(is_updated)
 }
 

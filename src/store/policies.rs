@@ -14,7 +14,7 @@ use super::page::{self, Rest, Rows};
 use super::{Page, Store, StoreError, as_integer};
 use crate::memory::{Held, Memory};
 use etude_core::mapping::{ShortSteps, Status, WrittenPolicy};
-pub(super) use insertion::{add, add_all, add_at_once};
+pub(super) use insertion::{add_all, add_at_once};
 
 /// A policy to be stored.
 #[derive(Clone, Debug)]

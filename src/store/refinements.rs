@@ -1,8 +1,9 @@
 //! The table of policies that wait to be refined.
 
-use sqlx::{Row, SqliteConnection};
+use sqlx::Row;
 
 use super::policies::{self, NewPolicy, NewRefinement};
+use super::statements::Statements;
 use super::writer::{Verb, Writing};
 use super::{Store, StoreError};
 
@@ -93,15 +94,14 @@ impl Store {
     }
 }
 
-pub(super) async fn add(connection: &mut SqliteConnection, refinement: &NewRefinement) -> Result<(), StoreError> {
-    sqlx::query("INSERT INTO refinements (policy_id, model_hash, session_id, request) VALUES ($1, $2, $3, $4)")
-        .bind(&refinement.policy_id)
-        .bind(&refinement.model_hash)
-        .bind(&refinement.session_id)
-        .bind(&refinement.request)
-        .execute(connection)
-        .await?;
-    Ok(())
+pub(super) fn add(statements: &mut Statements<'_>, refinement: &NewRefinement) {
+    let NewRefinement { policy_id, model_hash, session_id, request } = refinement;
+    statements
+        .add("INSERT INTO refinements (policy_id, model_hash, session_id, request) VALUES (?, ?, ?, ?)")
+        .bind(policy_id)
+        .bind(model_hash)
+        .bind(session_id)
+        .bind(request);
 }
 
 impl Verb for RefinementEnd {
@@ -111,14 +111,13 @@ impl Verb for RefinementEnd {
         self.refined.as_ref().map_or(0, NewPolicy::n_bytes)
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(), StoreError> {
-        let connection = &mut *writing.connection;
-        let deleted = sqlx::query("DELETE FROM refinements WHERE policy_id = $1").bind(&self.policy_id);
-        let was_waiting = deleted.execute(&mut *connection).await?.rows_affected() > 0;
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<(), StoreError> {
+        writing.statements.add("DELETE FROM refinements WHERE policy_id = ? RETURNING policy_id").bind(&self.policy_id);
+        let was_waiting = writing.statements.fetch().await?.is_some();
         let (true, Some(refined)) = (was_waiting, &self.refined) else { return Ok(()) };
-        policies::add(connection, refined).await?;
-        let linked = sqlx::query("UPDATE policies SET refined_by = $2 WHERE id = $1");
-        linked.bind(&self.policy_id).bind(&refined.id).execute(connection).await?;
+        policies::add_all(writing.statements, &[refined]).await?;
+        let linked = writing.statements.add("UPDATE policies SET refined_by = ? WHERE id = ?");
+        linked.bind(&refined.id).bind(&self.policy_id);
         Ok(())
     }
 }
@@ -126,16 +125,16 @@ impl Verb for RefinementEnd {
 impl Verb for BeginRefinement {
     type Answer = Attempt;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Attempt, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Attempt, StoreError> {
         let Self(policy_id) = self;
         let begun =
             sqlx::query("UPDATE refinements SET attempts = attempts + 1 WHERE policy_id = $1 AND attempts < $2");
-        let begun = begun.bind(policy_id).bind(MAX_ATTEMPTS).execute(&mut *writing.connection).await?;
+        let begun = begun.bind(policy_id).bind(MAX_ATTEMPTS).execute(writing.connection().await?).await?;
         if begun.rows_affected() > 0 {
             return Ok(Attempt::Begun);
         }
         let deleted = sqlx::query("DELETE FROM refinements WHERE policy_id = $1").bind(policy_id);
-        let deleted = deleted.execute(&mut *writing.connection).await?;
+        let deleted = deleted.execute(writing.connection().await?).await?;
         Ok(if deleted.rows_affected() > 0 { Attempt::GivenUp } else { Attempt::Gone })
     }
 }
@@ -143,9 +142,9 @@ impl Verb for BeginRefinement {
 impl Verb for ReturnRefinement {
     type Answer = ();
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(), StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<(), StoreError> {
         let returned = "UPDATE refinements SET attempts = attempts - 1 WHERE policy_id = $1 AND attempts > 0";
-        sqlx::query(returned).bind(&self.0).execute(&mut *writing.connection).await?;
+        sqlx::query(returned).bind(&self.0).execute(writing.connection().await?).await?;
         Ok(())
     }
 }

@@ -138,13 +138,13 @@ impl Verb for AddKeyedPolicy {
         self.policy.n_bytes() + self.refinement.as_ref().map_or(0, NewRefinement::n_bytes)
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Result<(), KeyTaken>, StoreError> {
-        let (Self { key, policy, refinement }, connection) = (self, &mut *writing.connection);
-        let was_added = add(connection, key, &policy.id).await?;
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Result<(), KeyTaken>, StoreError> {
+        let Self { key, policy, refinement } = self;
+        let was_added = add(writing.connection().await?, key, &policy.id).await?;
         if was_added.is_ok() {
-            policies::add(connection, policy).await?;
+            policies::add_all(writing.statements, &[policy]).await?;
             if let Some(refinement) = refinement {
-                refinements::add(connection, refinement).await?;
+                refinements::add(writing.statements, refinement);
             }
         }
         Ok(was_added)
@@ -154,13 +154,13 @@ impl Verb for AddKeyedPolicy {
 impl Verb for RemoveKeys {
     type Answer = u64;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<u64, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<u64, StoreError> {
         let removed = sqlx::query(
             "DELETE FROM request_keys WHERE sequence IN
                  (SELECT sequence FROM request_keys WHERE created_at_ms <= $1 ORDER BY created_at_ms LIMIT $2)",
         );
         let removed = removed.bind(self.0.as_millisecond()).bind(MAX_REMOVED_AT_ONCE);
-        Ok(removed.execute(&mut *writing.connection).await?.rows_affected())
+        Ok(removed.execute(writing.connection().await?).await?.rows_affected())
     }
 }
 

@@ -109,7 +109,7 @@ impl Verb for AddTallyPiece {
         self.content().len()
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<bool, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<bool, StoreError> {
         let inserted = sqlx::query(
             "INSERT OR REPLACE INTO tallies (definition_id, seq, piece, n_pieces, hash, checksum, content)
              SELECT $1, $2, $3, $4, $5, $6, $7 WHERE EXISTS (SELECT 1 FROM models WHERE definition_id = $1)",
@@ -123,7 +123,7 @@ impl Verb for AddTallyPiece {
             .bind(&self.hash)
             .bind(self.checksum)
             .bind(self.content())
-            .execute(&mut *writing.connection)
+            .execute(writing.connection().await?)
             .await?;
         Ok(inserted.rows_affected() > 0)
     }
@@ -151,8 +151,8 @@ impl Verb for RemoveEarlierTallies {
         MAX_LARGE_BYTES
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<bool, StoreError> {
-        remove_before(&mut *writing.connection, self.experience, self.seq).await
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<bool, StoreError> {
+        remove_before(writing.connection().await?, self.experience, self.seq).await
     }
 }
 

@@ -1,11 +1,10 @@
 //! Registering models, and replacing them.
 
-use sqlx::SqliteConnection;
-
 use super::{
     DeletedModel, ModelRegistration, NewDefinition, NewModel, Replaces, UNKNOWN, delete, note_change, read_summary,
 };
 use crate::store::definitions::{self, NewPieces};
+use crate::store::statements::Statements;
 use crate::store::writer::{MAX_LARGE_BYTES, Verb, Writing};
 use crate::store::{StoreError, as_integer, corrupt};
 
@@ -20,8 +19,8 @@ impl Verb for NewModel {
         }
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Self::Answer, StoreError> {
-        let registered = register(writing.connection, self).await?;
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Self::Answer, StoreError> {
+        let registered = register(writing.statements, self).await?;
         if let ModelRegistration::Created(_) | ModelRegistration::Replaced(_) = registered.0 {
             note_change(writing).await?;
         }
@@ -30,7 +29,7 @@ impl Verb for NewModel {
 }
 
 async fn register(
-    connection: &mut SqliteConnection,
+    statements: &mut Statements<'_>,
     model: &NewModel,
 ) -> Result<(ModelRegistration, Option<DeletedModel>), StoreError> {
     let NewModel { summary, definition, replaces } = model;
@@ -38,6 +37,7 @@ async fn register(
     if *replaces != Replaces::Nothing {
         let query = "SELECT hash, coalesce(definition_hash, hash) FROM models WHERE name = $1";
         let query = sqlx::query_as::<_, (String, String)>(query).bind(&summary.name);
+        let connection = statements.connection().await?;
         match query.fetch_optional(&mut *connection).await? {
             None => return Ok((ModelRegistration::Conflict { existing_hash: None }, None)),
             Some((hash, definition_hash)) if definition_hash != summary.hash && replaces.admits(&hash) => {
@@ -51,27 +51,22 @@ async fn register(
         NewDefinition::Pieces(pieces) => ("", Some(pieces.id)),
     };
     let json = |source: serde_json::Error| corrupt("models", "attributes")(source);
-    let inserted = sqlx::query(
+    let inserted = statements.add(
         "INSERT INTO models
              (name, hash, definition, definition_id, attributes, actions, n_states, n_transitions, n_stochastic, n_unsafe,
               created_at_ms, definition_hash)
-         VALUES ($1, $2, $3, $4, $5, $6, $7, $8, $9, $10, $11, $12) ON CONFLICT (name) DO NOTHING",
-    )
-    .bind(&summary.name)
-    .bind(&summary.hash)
-    .bind(text)
-    .bind(definition_id)
-    .bind(serde_json::to_string(&summary.attributes).map_err(json)?)
-    .bind(serde_json::to_string(&summary.actions).map_err(json)?)
-    .bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_states)))
-    .bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_transitions)))
-    .bind(as_integer(summary.n_stochastic))
-    .bind(as_integer(summary.n_unsafe))
-    .bind(summary.created_at.as_millisecond())
-    .bind(&summary.definition_hash)
-    .execute(&mut *connection)
-    .await?;
-    if inserted.rows_affected() == 1 {
+         VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT (name) DO NOTHING RETURNING name",
+    );
+    inserted.bind(&summary.name).bind(&summary.hash).bind(text).bind(definition_id);
+    inserted.bind(serde_json::to_string(&summary.attributes).map_err(json)?);
+    inserted.bind(serde_json::to_string(&summary.actions).map_err(json)?);
+    inserted.bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_states)));
+    inserted.bind(summary.size.map_or(UNKNOWN, |size| as_integer(size.n_transitions)));
+    inserted.bind(as_integer(summary.n_stochastic)).bind(as_integer(summary.n_unsafe));
+    inserted.bind(summary.created_at.as_millisecond()).bind(&summary.definition_hash);
+    let was_inserted = statements.fetch().await?.is_some();
+    let connection = statements.connection().await?;
+    if was_inserted {
         if let NewDefinition::Pieces(NewPieces { id, n_pieces, .. }) = definition
             && !definitions::is_whole(&mut *connection, *id, *n_pieces).await?
         {

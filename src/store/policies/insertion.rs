@@ -6,6 +6,9 @@ use sqlx::{AssertSqlSafe, SqlSafeStr, SqlStr, SqliteConnection};
 
 use super::{NewPolicy, PolicyClass, checksum};
 use crate::store::StoreError;
+use crate::store::statements::{Statements, Values};
+
+const INTO: &str = "INSERT INTO policies (id, model, learner, status, summary, steps, checksum, created_at_ms) ";
 
 /// Most policies that one statement inserts. For each number of policies there is a statement, which is prepared once and kept.
 const MAX_ROWS: usize = 64;
@@ -13,21 +16,19 @@ const MAX_ROWS: usize = 64;
 /// Most bytes of the policies of one statement, unless one policy alone has more: the driver copies them.
 const MAX_ROWS_BYTES: usize = 1 << 20;
 
-/// Adds a policy, within a transaction.
-pub(in crate::store) async fn add(connection: &mut SqliteConnection, policy: &NewPolicy) -> Result<(), StoreError> {
-    add_all(connection, &[policy]).await
-}
-
 /// Adds policies in this order, within a transaction.
 pub(in crate::store) async fn add_all(
-    connection: &mut SqliteConnection,
+    statements: &mut Statements<'_>,
     policies: &[&NewPolicy],
 ) -> Result<(), StoreError> {
     let mut rest = policies;
     while !rest.is_empty() {
         let (rows, after) = rest.split_at(n_fitting(rest));
-        insert(connection, rows).await?;
+        statements.insert_rows(INTO, rows, |values, policy| bind(values, policy));
         rest = after;
+        if !rest.is_empty() {
+            statements.run().await?;
+        }
     }
     Ok(())
 }
@@ -57,16 +58,19 @@ pub(in crate::store) async fn add_at_once(
 
 /// Adds some policies. Each statement costs the driver a change of threads, so there is only one.
 async fn insert(connection: &mut SqliteConnection, policies: &[&NewPolicy]) -> Result<(), StoreError> {
-    let mut insert = sqlx::query(insert_of(policies.len()));
+    let mut values = Values::default();
     for policy in policies {
-        let checksum = checksum(&policy.summary, &policy.steps);
-        let PolicyClass { model, learner, status } = &policy.class;
-        insert = insert.bind(&policy.id).bind(model).bind(learner).bind(status.name());
-        insert = insert.bind(&policy.summary).bind(&policy.steps).bind(checksum);
-        insert = insert.bind(policy.created_at.as_millisecond());
+        bind(&mut values, policy);
     }
-    insert.execute(connection).await?;
+    sqlx::query_with(insert_of(policies.len()), values.into_arguments()).execute(connection).await?;
     Ok(())
+}
+
+fn bind(values: &mut Values, policy: &NewPolicy) {
+    let checksum = checksum(&policy.summary, &policy.steps);
+    let PolicyClass { model, learner, status } = &policy.class;
+    values.bind(&policy.id).bind(model).bind(learner).bind(status.name());
+    values.bind(&policy.summary).bind(&policy.steps).bind(checksum).bind(policy.created_at.as_millisecond());
 }
 
 /// The statement that inserts so many policies, which is put together once.
@@ -74,10 +78,7 @@ fn insert_of(n_rows: usize) -> SqlStr {
     static INSERTS: [OnceLock<SqlStr>; MAX_ROWS + 1] = [const { OnceLock::new() }; MAX_ROWS + 1];
     let put_together = || {
         let rows = vec!["(?, ?, ?, ?, ?, ?, ?, ?)"; n_rows].join(", ");
-        let insert = format!(
-            "INSERT INTO policies (id, model, learner, status, summary, steps, checksum, created_at_ms) VALUES {rows}"
-        );
-        AssertSqlSafe(insert).into_sql_str()
+        AssertSqlSafe(format!("{INTO}VALUES {rows}")).into_sql_str()
     };
     match INSERTS.get(n_rows) {
         Some(insert) => insert.get_or_init(put_together).clone(),

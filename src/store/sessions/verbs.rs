@@ -4,11 +4,11 @@ use jiff::Timestamp;
 use sqlx::sqlite::SqliteRow;
 use sqlx::{Row, SqliteConnection};
 
-use super::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, Taken, read_session};
+use super::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, SessionStatus, Taken, read_session};
 use crate::store::alive::{self, Down, NoteAlive};
-use crate::store::insertion::insert_rows;
 use crate::store::observations::{Owner, SessionRefusal};
 use crate::store::policies::{NewPolicy, NewRefinement};
+use crate::store::statements::Statements;
 use crate::store::trials::{self, Opened};
 use crate::store::writer::{Verb, Writing};
 use crate::store::{NewTrial, StoreError, as_integer, corrupt, count, policies, refinements, timestamp};
@@ -44,7 +44,7 @@ impl Verb for SettleObservations {
 
     const READS_OBSERVATIONS: bool = true;
 
-    async fn apply(&self, _: &mut Writing<'_>) -> Result<(), StoreError> {
+    async fn apply(&self, _: &mut Writing<'_, '_>) -> Result<(), StoreError> {
         // Was done before.
         Ok(())
     }
@@ -55,21 +55,22 @@ impl Verb for TakeSession {
 
     const READS_OBSERVATIONS: bool = true;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Taken, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Taken, StoreError> {
         let Self { id, at } = self;
         let in_row = |error: StoreError| error.of_row("sessions", id);
-        let taken = sqlx::query(
-            "UPDATE sessions SET owner = owner + 1, active_at_ms = MAX(active_at_ms, $2)
-             WHERE id = $1 AND status = 'open' RETURNING *",
+        let taken = writing.statements.add(
+            "UPDATE sessions SET owner = owner + 1, active_at_ms = MAX(active_at_ms, ?)
+             WHERE id = ? AND status = 'open' RETURNING *",
         );
-        let taken = taken.bind(id).bind(at.as_millisecond()).fetch_optional(&mut *writing.connection).await?;
+        taken.bind(at.as_millisecond()).bind(id);
+        let taken = writing.statements.fetch().await?;
         if let Some(row) = taken {
             let session = read_session(&row).map_err(in_row)?;
             writing.arrivals.taken(id, session.owner, session.n_observations);
             return Ok(Taken::Open(session));
         }
         let query = sqlx::query("SELECT * FROM sessions WHERE id = $1").bind(id);
-        let row = query.fetch_optional(&mut *writing.connection).await?;
+        let row = query.fetch_optional(writing.connection().await?).await?;
         row.map_or(Ok(Taken::Unknown), |row| Ok(Taken::Ended(read_session(&row).map_err(in_row)?)))
     }
 }
@@ -78,14 +79,17 @@ impl Verb for TouchSession {
     type Answer = Result<(), SessionRefusal>;
 
     /// Observations that came before but are not settled yet do not undo it.
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Result<(), SessionRefusal>, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Result<(), SessionRefusal>, StoreError> {
         let Self { id, owner, at } = self;
-        let updated = sqlx::query(
-            "UPDATE sessions SET active_at_ms = MAX(active_at_ms, $3) WHERE id = $1 AND status = 'open' AND owner = $2",
+        let updated = writing.statements.add(
+            "UPDATE sessions SET active_at_ms = MAX(active_at_ms, ?) WHERE id = ? AND status = 'open' AND owner = ?
+             RETURNING id",
         );
-        let updated =
-            updated.bind(id).bind(owner.0).bind(at.as_millisecond()).execute(&mut *writing.connection).await?;
-        if updated.rows_affected() > 0 { Ok(Ok(())) } else { refusal(writing.connection, id).await.map(Err) }
+        updated.bind(at.as_millisecond()).bind(id).bind(owner.0);
+        if writing.statements.fetch().await?.is_some() {
+            return Ok(Ok(()));
+        }
+        refusal(writing.connection().await?, id).await.map(Err)
     }
 }
 
@@ -98,21 +102,20 @@ impl Verb for SessionEnd {
         self.policy.n_bytes() + self.refinement.as_ref().map_or(0, NewRefinement::n_bytes)
     }
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<Result<(), SessionRefusal>, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Result<(), SessionRefusal>, StoreError> {
         let NewPolicy { id: policy_id, created_at, .. } = &self.policy;
-        let updated = sqlx::query(
-            "UPDATE sessions SET status = 'done', policy_id = $3, active_at_ms = $4
-             WHERE id = $1 AND status = 'open' AND owner = $2",
+        let ended = writing.statements.add(
+            "UPDATE sessions SET status = 'done', policy_id = ?, active_at_ms = ?
+             WHERE id = ? AND status = 'open' AND owner = ? RETURNING id",
         );
-        let updated =
-            updated.bind(&self.session_id).bind(self.owner.0).bind(policy_id).bind(created_at.as_millisecond());
-        if updated.execute(&mut *writing.connection).await?.rows_affected() == 0 {
-            return refusal(writing.connection, &self.session_id).await.map(Err);
+        ended.bind(policy_id).bind(created_at.as_millisecond()).bind(&self.session_id).bind(self.owner.0);
+        if writing.statements.fetch().await?.is_none() {
+            return refusal(writing.connection().await?, &self.session_id).await.map(Err);
         }
         writing.arrivals.ended(&self.session_id);
-        policies::add(writing.connection, &self.policy).await?;
+        policies::add_all(writing.statements, &[&self.policy]).await?;
         if let Some(refinement) = &self.refinement {
-            refinements::add(writing.connection, refinement).await?;
+            refinements::add(writing.statements, refinement);
         }
         Ok(Ok(()))
     }
@@ -123,10 +126,10 @@ impl Verb for ExpireSessions {
 
     const READS_OBSERVATIONS: bool = true;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<(Down, Vec<ExpiredSession>), StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<(Down, Vec<ExpiredSession>), StoreError> {
         let down = alive::note(writing, self.alive).await?;
         writing.arrivals.expired();
-        Ok((down, expire(writing.connection, self.before).await?))
+        Ok((down, expire(writing.connection().await?, self.before).await?))
     }
 }
 
@@ -140,11 +143,11 @@ async fn refusal(connection: &mut SqliteConnection, id: &str) -> Result<SessionR
 /// Opens sessions, and the trials of those that explore. Takes one statement for all that do not: whoever opens many at once is not to keep others
 /// from being written.
 pub(in crate::store) async fn open_all(
-    connection: &mut SqliteConnection,
+    statements: &mut Statements<'_>,
     sessions: &[&NewSession],
 ) -> Result<Vec<Opened>, StoreError> {
     let explored: Vec<&NewTrial> = sessions.iter().filter_map(|session| session.trial.as_ref()).collect();
-    let mut explored = trials::open_all(connection, &explored).await?.into_iter();
+    let mut explored = trials::open_all(statements, &explored).await?.into_iter();
     let opened =
         sessions.iter().map(|session| session.trial.as_ref().and_then(|_| explored.next()).unwrap_or(Opened::Yes));
     let opened: Vec<Opened> = opened.collect();
@@ -154,11 +157,11 @@ pub(in crate::store) async fn open_all(
         .filter(|(_, opened)| **opened == Opened::Yes)
         .map(|(session, _)| *session)
         .collect();
-    insert(connection, &new).await?;
+    insert(statements, &new)?;
     Ok(opened)
 }
 
-async fn insert(connection: &mut SqliteConnection, sessions: &[&NewSession]) -> Result<(), StoreError> {
+fn insert(statements: &mut Statements<'_>, sessions: &[&NewSession]) -> Result<(), StoreError> {
     let in_json = |session: &&NewSession| {
         let weights = serde_json::to_string(&session.weights).map_err(corrupt("sessions", "weights"))?;
         let conditions = serde_json::to_string(&session.conditions).map_err(corrupt("sessions", "conditions"))?;
@@ -169,16 +172,15 @@ async fn insert(connection: &mut SqliteConnection, sessions: &[&NewSession]) -> 
     let into = "INSERT INTO sessions
         (id, model, model_hash, weights, lookahead, conditions, learner, weights_version, trial_id,
          status, owner, n_observations, created_at_ms, active_at_ms, lookahead_ms, observe) ";
-    insert_rows(connection, into, &rows, |mut row, (session, (weights, conditions))| {
+    statements.insert_rows(into, &rows, |values, (session, (weights, conditions))| {
         let created_at_ms = session.created_at.as_millisecond();
-        row.push_bind(&session.id).push_bind(&session.model).push_bind(&session.model_hash).push_bind(weights);
-        row.push_bind(session.lookahead).push_bind(conditions).push_bind(&session.learner);
-        row.push_bind(session.weights_version.map(as_integer));
-        row.push_bind(session.trial.as_ref().map(|trial| &trial.id));
-        row.push("'open'").push_bind(Owner::FIRST.0).push("0").push_bind(created_at_ms).push_bind(created_at_ms);
-        row.push_bind(session.lookahead_ms.map(as_integer)).push_bind(&session.observe);
-    })
-    .await
+        values.bind(&session.id).bind(&session.model).bind(&session.model_hash).bind(weights).bind(session.lookahead);
+        values.bind(conditions).bind(&session.learner).bind(session.weights_version.map(as_integer));
+        values.bind(session.trial.as_ref().map(|trial| &trial.id)).bind(SessionStatus::Open.name());
+        values.bind(Owner::FIRST.0).bind(0).bind(created_at_ms).bind(created_at_ms);
+        values.bind(session.lookahead_ms.map(as_integer)).bind(&session.observe);
+    });
+    Ok(())
 }
 
 async fn expire(connection: &mut SqliteConnection, before: Timestamp) -> Result<Vec<ExpiredSession>, StoreError> {

@@ -4,19 +4,20 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use jiff::Timestamp;
 use rustc_hash::{FxHashMap, FxHashSet};
-use sqlx::{AssertSqlSafe, QueryBuilder, Row, SqliteConnection};
+use sqlx::{AssertSqlSafe, Row, SqliteConnection};
 
 use super::{
     AcceptedReward, FROM, Failure, FailureAnswer, NewReward, NewTrial, Opened, RewardAnswer, SELECT, TrialRecord,
     read_trial,
 };
+use crate::store::statements::Statements;
 use crate::store::writer::{Verb, Writing};
 use crate::store::{StoreError, as_integer, corrupt, count, learners, policies, refinements, request_keys};
 
 /// Stores trials and their policies, in order, and the keys of the requests for them, within a transaction. Takes two statements for all without
 /// a key that come one after the other, and more for those that are refused or are to be refined.
 pub(in crate::store) async fn open_all(
-    connection: &mut SqliteConnection,
+    statements: &mut Statements<'_>,
     trials: &[&NewTrial],
 ) -> Result<Vec<Opened>, StoreError> {
     let mut answers = Vec::with_capacity(trials.len());
@@ -24,44 +25,44 @@ pub(in crate::store) async fn open_all(
     for together in trials.chunk_by(|one, next| one.key.is_none() && next.key.is_none()) {
         if let [trial] = together
             && let Some(key) = &trial.key
-            && request_keys::add(connection, key, &trial.id).await?.is_err()
+            && request_keys::add(statements.connection().await?, key, &trial.id).await?.is_err()
         {
             answers.push(Opened::KeyTaken);
             continue;
         }
-        let inserted = insert(connection, together).await?;
+        let inserted = insert(statements, together).await?;
         let opened: Vec<&NewTrial> = together.iter().copied().filter(|trial| inserted.contains(&trial.id)).collect();
         let policies: Vec<_> = opened.iter().filter_map(|trial| trial.policy.as_ref()).collect();
-        policies::add_all(connection, &policies).await?;
+        policies::add_all(statements, &policies).await?;
         for refinement in opened.iter().filter_map(|trial| trial.refinement.as_ref()) {
-            refinements::add(connection, refinement).await?;
+            refinements::add(statements, refinement);
         }
         for trial in together {
             let was_opened = inserted.contains(&trial.id);
-            answers.push(if was_opened { Opened::Yes } else { refused(connection, trial).await? });
+            answers.push(if was_opened { Opened::Yes } else { refused(statements.connection().await?, trial).await? });
         }
     }
     Ok(answers)
 }
 
 /// Inserts trials, in this order, those whose learner is there and whose number no other one has. Gives their ids.
-async fn insert(connection: &mut SqliteConnection, trials: &[&NewTrial]) -> Result<FxHashSet<String>, StoreError> {
-    let mut insert = QueryBuilder::new(
+async fn insert(statements: &mut Statements<'_>, trials: &[&NewTrial]) -> Result<FxHashSet<String>, StoreError> {
+    statements.add(
         "INSERT INTO trials
              (id, learner, number, weights, weights_version, policy_id, lease_expires_at_ms, created_at_ms)
          SELECT * FROM (",
     );
-    insert.push_values(trials, |mut columns, trial| {
-        columns.push_bind(&trial.id).push_bind(trial.learner).push_bind(as_integer(trial.number));
-        columns.push_bind(&trial.weights).push_bind(as_integer(trial.weights_version)).push_bind(&trial.policy_id);
-        columns.push_bind(trial.lease_expires_at.as_millisecond()).push_bind(trial.created_at.as_millisecond());
+    statements.go_on_with_rows(trials, |values, trial| {
+        values.bind(&trial.id).bind(trial.learner).bind(as_integer(trial.number)).bind(&trial.weights);
+        values.bind(as_integer(trial.weights_version)).bind(&trial.policy_id);
+        values.bind(trial.lease_expires_at.as_millisecond()).bind(trial.created_at.as_millisecond());
     });
     // The columns of values have these names.
-    insert.push(
+    statements.go_on(
         ") WHERE column2 IN (SELECT sequence FROM learners)
          ON CONFLICT (learner, number) DO NOTHING RETURNING id",
     );
-    Ok(insert.build_query_scalar().fetch_all(connection).await?.into_iter().collect())
+    statements.fetch_all().await?.iter().map(|row| Ok(row.try_get(0)?)).collect()
 }
 
 /// Why a trial was not inserted. Nothing is left of it.
@@ -84,10 +85,10 @@ pub(super) struct FailTrial {
 impl Verb for FailTrial {
     type Answer = FailureAnswer;
 
-    async fn apply(&self, writing: &mut Writing<'_>) -> Result<FailureAnswer, StoreError> {
+    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<FailureAnswer, StoreError> {
         let (id, reason) = (self.id.as_str(), self.reason.as_deref());
         let query = sqlx::query(AssertSqlSafe(format!("{SELECT} {FROM} WHERE t.id = $1"))).bind(id);
-        let Some(row) = query.fetch_optional(&mut *writing.connection).await? else {
+        let Some(row) = query.fetch_optional(writing.connection().await?).await? else {
             return Ok(FailureAnswer::Unknown);
         };
         let mut trial = read_trial(&row)?;
@@ -101,7 +102,7 @@ impl Verb for FailTrial {
             Some(_) => {}
             None => {
                 let query = sqlx::query("UPDATE trials SET is_failed = 1, fail_reason = $2 WHERE sequence = $1");
-                query.bind(trial.sequence).bind(reason).execute(&mut *writing.connection).await?;
+                query.bind(trial.sequence).bind(reason).execute(writing.connection().await?).await?;
             }
         }
         trial.failed = Some(Failure { reason: reason.map(str::to_owned) });
@@ -109,18 +110,17 @@ impl Verb for FailTrial {
     }
 }
 
-/// Accepts rewards, in order, within a transaction. Takes two statements, however many there are, and another one if a learner is not yet
-/// marked as having rewards to fold.
+/// Accepts rewards, in order, within a transaction.
 pub(in crate::store) async fn accept_all(
-    connection: &mut SqliteConnection,
+    statements: &mut Statements<'_>,
     rewards: &[&NewReward],
 ) -> Result<Vec<RewardAnswer>, StoreError> {
-    let decided = read_rewarded(connection, rewards).await?.decide(rewards);
+    let decided = read_rewarded(statements, rewards).await?.decide(rewards);
     if !decided.unmarked.is_empty() {
         let ids = serde_json::to_string(&decided.unmarked).map_err(corrupt("learners", "sequence"))?;
-        learners::mark_pending(connection, &ids).await?;
+        learners::mark_pending(statements, &ids);
     }
-    decided.insert(connection).await?;
+    decided.insert(statements);
     Ok(decided.answers)
 }
 
@@ -130,8 +130,13 @@ pub(in crate::store) async fn accept_at_once(
     connection: &mut SqliteConnection,
     rewards: &[&NewReward],
 ) -> Result<Option<Vec<RewardAnswer>>, StoreError> {
-    let decided = read_rewarded(connection, rewards).await?.decide(rewards);
-    let was_done = decided.unmarked.is_empty() && decided.insert(connection).await?;
+    let statements = &mut Statements::on(connection);
+    let decided = read_rewarded(statements, rewards).await?.decide(rewards);
+    if !decided.unmarked.is_empty() {
+        return Ok(None);
+    }
+    decided.insert(statements);
+    let was_done = decided.rows.is_empty() || statements.run().await? > 0;
     Ok(was_done.then_some(decided.answers))
 }
 
@@ -157,20 +162,17 @@ struct RewardRow {
 }
 
 impl Decided {
-    /// Adds what is accepted to the log of rewards, unless others have written meanwhile. Says whether it did.
-    async fn insert(&self, connection: &mut SqliteConnection) -> Result<bool, StoreError> {
+    /// Adds what is accepted to the log of rewards, unless others have written meanwhile.
+    fn insert(&self, statements: &mut Statements<'_>) {
         if self.rows.is_empty() {
-            return Ok(true);
+            return;
         }
-        let mut insert = QueryBuilder::new(
-            "INSERT INTO rewards (learner, reward_order, trial, reward, accepted_at_ms) SELECT * FROM (",
-        );
-        insert.push_values(&self.rows, |mut columns, row| {
-            columns.push_bind(row.learner).push_bind(as_integer(row.order)).push_bind(row.trial);
-            columns.push_bind(row.reward).push_bind(row.accepted_at.as_millisecond());
+        statements.add("INSERT INTO rewards (learner, reward_order, trial, reward, accepted_at_ms) SELECT * FROM (");
+        statements.go_on_with_rows(&self.rows, |values, row| {
+            values.bind(row.learner).bind(as_integer(row.order)).bind(row.trial).bind(row.reward);
+            values.bind(row.accepted_at.as_millisecond());
         });
-        insert.push(") WHERE (SELECT data_version FROM pragma_data_version) = ").push_bind(self.data_version);
-        Ok(insert.build().execute(connection).await?.rows_affected() > 0)
+        statements.go_on(") WHERE (SELECT data_version FROM pragma_data_version) = ?").bind(self.data_version);
     }
 }
 
@@ -227,19 +229,20 @@ impl Rewarded {
     }
 }
 
-async fn read_rewarded(connection: &mut SqliteConnection, rewards: &[&NewReward]) -> Result<Rewarded, StoreError> {
+async fn read_rewarded(statements: &mut Statements<'_>, rewards: &[&NewReward]) -> Result<Rewarded, StoreError> {
     let ids: Vec<&str> = rewards.iter().map(|new| new.trial.as_str()).collect();
     let ids = serde_json::to_string(&ids).map_err(corrupt("trials", "id"))?;
     // `CROSS JOIN` makes SQLite look trials up by id, rather than ids up by trial.
-    let query = sqlx::query(AssertSqlSafe(format!(
+    let wanted = statements.add(&format!(
         "{SELECT}, t.learner, l.has_pending,
              (SELECT MAX(last.reward_order) FROM rewards last WHERE last.learner = t.learner) AS last_order,
              (SELECT data_version FROM pragma_data_version) AS data_version
-         FROM json_each($1) wanted CROSS JOIN trials t ON t.id = wanted.value
+         FROM json_each(?) wanted CROSS JOIN trials t ON t.id = wanted.value
              JOIN learners l ON l.sequence = t.learner LEFT JOIN rewards r ON r.trial = t.sequence"
-    )));
+    ));
+    wanted.bind(ids);
     let mut read = Rewarded { trials: FxHashMap::default(), last_orders: BTreeMap::new(), data_version: 0 };
-    for row in query.bind(ids).fetch_all(connection).await? {
+    for row in statements.fetch_all().await? {
         let (learner, is_marked) = (row.try_get("learner")?, row.try_get("has_pending")?);
         read.data_version = row.try_get("data_version")?;
         let last: Option<i64> = row.try_get("last_order")?;

@@ -1,10 +1,11 @@
 //! How a group of requests becomes durable: in one statement where that suffices, else in one transaction.
 
-use sqlx::{Connection, SqliteConnection};
+use sqlx::SqliteConnection;
 
 use super::verb::{Effects, Job, Writing};
 use crate::store::arrivals::Arrivals;
 use crate::store::observations::SessionRefusal;
+use crate::store::statements::Statements;
 use crate::store::trials::{NewReward, NewTrial, Opened, RewardAnswer};
 use crate::store::{NewObservations, NewPolicy, NewSession, StoreError, policies, refinements, sessions, trials};
 
@@ -45,8 +46,8 @@ async fn append_at_once(
     if news.len() < group.len() || !arrivals.is_known() || arrivals.is_full() {
         return Ok(false);
     }
-    let accepted = arrivals.accept(connection, &news).await?;
-    if accepted.answers.iter().any(Result::is_err) || !arrivals.add_at_once(connection, &accepted).await? {
+    let accepted = arrivals.accept(&mut Statements::on(connection), &news).await?;
+    if accepted.answers.iter().any(Result::is_err) || !arrivals.add_at_once(connection, &news, &accepted).await? {
         // The transaction that follows finds out why.
         arrivals.forget();
         return Ok(false);
@@ -93,8 +94,9 @@ fn answer_policies(group: &mut [Job]) {
     }
 }
 
-/// Applies `group` in one transaction: observations, policies, trials and sessions first, rewards last, each kind together. As nobody was
-/// answered yet, the requests of a group may be applied in any order.
+/// Applies `group` in one transaction, each kind together. As nobody was answered yet, the requests of a group may be applied in any order. What
+/// need not be asked is executed together, with the beginning and the end of the transaction. After an error the connection is closed, which
+/// undoes what was done.
 async fn transact(
     connection: &mut SqliteConnection,
     arrivals: &mut Arrivals,
@@ -102,58 +104,53 @@ async fn transact(
     was_interrupted: bool,
 ) -> Result<Effects, StoreError> {
     let mut effects = Effects::default();
-    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
-    append(&mut transaction, arrivals, group).await?;
-    policies::add_all(&mut transaction, &added_policies(group)).await?;
-    open_trials(&mut transaction, group).await?;
-    open_sessions(&mut transaction, arrivals, group).await?;
+    let statements = &mut Statements::on(connection);
+    statements.add("BEGIN IMMEDIATE");
+    append(statements, arrivals, group).await?;
+    open_trials(statements, group).await?;
     for job in &mut *group {
         match job {
             Job::Policies(asked) => {
                 for refinement in &asked.request.refinements {
-                    refinements::add(&mut transaction, refinement).await?;
+                    refinements::add(statements, refinement);
                 }
             }
             Job::Other(verb) => {
-                let (connection, effects) = (&mut *transaction, &mut effects);
-                verb.apply(&mut Writing { connection, arrivals, effects, was_interrupted }).await?;
+                let effects = &mut effects;
+                verb.apply(&mut Writing { statements, arrivals, effects, was_interrupted }).await?;
             }
             Job::Observations(_) | Job::Trial(_) | Job::Session(_) | Job::Reward(_) => {}
         }
     }
+    accept_rewards(statements, group).await?;
+    open_sessions(statements, arrivals, group).await?;
+    policies::add_all(statements, &added_policies(group)).await?;
     answer_policies(group);
-    accept_rewards(&mut transaction, group).await?;
-    transaction.commit().await?;
+    statements.add("COMMIT");
+    statements.run().await?;
     Ok(effects)
 }
 
 /// Appends the observations in `group`, and brings all to their table if somebody in it reads them.
-async fn append(
-    transaction: &mut SqliteConnection,
-    arrivals: &mut Arrivals,
-    group: &mut [Job],
-) -> Result<(), StoreError> {
+async fn append(statements: &mut Statements<'_>, arrivals: &mut Arrivals, group: &mut [Job]) -> Result<(), StoreError> {
     let are_read = group.iter().any(|job| matches!(job, Job::Other(verb) if verb.reads_observations()));
     let news = observations(group);
     // A group without observations does not wait for them to be settled.
     if !are_read && news.is_empty() {
         return Ok(());
     }
-    arrivals.check(transaction).await?;
+    arrivals.check(statements).await?;
     if !arrivals.is_known() {
-        arrivals.settle(transaction).await?;
+        arrivals.settle(statements).await?;
     }
-    let accepted = arrivals.accept(transaction, &news).await?;
-    arrivals.add(transaction, &accepted).await?;
-    if are_read || arrivals.is_full() {
-        arrivals.settle(transaction).await?;
-    }
+    let accepted = arrivals.accept(statements, &news).await?;
+    arrivals.add(statements, &news, &accepted, are_read).await?;
     answer_observations(group, accepted.answers);
     Ok(())
 }
 
 /// Stores the trials in `group`, in order.
-async fn open_trials(transaction: &mut SqliteConnection, group: &mut [Job]) -> Result<(), StoreError> {
+async fn open_trials(statements: &mut Statements<'_>, group: &mut [Job]) -> Result<(), StoreError> {
     let mut asked: Vec<_> = group
         .iter_mut()
         .filter_map(|job| match job {
@@ -162,7 +159,7 @@ async fn open_trials(transaction: &mut SqliteConnection, group: &mut [Job]) -> R
         })
         .collect();
     let new: Vec<&NewTrial> = asked.iter().map(|asked| &*asked.request).collect();
-    let answers = trials::open_all(transaction, &new).await?;
+    let answers = trials::open_all(statements, &new).await?;
     for (asked, answer) in asked.iter_mut().zip(answers) {
         asked.answer = Some(answer);
     }
@@ -178,14 +175,16 @@ async fn open_sessions_at_once(
 ) -> Result<bool, StoreError> {
     let are_all = group.iter().all(|job| matches!(job, Job::Session(asked) if asked.request.trial.is_none()));
     if are_all {
-        open_sessions(connection, arrivals, group).await?;
+        let statements = &mut Statements::on(connection);
+        open_sessions(statements, arrivals, group).await?;
+        statements.run().await?;
     }
     Ok(are_all)
 }
 
 /// Opens the sessions in `group`.
 async fn open_sessions(
-    connection: &mut SqliteConnection,
+    statements: &mut Statements<'_>,
     arrivals: &mut Arrivals,
     group: &mut [Job],
 ) -> Result<(), StoreError> {
@@ -195,7 +194,7 @@ async fn open_sessions(
     });
     let mut asked: Vec<_> = asked.collect();
     let new: Vec<&NewSession> = asked.iter().map(|asked| &*asked.request).collect();
-    let answers = sessions::open_all(connection, &new).await?;
+    let answers = sessions::open_all(statements, &new).await?;
     for (asked, answer) in asked.iter_mut().zip(answers) {
         if answer == Opened::Yes {
             arrivals.opened(&asked.request.id);
@@ -226,10 +225,10 @@ async fn accept_rewards_at_once(connection: &mut SqliteConnection, group: &mut [
 }
 
 /// Accepts the rewards in `group`, in order.
-async fn accept_rewards(transaction: &mut SqliteConnection, group: &mut [Job]) -> Result<(), StoreError> {
+async fn accept_rewards(statements: &mut Statements<'_>, group: &mut [Job]) -> Result<(), StoreError> {
     let rewards = rewards(group);
     if !rewards.is_empty() {
-        let answers = trials::accept_all(transaction, &rewards).await?;
+        let answers = trials::accept_all(statements, &rewards).await?;
         answer_rewards(group, answers);
     }
     Ok(())

@@ -32,6 +32,7 @@ use super::database::{Database, Readers};
 use super::observations::NewObservations;
 use super::observations::SessionRefusal;
 use super::policies::AddPolicies;
+use super::statements::Statements;
 use super::trials::{NewReward, NewTrial, Opened, RewardAnswer};
 use super::{NewSession, StoreError, Unavailable, count, database};
 pub(super) use lines::MAX_LARGE_BYTES;
@@ -369,9 +370,12 @@ impl Open {
 
 /// Brings what has arrived to its table.
 async fn settle(connection: &mut SqliteConnection, arrivals: &mut Arrivals) -> Result<(), StoreError> {
-    let mut transaction = connection.begin_with("BEGIN IMMEDIATE").await?;
-    arrivals.settle(&mut transaction).await?;
-    Ok(transaction.commit().await?)
+    let statements = &mut Statements::on(connection);
+    statements.add("BEGIN IMMEDIATE");
+    arrivals.check(statements).await?;
+    arrivals.settle(statements).await?;
+    statements.add("COMMIT");
+    statements.run().await.map(drop)
 }
 
 /// Changes with every registration and deletion of a model.

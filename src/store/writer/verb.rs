@@ -10,6 +10,7 @@ use tokio::sync::oneshot;
 use crate::store::arrivals::Arrivals;
 use crate::store::observations::SessionRefusal;
 use crate::store::policies::AddPolicies;
+use crate::store::statements::Statements;
 use crate::store::trials::{NewReward, NewTrial, Opened, RewardAnswer};
 use crate::store::{NewObservations, NewSession, StoreError};
 
@@ -27,16 +28,23 @@ pub(in crate::store) trait Verb: fmt::Debug + Send + Sync + 'static {
     }
 
     /// Applies it within a transaction. If that fails, it may be applied once more in another one.
-    fn apply(&self, writing: &mut Writing<'_>) -> impl Future<Output = Result<Self::Answer, StoreError>> + Send;
+    fn apply(&self, writing: &mut Writing<'_, '_>) -> impl Future<Output = Result<Self::Answer, StoreError>> + Send;
 }
 
 /// A transaction that writes.
-pub(in crate::store) struct Writing<'w> {
-    pub(in crate::store) connection: &'w mut SqliteConnection,
+pub(in crate::store) struct Writing<'w, 's> {
+    pub(in crate::store) statements: &'w mut Statements<'s>,
     pub(in crate::store) arrivals: &'w mut Arrivals,
     pub(in crate::store) effects: &'w mut Effects,
     /// Whether no sign of life was written since the start, or since the database was unavailable.
     pub(in crate::store) was_interrupted: bool,
+}
+
+impl Writing<'_, '_> {
+    /// The connection, once what waits was executed.
+    pub(in crate::store) async fn connection(&mut self) -> Result<&mut SqliteConnection, StoreError> {
+        self.statements.connection().await
+    }
 }
 
 /// What a transaction changes, once it is committed, for those who do not read the database.
@@ -110,7 +118,7 @@ impl<R, A> Asked<R, A> {
 pub(super) trait AnyVerb: fmt::Debug + Send + Sync {
     fn n_bytes(&self) -> usize;
     fn reads_observations(&self) -> bool;
-    fn apply<'a>(&'a mut self, writing: &'a mut Writing<'_>) -> BoxFuture<'a, Result<(), StoreError>>;
+    fn apply<'a>(&'a mut self, writing: &'a mut Writing<'_, '_>) -> BoxFuture<'a, Result<(), StoreError>>;
     fn tell(self: Box<Self>, committed: Result<(), StoreError>);
 }
 
@@ -123,7 +131,7 @@ impl<V: Verb> AnyVerb for Asked<V, V::Answer> {
         V::READS_OBSERVATIONS
     }
 
-    fn apply<'a>(&'a mut self, writing: &'a mut Writing<'_>) -> BoxFuture<'a, Result<(), StoreError>> {
+    fn apply<'a>(&'a mut self, writing: &'a mut Writing<'_, '_>) -> BoxFuture<'a, Result<(), StoreError>> {
         async {
             self.answer = Some(self.request.apply(writing).await?);
             Ok(())

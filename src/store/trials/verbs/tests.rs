@@ -29,16 +29,20 @@ async fn rewards_need_no_transaction_once_their_learner_is_marked_unless_others_
     let (first, second) = (reward(1, 0.1), reward(2, 0.2));
     assert_eq!(accept_at_once(&mut connection, &[&first]).await.unwrap(), None);
     assert_eq!(store.trial(&first.trial).await.unwrap().unwrap().reward, None, "nothing was done");
-    learners::mark_pending(&mut connection, &format!("[{learner}]")).await.unwrap();
+    let statements = &mut Statements::on(&mut connection);
+    learners::mark_pending(statements, &format!("[{learner}]"));
+    statements.run().await.unwrap();
     let answers = accept_at_once(&mut connection, &[&second, &first]).await.unwrap().unwrap();
     assert!(answers.iter().all(|answer| matches!(answer, RewardAnswer::Accepted(_))), "{answers:?}");
     let stored = store.trial(&first.trial).await.unwrap().unwrap().reward.unwrap();
     assert_eq!((stored.reward.to_bits(), stored.reward_order), (0.1_f64.to_bits(), 2));
 
     let third = reward(3, 0.3);
-    let decided = read_rewarded(&mut connection, &[&third]).await.unwrap().decide(&[&third]);
+    let decided = read_rewarded(&mut Statements::on(&mut connection), &[&third]).await.unwrap().decide(&[&third]);
     sqlx::query("UPDATE trials SET is_failed = 1 WHERE number = 3").execute(&mut other).await.unwrap();
-    assert!(!decided.insert(&mut connection).await.unwrap());
+    let statements = &mut Statements::on(&mut connection);
+    decided.insert(statements);
+    assert_eq!(statements.run().await.unwrap(), 0);
     assert_eq!(store.trial(&third.trial).await.unwrap().unwrap().reward, None);
     let answers = accept_at_once(&mut connection, &[&third]).await.unwrap().unwrap();
     assert_eq!(answers, [RewardAnswer::Failed]);
