@@ -244,8 +244,8 @@ mod tests {
     }
 }
 
-/// Keys of models by name, each with the generation of the table of models that it was read from: known for as long as no
-/// model is registered or deleted.
+/// Keys of models by name, each with the generation of the model that it was read from: known for as long as no model of this name is
+/// registered, changed or deleted.
 #[derive(Debug)]
 pub(super) struct ModelNames {
     keys: Cache<String, (u64, ModelKey)>,
@@ -261,7 +261,7 @@ impl ModelNames {
 }
 
 impl Etude {
-    /// As [`Self::mapper`], without a look at the database if no model was registered or deleted since the last one.
+    /// As [`Self::mapper`], without a look at the database if it has not changed since the last one.
     pub(super) async fn known_mapper(
         &self,
         name: &str,
@@ -270,7 +270,7 @@ impl Etude {
         deadline: Option<Instant>,
     ) -> Result<(String, Arc<Mapper>), ServiceError> {
         // Read before anything else, so that a change meanwhile makes the entry outdated.
-        let generation = self.store.models_generation();
+        let generation = self.store.model_generation(name);
         if let Some(known) = self.mapper_at_hand(name) {
             return Ok(known);
         }
@@ -285,7 +285,7 @@ impl Etude {
 
     /// The mapper of the model called `name`, and the hash of that, if both are known without waiting for anything.
     pub(super) fn mapper_at_hand(&self, name: &str) -> Option<(String, Arc<Mapper>)> {
-        let generation = self.store.models_generation()?;
+        let generation = self.store.model_generation(name)?;
         let (_, key) = self.model_names.keys.get(name).filter(|(known, _)| *known == generation)?;
         let mapper = self.compiler.cache.get(&key)?;
         Some((key.hash, mapper))

@@ -198,7 +198,7 @@ impl Verb for NewBatch {
             .bind(&self.content)
             .execute(writing.connection().await?)
             .await?;
-        note_change(writing).await?;
+        note_change(writing, &self.model).await?;
         Ok(true)
     }
 }

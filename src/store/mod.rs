@@ -166,9 +166,10 @@ impl Store {
         self.readers.one().await
     }
 
-    /// A number that changes whenever a model is registered, replaced or deleted, before that is answered; `None` if it is not known now.
-    pub(crate) fn models_generation(&self) -> Option<u64> {
-        self.writer.models_generation()
+    /// A number that changes whenever the model called `name` is registered, changed or deleted, before that is answered; `None` if it is not known
+    /// now.
+    pub(crate) fn model_generation(&self, name: &str) -> Option<u64> {
+        self.writer.generation(name)
     }
 
     /// Notes that the service is alive at `now`, as is done at least `every` so often. Time without service before does not count for

@@ -315,7 +315,7 @@ impl Verb for DeleteModel {
     async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Option<DeletedModel>, StoreError> {
         let deleted = delete(writing.connection().await?, &self.0).await?;
         if deleted.is_some() {
-            note_change(writing).await?;
+            note_change(writing, &self.0).await?;
         }
         Ok(deleted)
     }
@@ -326,10 +326,12 @@ async fn delete(connection: &mut SqliteConnection, name: &str) -> Result<Option<
     Ok(query.fetch_optional(connection).await?.map(|definition_id| DeletedModel { definition_id }))
 }
 
-/// Counts a registration, replacement or deletion.
-pub(super) async fn note_change(writing: &mut Writing<'_, '_>) -> Result<(), StoreError> {
-    let query = "UPDATE service SET models_generation = models_generation + 1 RETURNING models_generation";
-    let row = sqlx::query(query).fetch_one(writing.connection().await?).await?;
-    writing.effects.models_generation = Some(count(&row, "service", "models_generation")?);
+/// Counts a registration, change or deletion of the model called `name`.
+pub(super) async fn note_change(writing: &mut Writing<'_, '_>, name: &str) -> Result<(), StoreError> {
+    let counted = "UPDATE service SET models_generation = models_generation + 1 RETURNING models_generation";
+    writing.statements.add(counted);
+    let row = writing.statements.fetch().await?.ok_or(sqlx::Error::RowNotFound)?;
+    let generation = count(&row, "service", "models_generation")?;
+    writing.effects.changed_models.push((name.to_owned(), generation));
     Ok(())
 }

@@ -32,6 +32,7 @@ pub use error::SessionError;
 pub use kept::ShortStep;
 use kept::Unwritten;
 pub(super) use left::Left;
+use received::ReceivedText;
 pub use received::{Coming, Observation, Received, ReceivedFrame};
 pub use resuming::Resumed;
 use session::Source;
@@ -134,6 +135,7 @@ impl Etude {
             unwritten: Unwritten::default(),
             is_slow: false,
             takes_some_time: false,
+            text: ReceivedText::from_start(),
             watch: Watch::new(&weights),
             weights,
             online,

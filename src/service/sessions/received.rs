@@ -64,3 +64,57 @@ pub enum Received {
     /// They take longer to be mapped: see [`Session::advance`](super::Session::advance).
     Waiting(Waiting),
 }
+
+/// What was received since the start, as it is stored, for as long as that is short: whoever ends such a session need not read it again.
+#[derive(Debug, Default)]
+pub(super) struct ReceivedText(Option<String>);
+
+impl ReceivedText {
+    /// Most bytes: some tens of observations.
+    const MAX_BYTES: usize = 8 << 10;
+
+    /// Nothing was received yet.
+    pub(super) fn from_start() -> Self {
+        Self(Some(String::new()))
+    }
+
+    /// Adds what was received next: an array in JSON that is not empty.
+    pub(super) fn add(&mut self, states: &str) {
+        let Some(text) = self.0.as_mut().filter(|text| text.len() + states.len() <= Self::MAX_BYTES) else {
+            self.0 = None;
+            return;
+        };
+        if text.pop().is_some() {
+            text.push(',');
+            text.push_str(&states[1..]);
+        } else {
+            text.push_str(states);
+        }
+    }
+
+    /// All that was received: an array in JSON; `None` if it is not known, or nothing was.
+    pub(super) fn whole(&self) -> Option<&str> {
+        self.0.as_deref().filter(|text| !text.is_empty())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_was_received_is_known_while_it_is_short() {
+        let mut text = ReceivedText::from_start();
+        assert_eq!(text.whole(), None);
+        text.add("[[0]]");
+        text.add("[0.5,[1],[2]]");
+        assert_eq!(text.whole(), Some("[[0],0.5,[1],[2]]"));
+        text.add(&format!("[[{}]]", "9".repeat(ReceivedText::MAX_BYTES)));
+        assert_eq!(text.whole(), None);
+        text.add("[[3]]");
+        assert_eq!(text.whole(), None, "it is not the whole");
+        let mut resumed = ReceivedText::default();
+        resumed.add("[[3]]");
+        assert_eq!(resumed.whole(), None);
+    }
+}

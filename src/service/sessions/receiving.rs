@@ -158,6 +158,7 @@ impl Session {
             waits.came(self.n_received, Duration::ZERO, etude.clock.instant());
         }
         stored.push(']');
+        self.text.add(&stored);
         let appending = etude.store.append_observations(NewObservations {
             session_id: self.id.clone(),
             owner: self.owner,

@@ -8,7 +8,7 @@ use super::ending::SessionPolicy;
 use super::kept::{Kept, ShortStep, Unwritten};
 use super::left::RETRY_AFTER;
 use super::reading::{ReadAgain, StoredSession, read_again};
-use super::received::Observation;
+use super::received::{Observation, ReceivedText};
 use super::session::{Session, Source};
 use super::waits::Waits;
 use super::{SessionError, unknown};
@@ -125,6 +125,7 @@ impl Etude {
             watch: Watch::new(&weights),
             is_slow: false,
             takes_some_time: false,
+            text: ReceivedText::default(),
             online: None,
             mapper,
             held: self.memory.try_take(0).map_err(ServiceError::from)?,
@@ -230,16 +231,26 @@ impl Etude {
         n_observations: u32,
         model: &Model,
     ) -> Result<(StoredObservations, Option<Held>), ServiceError> {
+        let n_bytes = usize::try_from(self.store.observations_bytes(session, from).await?).unwrap_or(usize::MAX);
+        let held = self.hold_observations(n_bytes, n_observations.saturating_sub(from) as usize, model)?;
+        Ok((self.store.observations(session, from).await?, held))
+    }
+
+    /// The memory that so many observations take, of a text of so many bytes, if it is much.
+    pub(super) fn hold_observations(
+        &self,
+        n_bytes: usize,
+        n_observations: usize,
+        model: &Model,
+    ) -> Result<Option<Held>, ServiceError> {
         /// In a row, and as they are given.
         const COPIES: usize = 2;
-        let n_bytes = usize::try_from(self.store.observations_bytes(session, from).await?).unwrap_or(usize::MAX);
-        let (schema, n_observations) = (model.schema(), n_observations.saturating_sub(from) as usize);
         // All together, and one by one.
         let read_bytes =
-            2 * Demonstration::bytes_of(schema, n_observations) + n_observations * size_of::<Observation>();
+            2 * Demonstration::bytes_of(model.schema(), n_observations) + n_observations * size_of::<Observation>();
         let mut held = None;
         self.memory.reserve(&mut held, COPIES.saturating_mul(n_bytes) + read_bytes)?;
-        Ok((self.store.observations(session, from).await?, held))
+        Ok(held)
     }
 }
 

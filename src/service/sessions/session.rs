@@ -11,6 +11,7 @@ use super::SessionError;
 use super::ending::{Ended, conclude, take_for_end, written_bytes};
 use super::kept::Unwritten;
 use super::left::Leaving;
+use super::received::ReceivedText;
 use super::waits::Waits;
 use crate::client::Client;
 use crate::memory::{Held, SMALL_BYTES};
@@ -52,6 +53,8 @@ pub struct Session {
     pub(super) online: Option<OnlineMapping>,
     /// What was observed and can hardly be meant.
     pub(super) watch: Watch,
+    /// What was received, as it is stored.
+    pub(super) text: ReceivedText,
     /// What the mapping takes.
     pub(super) held: Held,
     /// Who drives it.
@@ -187,8 +190,14 @@ impl Session {
         if seq == 0 {
             return Err(SessionError::Empty);
         }
-        let stored = etude.stored_observations(&self.id, 0, self.n_received, self.mapper.model());
-        let (StoredObservations { texts, .. }, texts_held) = stored.await?;
+        let (texts, texts_held) = if let Some(text) = self.text.whole() {
+            let held = etude.hold_observations(text.len(), self.n_received as usize, self.mapper.model())?;
+            (vec![text.to_owned()], held)
+        } else {
+            let stored = etude.stored_observations(&self.id, 0, self.n_received, self.mapper.model());
+            let (StoredObservations { texts, .. }, held) = stored.await?;
+            (texts, held)
+        };
         let is_inline = self.ends_inline(&etude.clock);
         let online = self.online.take().ok_or(SessionError::NotOpen)?;
         let (mapper, wanted) = (Arc::clone(&self.mapper), (self.weights.clone(), self.conditions.clone()));

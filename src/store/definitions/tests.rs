@@ -191,9 +191,13 @@ async fn a_model_that_takes_the_place_of_another_one_leaves_nothing_of_that() {
     let mut new = model("m", stored(&store, &["new"]).await);
     new.summary.hash = "other".to_owned();
     new.replaces = Replaces::OneOf(vec!["hash".to_owned()]);
-    let before = store.models_generation();
+    let before = store.model_generation("m");
     assert!(matches!(store.register_model(new).await.unwrap(), ModelRegistration::Replaced(_)));
-    assert_ne!(store.models_generation(), before);
+    assert_ne!(store.model_generation("m"), before);
+    let before = store.model_generation("m");
+    store.register_model(model("other", stored(&store, &["other"]).await)).await.unwrap();
+    assert!(before.is_some() && store.model_generation("m") == before, "another one has changed");
+    store.delete_model("other").await.unwrap();
     assert_eq!(text(&store, "m").await.unwrap(), "new");
     until_counts_are(&store, (1, 1)).await;
     // What is not to be replaced stays, with all its pieces.

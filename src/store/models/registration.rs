@@ -22,7 +22,7 @@ impl Verb for NewModel {
     async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Self::Answer, StoreError> {
         let registered = register(writing.statements, self).await?;
         if let ModelRegistration::Created(_) | ModelRegistration::Replaced(_) = registered.0 {
-            note_change(writing).await?;
+            note_change(writing, &self.summary.name).await?;
         }
         Ok(registered)
     }

@@ -10,6 +10,7 @@
 //! After an error the state of the connection is unknown: a transaction may still be open. So the connection is closed, and the next
 //! group opens another. A write is acknowledged only if the file that was written to still has the database's name.
 
+mod generations;
 mod group;
 mod lines;
 #[cfg(test)]
@@ -17,7 +18,6 @@ mod tests;
 mod verb;
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use sqlx::{Connection, SqliteConnection};
@@ -35,6 +35,7 @@ use super::policies::AddPolicies;
 use super::statements::Statements;
 use super::trials::{NewReward, NewTrial, Opened, RewardAnswer};
 use super::{NewSession, StoreError, Unavailable, count, database};
+use generations::Generations;
 pub(super) use lines::MAX_LARGE_BYTES;
 use lines::{Lines, MAX_SMALL_BYTES};
 use verb::{Asked, Job};
@@ -61,24 +62,7 @@ pub(super) struct Writer {
     small: mpsc::Sender<Job>,
     large: mpsc::Sender<Job>,
     closing: CancellationToken,
-    models_generation: ModelsGeneration,
-}
-
-/// The generation of models in the database, if it is known: read when the writer's connection is opened, and forgotten when it is closed.
-#[derive(Clone, Debug, Default)]
-struct ModelsGeneration(Arc<AtomicU64>);
-
-impl ModelsGeneration {
-    /// Stands for one that is not known. The database counts from 1.
-    const UNKNOWN: u64 = 0;
-
-    fn get(&self) -> Option<u64> {
-        Some(self.0.load(Ordering::Acquire)).filter(|generation| *generation != Self::UNKNOWN)
-    }
-
-    fn set(&self, generation: Option<u64>) {
-        self.0.store(generation.unwrap_or(Self::UNKNOWN), Ordering::Release);
-    }
+    generations: Generations,
 }
 
 impl Writer {
@@ -101,7 +85,7 @@ impl Writer {
             arrivals: Arrivals::default(),
             was_interrupted: true,
             trouble: None,
-            models_generation: writer.models_generation.clone(),
+            generations: writer.generations.clone(),
         };
         tasks.spawn(open.run(lines));
         writer
@@ -118,12 +102,13 @@ impl Writer {
     fn with_lines() -> (Self, Lines) {
         let closing = CancellationToken::new();
         let (lines, [small, large]) = Lines::new(closing.clone());
-        (Self { small, large, closing, models_generation: ModelsGeneration::default() }, lines)
+        (Self { small, large, closing, generations: Generations::default() }, lines)
     }
 
-    /// A number that changes whenever a model is registered or deleted, before that is answered; `None` if it is not known now.
-    pub(super) fn models_generation(&self) -> Option<u64> {
-        self.models_generation.get()
+    /// A number that changes whenever the model called `name` is registered, changed or deleted, before that is answered; `None` if it is not known
+    /// now.
+    pub(super) fn generation(&self, name: &str) -> Option<u64> {
+        self.generations.of(name)
     }
 
     /// Takes no more requests, and ends once everything waiting has been written.
@@ -228,7 +213,7 @@ struct Open {
     was_interrupted: bool,
     /// Why nothing could be written the last time, if that was so.
     trouble: Option<Unavailable>,
-    models_generation: ModelsGeneration,
+    generations: Generations,
 }
 
 impl Open {
@@ -293,14 +278,14 @@ impl Open {
             Some(connection) => connection,
             none => none.insert(self.database.connect().await?),
         };
-        if self.models_generation.get().is_none() {
-            self.models_generation.set(Some(models_generation(connection).await?));
+        if !self.generations.are_known() {
+            self.generations.begin(models_generation(connection).await?);
         }
         let effects = group::write(connection, &mut self.arrivals, group, self.was_interrupted).await?;
         self.database.check_written()?;
         self.was_interrupted &= !effects.has_noted_life;
-        if effects.models_generation.is_some() {
-            self.models_generation.set(effects.models_generation);
+        for (name, generation) in effects.changed_models {
+            self.generations.note(name, generation);
         }
         Ok(())
     }
@@ -336,7 +321,7 @@ impl Open {
 
     async fn failed(&mut self, error: StoreError) -> StoreError {
         self.arrivals.forget();
-        self.models_generation.set(None);
+        self.generations.forget();
         if let Some(connection) = self.connection.take() {
             self.database.disconnect(connection).await;
         }

@@ -52,8 +52,8 @@ impl Writing<'_, '_> {
 pub(in crate::store) struct Effects {
     /// Whether a sign of life was noted.
     pub(in crate::store) has_noted_life: bool,
-    /// The generation of models, if models were registered or deleted.
-    pub(in crate::store) models_generation: Option<u64>,
+    /// Models that were registered, changed or deleted, in order, with their generations.
+    pub(in crate::store) changed_models: Vec<(String, u64)>,
 }
 
 /// A request to the writer. Those of a kind that comes often are applied all together.
