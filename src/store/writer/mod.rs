@@ -5,7 +5,8 @@
 //! grow with the load, and no timer is needed. Small and large requests wait in lines of their own. A group takes all small requests, but
 //! only about a MiB of large ones, so that small requests never wait long behind large ones. Observations, which are most requests, are
 //! written to `arrivals` with a commit, and moved to their table later. A group of observations alone, of policies alone, or of sessions
-//! alone that are opened, takes a single statement, and one of rewards alone two, outside of a transaction, as each statement costs the driver a change of threads.
+//! alone that are opened, takes a single statement, and one of rewards alone two, outside of a transaction. Any other takes a transaction of a
+//! few executions (`store::statements`), as each costs the driver a change of threads.
 //!
 //! After an error the state of the connection is unknown: a transaction may still be open. So the connection is closed, and the next
 //! group opens another. A write is acknowledged only if the file that was written to still has the database's name.
