@@ -84,7 +84,7 @@ pub(super) async fn serve<S>(
         }
     };
     let (speaking, speaker) = abortable(speaking);
-    // Each is polled only when it was woken, which is most of what an observation takes here.
+    // Each is polled only when it was woken: an observation wakes them one after the other.
     let parts: [BoxFuture<'_, Part>; 3] = [
         listening.map(|()| Part::Listening).boxed(),
         speaking.map(|_| Part::Speaking).boxed(),

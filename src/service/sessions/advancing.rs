@@ -232,7 +232,7 @@ impl Session {
     /// Takes note of what was mapped, and gives what is left, with all the steps.
     fn take_note(&mut self, advance: Advance) -> Result<Waiting, SessionError> {
         let Advance { online, waiting, n_noted, n_met, .. } = advance;
-        self.reserve(online.size_bytes() as u64)?;
+        self.reserve((online.size_bytes() + self.text.n_bytes()) as u64)?;
         self.online = Some(online);
         let steps = waiting.steps.get(n_noted..).unwrap_or_default();
         self.n_steps += steps.len();
@@ -267,7 +267,7 @@ impl Session {
         are_few_nodes(graph.n_states() + graph.n_transitions(), self.lookahead, n_observations)
     }
 
-    /// Counts what the mapping takes.
+    /// Counts what the mapping, and the text of what was received, take.
     pub(super) fn reserve(&mut self, n_bytes: u64) -> Result<(), SessionError> {
         // Most windows grow and shrink a little all the time.
         if n_bytes < self.held.n_bytes() / 2 {

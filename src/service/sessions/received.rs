@@ -92,6 +92,11 @@ impl ReceivedText {
         }
     }
 
+    /// How much memory it takes, in bytes.
+    pub(super) fn n_bytes(&self) -> usize {
+        self.0.as_ref().map_or(0, String::capacity)
+    }
+
     /// All that was received: an array in JSON; `None` if it is not known, or nothing was.
     pub(super) fn whole(&self) -> Option<&str> {
         self.0.as_deref().filter(|text| !text.is_empty())
@@ -109,8 +114,9 @@ mod tests {
         text.add("[[0]]");
         text.add("[0.5,[1],[2]]");
         assert_eq!(text.whole(), Some("[[0],0.5,[1],[2]]"));
+        assert!(text.n_bytes() >= "[[0],0.5,[1],[2]]".len());
         text.add(&format!("[[{}]]", "9".repeat(ReceivedText::MAX_BYTES)));
-        assert_eq!(text.whole(), None);
+        assert_eq!((text.whole(), text.n_bytes()), (None, 0));
         text.add("[[3]]");
         assert_eq!(text.whole(), None, "it is not the whole");
         let mut resumed = ReceivedText::default();

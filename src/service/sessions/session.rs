@@ -55,7 +55,7 @@ pub struct Session {
     pub(super) watch: Watch,
     /// What was received, as it is stored.
     pub(super) text: ReceivedText,
-    /// What the mapping takes.
+    /// What the mapping and the text take.
     pub(super) held: Held,
     /// Who drives it.
     pub(super) client: Client,
