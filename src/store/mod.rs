@@ -3,6 +3,7 @@
 //! ```text
 //! service --verbs--> two lines --> writer (one task, one connection): groups what is small and waits, and some of what is large
 //!    |                                BEGIN IMMEDIATE .. COMMIT (WAL, synchronous = FULL), then answers every waiter
+//!    |                                statements: executed together, but for what is asked in between
 //!    |                                observations: one row a group in `arrivals`, settled in their table later
 //!    +------ reads ----------------> pool of readers (query_only), one of which copies the log to the database now and then
 //! ```

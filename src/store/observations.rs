@@ -166,8 +166,8 @@ pub(super) async fn find_open(
     Ok(open.map(|(id, owner, n_observations)| (id, OpenSession { owner: Owner(owner), n_observations })).collect())
 }
 
-/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. A few
-/// statements, however many there are: each one costs the driver a change of threads.
+/// Adds to the tables of several sessions, each of them once. Gives for each whether it was open and this was what came next. Takes
+/// one execution, however many there are; what is inserted waits in `statements`.
 pub(super) async fn add(statements: &mut Statements<'_>, group: &[&Arrived]) -> Result<Vec<bool>, StoreError> {
     let rows = group.iter().map(|new| json!([new.session_id, new.seq, new.n_states, new.at.as_millisecond()]));
     let updated = sqlx::query_scalar::<_, String>(COUNT_NEXT)

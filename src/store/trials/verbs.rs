@@ -14,8 +14,8 @@ use crate::store::statements::Statements;
 use crate::store::writer::{Verb, Writing};
 use crate::store::{StoreError, as_integer, corrupt, count, learners, policies, refinements, request_keys};
 
-/// Stores trials and their policies, in order, and the keys of the requests for them, within a transaction. Takes two statements for all without
-/// a key that come one after the other, and more for those that are refused or are to be refined.
+/// Stores trials and their policies, in order, and the keys of the requests for them, within a transaction. Takes one execution for all without
+/// a key that come one after the other, and more for those that have one or are refused.
 pub(in crate::store) async fn open_all(
     statements: &mut Statements<'_>,
     trials: &[&NewTrial],
