@@ -30,7 +30,7 @@ const MAX_BYTES: usize = 1 << 20;
 /// What the writer knows of open sessions and of the table `arrivals`.
 #[derive(Debug, Default)]
 pub(super) struct Arrivals {
-    /// Open sessions, by id: who owns them and how many observations they have, those in `arrivals` included. Every session with
+    /// Open sessions, by id: who owns them and how many observations they have, those in `arrivals` included. Every open session with
     /// observations in `arrivals` is among them.
     open: HashMap<String, OpenSession>,
     /// What is in the table, by session.
@@ -62,6 +62,11 @@ impl Arrivals {
     /// Whether it is known what the database holds.
     pub(super) fn is_known(&self) -> bool {
         self.data_version.is_some()
+    }
+
+    /// SQLite's number that changes when others write, if anything is known.
+    pub(super) fn data_version(&self) -> Option<i64> {
+        self.data_version
     }
 
     /// Whether it is time to settle.
@@ -232,7 +237,7 @@ impl Arrivals {
         }
     }
 
-    /// A session was ended, once everything was settled.
+    /// A session was ended. What it has in the table is settled with the rest.
     pub(super) fn ended(&mut self, session_id: &str) {
         self.open.remove(session_id);
     }

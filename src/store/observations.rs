@@ -149,11 +149,11 @@ pub(super) struct OpenSession {
 const FIND_OPEN: &str = "SELECT id, owner, n_observations FROM sessions
      WHERE +status = 'open' AND id IN (SELECT value FROM json_each($1))";
 
-/// Only what comes next, and only once, whatever is retried or raced.
+/// Only what comes next, and only once, whatever is retried or raced; also to sessions that have ended meanwhile.
 const COUNT_NEXT: &str = "UPDATE sessions
      SET n_observations = n_observations + (new.value ->> 2), active_at_ms = MAX(active_at_ms, new.value ->> 3)
      FROM json_each($1) AS new
-     WHERE sessions.id = new.value ->> 0 AND +status = 'open' AND n_observations = new.value ->> 1
+     WHERE sessions.id = new.value ->> 0 AND +status <> 'expired' AND n_observations = new.value ->> 1
      RETURNING sessions.id";
 
 /// The open ones among the sessions with these ids (JSON: an array), with how many observations their table has of each.

@@ -85,6 +85,13 @@ impl<'c> Statements<'c> {
         Ok(query.execute(&mut *self.connection).await?.rows_affected())
     }
 
+    /// Undoes what was done in the transaction that has begun, and forgets what waits.
+    pub(super) async fn undo(&mut self) -> Result<(), StoreError> {
+        self.take();
+        self.add("ROLLBACK");
+        self.run().await.map(drop)
+    }
+
     fn take(&mut self) -> Option<Query<'static, Sqlite, SqliteArguments>> {
         let (sql, values) = (std::mem::take(&mut self.sql), std::mem::take(&mut self.values));
         let are_usual = std::mem::replace(&mut self.are_usual, true);

@@ -244,14 +244,17 @@ impl Connection<'_> {
                 self.observe(seq, (frame, memory), n_bytes, incoming, now).await
             }
             (ClientFrame::End { seq }, Some(session)) => match session.end(self.etude, seq, now).await {
-                Ok(Ended { steps, policy }) => {
-                    self.outlet.send_steps(&steps).await?;
-                    self.outlet.send(&ServerFrame::from(&policy)).await?;
-                    self.done().await
-                }
+                Ok(ended) => self.ended(&ended).await,
                 Err(error) => self.go_on_or_end(&error).await,
             },
         }
+    }
+
+    /// Tells the client how its demonstration has ended.
+    pub(super) async fn ended(&mut self, Ended { steps, policy }: &Ended) -> Result<Option<Closed>, Over> {
+        self.outlet.send_steps(steps).await?;
+        self.outlet.send(&ServerFrame::from(policy)).await?;
+        self.done().await
     }
 
     /// How the connection ends once the policy is done, unless a reward is still to come.

@@ -68,7 +68,13 @@ impl Connection<'_> {
             }
             others.push(next);
         }
-        let received = match session.receive(self.etude, coming, now).await {
+        let is_last = self.next.as_ref().is_some_and(|next| ends_after(&next.item, &coming));
+        let received = if is_last {
+            session.receive_last(self.etude, coming, now).await
+        } else {
+            session.receive(self.etude, coming, now).await.map(|received| (received, None))
+        };
+        let (received, ended) = match received {
             Ok(received) => received,
             Err(error) => return self.go_on_or_end(&error).await,
         };
@@ -88,8 +94,18 @@ impl Connection<'_> {
             };
             outlet.send_steps(&steps).await?;
         }
-        Ok(None)
+        let Some(ended) = ended else { return Ok(None) };
+        // What said that it ends is answered too.
+        self.next = None;
+        self.ended(&ended).await
     }
+}
+
+/// Whether what waits ends a demonstration that has come as far as what is coming.
+fn ends_after(next: &Incoming, coming: &Coming) -> bool {
+    let Incoming::Frame { text, .. } = next else { return false };
+    text.len() <= SMALL_FRAME_BYTES
+        && matches!(read_frame(text), Ok(ClientFrame::End { seq }) if Some(seq) == coming.n_received())
 }
 
 /// Takes in a frame that waits, if it is one of observations with which nothing is wrong. Says whether it was taken; whatever else it is, it is

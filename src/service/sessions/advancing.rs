@@ -246,7 +246,7 @@ impl Session {
 
     /// Finds the rest of the mapping, if the session is so short that its end takes little. Gives whether it has found it.
     pub(super) fn ends_inline(&self, clock: &Clock) -> bool {
-        let n_observations = self.n_received as usize;
+        let n_observations = self.n_sent as usize;
         let n_values = (n_observations + self.n_steps).saturating_mul(self.mapper.model().schema().len());
         let Some(online) =
             self.online.as_ref().filter(|_| n_values <= MAX_WINDOW_VALUES && self.is_inline(n_observations))

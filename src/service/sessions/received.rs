@@ -21,6 +21,14 @@ pub struct Coming {
     pub(super) stored: String,
 }
 
+impl Coming {
+    /// How many observations there are with it; `None` if nothing is coming.
+    #[must_use]
+    pub fn n_received(&self) -> Option<u32> {
+        self.frames.last().map(|last| last.n_received)
+    }
+}
+
 /// What is new of a frame.
 #[derive(Debug)]
 pub(super) struct ComingFrame {
@@ -95,6 +103,11 @@ impl ReceivedText {
     /// How much memory it takes, in bytes.
     pub(super) fn n_bytes(&self) -> usize {
         self.0.as_ref().map_or(0, String::capacity)
+    }
+
+    /// Whether all that was received is known so far.
+    pub(super) fn is_known(&self) -> bool {
+        self.0.is_some()
     }
 
     /// All that was received: an array in JSON; `None` if it is not known, or nothing was.

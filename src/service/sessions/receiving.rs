@@ -19,6 +19,7 @@ use serde_json::Value;
 use super::SessionError;
 use super::advancing::HERE;
 use super::committed::CommittedSteps;
+use super::ending::Ended;
 use super::received::{Coming, ComingFrame, Observation, Received, ReceivedFrame, Waiting};
 use super::session::Session;
 use crate::memory::UNCOUNTED_BYTES;
@@ -142,33 +143,12 @@ impl Session {
         coming: Coming,
         now: Timestamp,
     ) -> Result<Vec<ReceivedFrame>, SessionError> {
-        let Coming { frames, mut stored } = coming;
-        if stored.is_empty() {
+        if coming.stored.is_empty() {
             etude.store.touch_session(&self.id, self.owner, now).await??;
-            return Ok(self.map_frames(etude, frames));
+            return Ok(self.map_frames(etude, coming.frames));
         }
-        let steps = match &self.online {
-            Some(online) if self.unwritten.are_enough(self.is_inline(1)) => {
-                Some(self.unwritten.take(online, &self.watch, self.n_received)?)
-            }
-            _ => None,
-        };
-        self.n_sent = frames.last().map_or(self.n_received, |last| last.n_received);
-        if let Some(waits) = &mut self.waits {
-            waits.came(self.n_received, Duration::ZERO, etude.clock.instant());
-        }
-        stored.push(']');
-        self.text.add(&stored);
-        let appending = etude.store.append_observations(NewObservations {
-            session_id: self.id.clone(),
-            owner: self.owner,
-            seq: self.n_received,
-            n_states: self.n_sent - self.n_received,
-            states: stored,
-            at: now,
-            service_time: self.waits.as_ref().map(|_| etude.store.service_time(now)),
-            steps,
-        });
+        let (frames, new) = self.written(etude, coming, now)?;
+        let appending = etude.store.append_observations(new);
         let mapping = async {
             if self.takes_some_time {
                 // What writes runs on this thread, once it has nothing else to do.
@@ -181,6 +161,74 @@ impl Session {
         appended??;
         self.n_received = self.n_sent;
         Ok(received)
+    }
+
+    /// Receives what is coming as [`Self::receive`] does, and ends the demonstration by the same commit, if all of that takes little. Gives its
+    /// end; `None` if it is still to be [ended](Self::end).
+    ///
+    /// # Errors
+    ///
+    /// After any the session is to be dropped.
+    pub async fn receive_last(
+        &mut self,
+        etude: &Etude,
+        coming: Coming,
+        now: Timestamp,
+    ) -> Result<(Vec<ReceivedFrame>, Option<Ended>), SessionError> {
+        if coming.stored.is_empty() || !self.text.is_known() {
+            return Ok((self.receive(etude, coming, now).await?, None));
+        }
+        let (frames, new) = self.written(etude, coming, now)?;
+        let received = self.map_frames(etude, frames);
+        let are_mapped = received.iter().all(|frame| matches!(frame.mapped, Ok(Received::Mapped(_))));
+        let is_short = are_mapped && self.ends_inline(&etude.clock);
+        let texts = if is_short { self.texts_if_known(etude).ok().flatten() } else { None };
+        let concluded = match texts {
+            Some(texts) => Some(self.conclude_all(etude, texts, true).await),
+            None => None,
+        };
+        let ended = if let Some(Ok(concluded)) = concluded {
+            Some(self.store_end(etude, concluded, Some(new), now).await?)
+        } else {
+            // Whatever kept it from ending, they were received.
+            etude.store.append_observations(new).await??;
+            concluded.transpose()?;
+            None
+        };
+        self.n_received = self.n_sent;
+        Ok((received, ended))
+    }
+
+    /// What is coming as it is stored, and its frames. Takes note of it.
+    fn written(
+        &mut self,
+        etude: &Etude,
+        Coming { frames, mut stored }: Coming,
+        now: Timestamp,
+    ) -> Result<(Vec<ComingFrame>, NewObservations), SessionError> {
+        let steps = match &self.online {
+            Some(online) if self.unwritten.are_enough(self.is_inline(1)) => {
+                Some(self.unwritten.take(online, &self.watch, self.n_received)?)
+            }
+            _ => None,
+        };
+        self.n_sent = frames.last().map_or(self.n_received, |last| last.n_received);
+        if let Some(waits) = &mut self.waits {
+            waits.came(self.n_received, Duration::ZERO, etude.clock.instant());
+        }
+        stored.push(']');
+        self.text.add(&stored);
+        let new = NewObservations {
+            session_id: self.id.clone(),
+            owner: self.owner,
+            seq: self.n_received,
+            n_states: self.n_sent - self.n_received,
+            states: stored,
+            at: now,
+            service_time: self.waits.as_ref().map(|_| etude.store.service_time(now)),
+            steps,
+        };
+        Ok((frames, new))
     }
 
     /// Maps as much of `frames` as is done where they arrive. What comes after a frame that takes longer, or when they have taken as long

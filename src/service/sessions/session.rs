@@ -4,24 +4,20 @@ use std::num::NonZeroU32;
 use std::sync::Arc;
 use std::time::Instant;
 
-use jiff::Timestamp;
 use tokio_util::sync::CancellationToken;
 
 use super::SessionError;
-use super::ending::{Ended, conclude, take_for_end, written_bytes};
 use super::kept::Unwritten;
 use super::left::Leaving;
 use super::received::ReceivedText;
 use super::waits::Waits;
 use crate::client::Client;
-use crate::memory::{Held, SMALL_BYTES};
+use crate::memory::Held;
+use crate::service::Etude;
 use crate::service::owners::Ownership;
-use crate::service::search::take_beyond_small;
-use crate::service::{Etude, ServiceError};
-use crate::store::{AcceptedReward, Owner, SessionEnd, StoredObservations, TrialRecord};
+use crate::store::{AcceptedReward, Owner, TrialRecord};
 use etude_core::attribute::{ByAttribute, Weights};
-use etude_core::interrupt::Interrupt;
-use etude_core::mapping::{Conditions, Mapper, OnlineMapping, Perception, Stamp, Watch};
+use etude_core::mapping::{Conditions, Mapper, OnlineMapping, Perception, Watch};
 
 /// An open session, and the right to drive it.
 #[derive(Debug)]
@@ -173,75 +169,5 @@ impl Session {
             Some(TrialRecord { failed: None, .. }) => RewardState::Awaited,
             Some(_) | None => RewardState::Never,
         })
-    }
-
-    /// Ends the demonstration, which must have `seq` observations, and stores its policy.
-    ///
-    /// # Errors
-    ///
-    /// If observations are missing, or the service ends. After [`SessionError::TooManySteps`] the session is to be dropped.
-    pub async fn end(&mut self, etude: &Etude, seq: u32, now: Timestamp) -> Result<Ended, SessionError> {
-        if self.has_ended() {
-            return Err(SessionError::Ended);
-        }
-        if seq != self.n_received {
-            return Err(SessionError::Gap { expected: self.n_received });
-        }
-        if seq == 0 {
-            return Err(SessionError::Empty);
-        }
-        let (texts, texts_held) = if let Some(text) = self.text.whole() {
-            let held = etude.hold_observations(text.len(), self.n_received as usize, self.mapper.model())?;
-            (vec![text.to_owned()], held)
-        } else {
-            let stored = etude.stored_observations(&self.id, 0, self.n_received, self.mapper.model());
-            let (StoredObservations { texts, .. }, held) = stored.await?;
-            (texts, held)
-        };
-        let is_inline = self.ends_inline(&etude.clock);
-        let online = self.online.take().ok_or(SessionError::NotOpen)?;
-        let (mapper, wanted) = (Arc::clone(&self.mapper), (self.weights.clone(), self.conditions.clone()));
-        let (id, n_committed) = (self.id.clone(), self.n_steps);
-        let (memory, clock) = (etude.memory.clone(), etude.clock.clone());
-        let policy_id = match &self.source.trial_id {
-            Some(trial) => etude.store.trial(trial).await?.map(|trial| trial.policy_id),
-            None => None,
-        };
-        let stamp = Stamp {
-            id: Some(policy_id.unwrap_or_else(|| etude.ids.next().to_string())),
-            model: self.model.clone(),
-            model_hash: self.model_hash.clone(),
-            learner: self.source.learner.clone(),
-            weights_version: self.source.weights_version,
-            lookahead: self.lookahead.map(NonZeroU32::get),
-            ..Stamp::default()
-        };
-        let held_bytes = self.held.n_bytes();
-        let job = move |interrupt: &mut dyn Interrupt| {
-            let spare = take_beyond_small(u64::MAX, &memory);
-            let most_bytes = held_bytes + SMALL_BYTES + spare.as_ref().map_or(0, Held::n_bytes);
-            let online = online.within(usize::try_from(most_bytes).unwrap_or(usize::MAX));
-            online.find_rest(interrupt)?;
-            drop(spare);
-            let steps = take_for_end(&online, n_committed, mapper.model(), &memory);
-            let concluded = steps
-                .map_err(|no_room| ServiceError::from(no_room).into())
-                .and_then(|steps| conclude(online, steps, (&mapper, &clock), (&id, seq, &texts), wanted, stamp));
-            drop(texts_held);
-            Ok(concluded)
-        };
-        let concluded =
-            if is_inline { etude.pool.run_here(None, job)? } else { etude.pool.run_in_turn(self.client, job).await? };
-        let (mut steps, policy, row, refinement) = concluded?;
-        let is_refined = refinement.is_some();
-        let end = SessionEnd { session_id: self.id.clone(), owner: self.owner, policy: row.at(now), refinement };
-        etude.store.end_session(end).await??;
-        self.stay();
-        if is_refined {
-            etude.refiner.wake();
-        }
-        self.n_steps += steps.len();
-        steps.give_back(written_bytes(self.n_steps, self.mapper.model()));
-        Ok(Ended { steps, policy })
     }
 }

@@ -21,7 +21,7 @@ use etude_core::attribute::ByAttribute;
 use etude_core::mapping::Conditions;
 pub use reads::{StoredObservations, StoredSteps};
 use verbs::{ExpireSessions, TakeSession, TouchSession};
-pub(super) use verbs::{SettleObservations, open_all};
+pub(super) use verbs::{SettleObservations, end_all, open_all, refusal};
 
 /// How far a session has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -186,6 +186,8 @@ pub struct SessionEnd {
     pub session_id: String,
     /// Who ends it.
     pub owner: Owner,
+    /// Its last observations, if they are not stored yet.
+    pub last: Option<NewObservations>,
     /// Its policy.
     pub policy: NewPolicy,
     /// What is to be done about its policy, if that is local.
@@ -257,13 +259,13 @@ impl Store {
         self.writer.write(TouchSession { id: id.to_owned(), owner, at }).await
     }
 
-    /// Ends an open session: stores its policy and links them.
+    /// Ends an open session: stores its last observations and its policy, and links them.
     ///
     /// # Errors
     ///
     /// If the database failed; then nothing was stored.
     pub async fn end_session(&self, end: SessionEnd) -> Result<Result<(), SessionRefusal>, StoreError> {
-        self.writer.write(end).await
+        self.writer.end_session(end).await
     }
 
     /// Ends open sessions that were last active longer than `idle` before `now`, and forgets their observations:

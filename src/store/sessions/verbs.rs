@@ -1,12 +1,15 @@
 //! How the tables of sessions and their observations are written.
 
+use std::collections::HashSet;
+
 use jiff::Timestamp;
+use serde_json::{Value, json};
 use sqlx::sqlite::SqliteRow;
-use sqlx::{Row, SqliteConnection};
+use sqlx::{FromRow, Row, SqliteConnection};
 
 use super::{ExpiredSession, MAX_EXPIRED_AT_ONCE, NewSession, SessionEnd, SessionStatus, Taken, read_session};
 use crate::store::alive::{self, Down, NoteAlive};
-use crate::store::observations::{Owner, SessionRefusal};
+use crate::store::observations::{NewObservations, Owner, SessionRefusal};
 use crate::store::policies::{NewPolicy, NewRefinement};
 use crate::store::statements::Statements;
 use crate::store::trials::{self, Opened};
@@ -93,34 +96,6 @@ impl Verb for TouchSession {
     }
 }
 
-impl Verb for SessionEnd {
-    type Answer = Result<(), SessionRefusal>;
-
-    const READS_OBSERVATIONS: bool = true;
-
-    fn n_bytes(&self) -> usize {
-        self.policy.n_bytes() + self.refinement.as_ref().map_or(0, NewRefinement::n_bytes)
-    }
-
-    async fn apply(&self, writing: &mut Writing<'_, '_>) -> Result<Result<(), SessionRefusal>, StoreError> {
-        let NewPolicy { id: policy_id, created_at, .. } = &self.policy;
-        let ended = writing.statements.add(
-            "UPDATE sessions SET status = 'done', policy_id = ?, active_at_ms = ?
-             WHERE id = ? AND status = 'open' AND owner = ? RETURNING id",
-        );
-        ended.bind(policy_id).bind(created_at.as_millisecond()).bind(&self.session_id).bind(self.owner.0);
-        if writing.statements.fetch().await?.is_none() {
-            return refusal(writing.connection().await?, &self.session_id).await.map(Err);
-        }
-        writing.arrivals.ended(&self.session_id);
-        policies::add_all(writing.statements, &[&self.policy]).await?;
-        if let Some(refinement) = &self.refinement {
-            refinements::add(writing.statements, refinement);
-        }
-        Ok(Ok(()))
-    }
-}
-
 impl Verb for ExpireSessions {
     type Answer = (Down, Vec<ExpiredSession>);
 
@@ -134,10 +109,55 @@ impl Verb for ExpireSessions {
 }
 
 /// Why nothing was done: the session is not open, or the caller is not its owner.
-async fn refusal(connection: &mut SqliteConnection, id: &str) -> Result<SessionRefusal, StoreError> {
+pub(in crate::store) async fn refusal(
+    connection: &mut SqliteConnection,
+    id: &str,
+) -> Result<SessionRefusal, StoreError> {
     let query = sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM sessions WHERE id = $1 AND status = 'open')");
     let is_open = query.bind(id).fetch_one(connection).await?;
     Ok(if is_open { SessionRefusal::Superseded } else { SessionRefusal::NotOpen })
+}
+
+impl SessionEnd {
+    /// How many bytes there are to be written, roughly.
+    pub(in crate::store) fn n_bytes(&self) -> usize {
+        let Self { last, policy, refinement, .. } = self;
+        let n_last = last.as_ref().map_or(0, NewObservations::n_bytes);
+        n_last + policy.n_bytes() + refinement.as_ref().map_or(0, NewRefinement::n_bytes)
+    }
+}
+
+/// Ends sessions, and adds their policies. Gives for each whether it was open, and the caller its owner; what is inserted waits in `statements`.
+/// Does nothing if others have written since the `data_version` that is given.
+pub(in crate::store) async fn end_all(
+    statements: &mut Statements<'_>,
+    ends: &[&SessionEnd],
+    data_version: Option<i64>,
+) -> Result<Vec<bool>, StoreError> {
+    // The sign before `status` is explained where observations are counted.
+    let ended = statements.add(
+        "UPDATE sessions SET status = 'done', policy_id = new.value ->> 2, active_at_ms = new.value ->> 3
+         FROM json_each(?) AS new
+         WHERE sessions.id = new.value ->> 0 AND +status = 'open' AND owner = new.value ->> 1
+             AND IFNULL((SELECT data_version FROM pragma_data_version) = ?, TRUE)
+         RETURNING sessions.id, sessions.owner",
+    );
+    let row = |end: &&SessionEnd| {
+        let NewPolicy { id, created_at, .. } = &end.policy;
+        json!([end.session_id, end.owner.0, id, created_at.as_millisecond()])
+    };
+    ended.bind(Value::Array(ends.iter().map(row).collect()).to_string()).bind(data_version);
+    let ended = statements.fetch_all().await?;
+    let ended = ended.iter().map(<(String, u32)>::from_row).collect::<Result<HashSet<_>, _>>()?;
+    let has_ended = |end: &SessionEnd| ended.contains(&(end.session_id.clone(), end.owner.0));
+    let have_ended: Vec<bool> = ends.iter().map(|end| has_ended(end)).collect();
+    let ended: Vec<&SessionEnd> = ends.iter().copied().filter(|end| has_ended(end)).collect();
+    let policies: Vec<&NewPolicy> = ended.iter().map(|end| &end.policy).collect();
+    policies::add_all(statements, &policies).await?;
+    for refinement in ended.iter().filter_map(|end| end.refinement.as_ref()) {
+        refinements::add(statements, refinement);
+    }
+    Ok(have_ended)
 }
 
 /// Opens sessions, and the trials of those that explore. Takes one statement for all that do not: whoever opens many at once is not to keep others

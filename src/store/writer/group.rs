@@ -7,7 +7,9 @@ use crate::store::arrivals::Arrivals;
 use crate::store::observations::SessionRefusal;
 use crate::store::statements::Statements;
 use crate::store::trials::{NewReward, NewTrial, Opened, RewardAnswer};
-use crate::store::{NewObservations, NewPolicy, NewSession, StoreError, policies, refinements, sessions, trials};
+use crate::store::{
+    NewObservations, NewPolicy, NewSession, SessionEnd, StoreError, policies, refinements, sessions, trials,
+};
 
 /// Applies `group`: durable when this returns.
 pub(super) async fn write(
@@ -17,6 +19,7 @@ pub(super) async fn write(
     was_interrupted: bool,
 ) -> Result<Effects, StoreError> {
     if append_at_once(connection, arrivals, group).await?
+        || end_sessions_at_once(connection, arrivals, group).await?
         || add_policies_at_once(connection, group).await?
         || accept_rewards_at_once(connection, group).await?
         || open_sessions_at_once(connection, arrivals, group).await?
@@ -26,10 +29,11 @@ pub(super) async fn write(
     transact(connection, arrivals, group, was_interrupted).await
 }
 
-/// The observations in a group, in order.
+/// The observations in a group, in order, with those that come with the end of their session.
 fn observations(group: &[Job]) -> Vec<&NewObservations> {
     let new = group.iter().filter_map(|job| match job {
         Job::Observations(asked) => Some(&asked.request),
+        Job::End(asked) => asked.request.last.as_ref(),
         _ => None,
     });
     new.collect()
@@ -42,10 +46,11 @@ async fn append_at_once(
     arrivals: &mut Arrivals,
     group: &mut [Job],
 ) -> Result<bool, StoreError> {
-    let news = observations(group);
-    if news.len() < group.len() || !arrivals.is_known() || arrivals.is_full() {
+    let are_all = group.iter().all(|job| matches!(job, Job::Observations(_)));
+    if !are_all || !arrivals.is_known() || arrivals.is_full() {
         return Ok(false);
     }
+    let news = observations(group);
     let accepted = arrivals.accept(&mut Statements::on(connection), &news).await?;
     if accepted.answers.iter().any(Result::is_err) || !arrivals.add_at_once(connection, &news, &accepted).await? {
         // The transaction that follows finds out why.
@@ -56,14 +61,96 @@ async fn append_at_once(
     Ok(true)
 }
 
+/// Sessions whose last observations are refused do not end.
 fn answer_observations(group: &mut [Job], answers: Vec<Result<(), SessionRefusal>>) {
-    let asked = group.iter_mut().filter_map(|job| match job {
-        Job::Observations(asked) => Some(asked),
+    let mut answers = answers.into_iter();
+    for job in group {
+        match job {
+            Job::Observations(asked) => asked.answer = answers.next(),
+            Job::End(asked) if asked.request.last.is_some() => {
+                asked.answer = answers.next().filter(Result::is_err);
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Ends sessions by two executions, if there is nothing else in the group but observations, and all of it is done as far as is known. Says
+/// whether it was; it has done nothing otherwise.
+async fn end_sessions_at_once(
+    connection: &mut SqliteConnection,
+    arrivals: &mut Arrivals,
+    group: &mut [Job],
+) -> Result<bool, StoreError> {
+    let are_all = group.iter().all(|job| matches!(job, Job::Observations(_) | Job::End(_)));
+    if !are_all || !arrivals.is_known() || arrivals.is_full() {
+        return Ok(false);
+    }
+    let (news, ends, statements) = (observations(group), ends(group), &mut Statements::on(connection));
+    let accepted = arrivals.accept(statements, &news).await?;
+    if accepted.answers.iter().any(Result::is_err) {
+        arrivals.forget();
+        return Ok(false);
+    }
+    statements.add("BEGIN IMMEDIATE");
+    if sessions::end_all(statements, &ends, arrivals.data_version()).await?.contains(&false) {
+        // The transaction that follows finds out why.
+        arrivals.forget();
+        statements.undo().await?;
+        return Ok(false);
+    }
+    arrivals.add(statements, &news, &accepted, false).await?;
+    statements.add("COMMIT");
+    statements.run().await?;
+    for end in ends {
+        arrivals.ended(&end.session_id);
+    }
+    answer_observations(group, accepted.answers);
+    for job in group {
+        if let Job::End(asked) = job {
+            asked.answer = Some(Ok(()));
+        }
+    }
+    Ok(true)
+}
+
+/// The sessions that are ended in a group, in order, but for those that were refused.
+fn ends(group: &[Job]) -> Vec<&SessionEnd> {
+    let ends = group.iter().filter_map(|job| match job {
+        Job::End(asked) if asked.answer.is_none() => Some(&*asked.request),
         _ => None,
     });
-    for (asked, answer) in asked.zip(answers) {
-        asked.answer = Some(answer);
+    ends.collect()
+}
+
+/// Ends the sessions in `group`.
+async fn end_sessions(
+    statements: &mut Statements<'_>,
+    arrivals: &mut Arrivals,
+    group: &mut [Job],
+) -> Result<(), StoreError> {
+    let ends = ends(group);
+    if ends.is_empty() {
+        return Ok(());
     }
+    let have_ended = sessions::end_all(statements, &ends, None).await?;
+    let mut answers = Vec::with_capacity(ends.len());
+    for (end, has_ended) in ends.iter().zip(have_ended) {
+        answers.push(if has_ended {
+            arrivals.ended(&end.session_id);
+            Ok(())
+        } else {
+            Err(sessions::refusal(statements.connection().await?, &end.session_id).await?)
+        });
+    }
+    let mut answers = answers.into_iter();
+    for job in group {
+        match job {
+            Job::End(asked) if asked.answer.is_none() => asked.answer = answers.next(),
+            _ => {}
+        }
+    }
+    Ok(())
 }
 
 /// Adds policies in one statement, if there is nothing else in the group and they fit. Says whether it did; it has done nothing
@@ -107,6 +194,7 @@ async fn transact(
     let statements = &mut Statements::on(connection);
     statements.add("BEGIN IMMEDIATE");
     append(statements, arrivals, group).await?;
+    end_sessions(statements, arrivals, group).await?;
     open_trials(statements, group).await?;
     for job in &mut *group {
         match job {
@@ -119,7 +207,7 @@ async fn transact(
                 let effects = &mut effects;
                 verb.apply(&mut Writing { statements, arrivals, effects, was_interrupted }).await?;
             }
-            Job::Observations(_) | Job::Trial(_) | Job::Session(_) | Job::Reward(_) => {}
+            Job::Observations(_) | Job::Trial(_) | Job::Session(_) | Job::End(_) | Job::Reward(_) => {}
         }
     }
     accept_rewards(statements, group).await?;

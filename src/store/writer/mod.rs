@@ -5,8 +5,9 @@
 //! grow with the load, and no timer is needed. Small and large requests wait in lines of their own. A group takes all small requests, but
 //! only about a MiB of large ones, so that small requests never wait long behind large ones. Observations, which are most requests, are
 //! written to `arrivals` with a commit, and moved to their table later. A group of observations alone, of policies alone, or of sessions
-//! alone that are opened, takes a single statement, and one of rewards alone two, outside of a transaction. Any other takes a transaction of a
-//! few executions (`store::statements`), as each costs the driver a change of threads.
+//! alone that are opened, takes a single statement, and one of rewards alone two, outside of a transaction. Sessions that end, with their last
+//! observations, take a transaction of two executions (`store::statements`), any other group one of a few more: each costs the driver a change
+//! of threads.
 //!
 //! After an error the state of the connection is unknown: a transaction may still be open. So the connection is closed, and the next
 //! group opens another. A write is acknowledged only if the file that was written to still has the database's name.
@@ -35,7 +36,7 @@ use super::observations::SessionRefusal;
 use super::policies::AddPolicies;
 use super::statements::Statements;
 use super::trials::{NewReward, NewTrial, Opened, RewardAnswer};
-use super::{NewSession, StoreError, Unavailable, count, database};
+use super::{NewSession, SessionEnd, StoreError, Unavailable, count, database};
 use generations::Generations;
 pub(super) use lines::MAX_LARGE_BYTES;
 use lines::{Lines, MAX_SMALL_BYTES};
@@ -170,6 +171,16 @@ impl Writer {
     pub(super) async fn open_session(&self, session: NewSession) -> Result<Opened, StoreError> {
         let (asked, answered) = Asked::new(Box::new(session));
         self.send(Job::Session(asked), answered).await
+    }
+
+    /// Ends an open session.
+    ///
+    /// # Errors
+    ///
+    /// If the database failed; then nothing was done.
+    pub(super) async fn end_session(&self, end: SessionEnd) -> Result<Result<(), SessionRefusal>, StoreError> {
+        let (asked, answered) = Asked::new(Box::new(end));
+        self.send(Job::End(asked), answered).await
     }
 
     /// Accepts a reward, unless its trial has one.

@@ -13,7 +13,7 @@ use super::*;
 use crate::store::database::{Locking, N_READERS};
 use crate::store::policies::NewPolicy;
 use crate::store::sessions::SettleObservations;
-use crate::store::{NewObservations, NewSession, NewTrial, Opened, Owner, SessionEnd, Store, Taken};
+use crate::store::{NewObservations, NewSession, NewTrial, Opened, Owner, SessionEnd, SessionStatus, Store, Taken};
 
 fn policy(id: &str, n_bytes: usize) -> AddPolicies {
     let steps = vec![0; n_bytes];
@@ -169,6 +169,61 @@ async fn sessions_that_are_opened_together_are_as_if_they_had_come_one_after_the
     }
 }
 
+/// Those of a group are ended together, with their last observations; one that cannot be is refused alone.
+#[tokio::test]
+async fn sessions_that_are_ended_together_are_as_if_each_had_ended_alone() {
+    const MANY: usize = 40;
+    const UNKNOWN: usize = 3;
+    const TAKEN: usize = 17;
+    const NOT_NEXT: usize = 23;
+    let at = Timestamp::UNIX_EPOCH;
+    let end = |n: usize| SessionEnd {
+        session_id: n.to_string(),
+        owner: Owner::FIRST,
+        last: (n % 2 == 1).then(|| NewObservations {
+            session_id: n.to_string(),
+            owner: Owner::FIRST,
+            seq: u32::from(n == NOT_NEXT),
+            n_states: 2,
+            states: "[1, 2]".to_owned(),
+            at,
+            service_time: None,
+            steps: None,
+        }),
+        policy: policy(&format!("of {n}"), 0).policies.remove(0),
+        refinement: None,
+    };
+    for are_refused in [false, true] {
+        let directory = tempfile::tempdir().unwrap();
+        let store = open(directory.path()).await;
+        for n in (0..MANY).filter(|n| !are_refused || *n != UNKNOWN) {
+            assert_eq!(store.open_session(NewSession::plain(&n.to_string(), at)).await.unwrap(), Opened::Yes);
+        }
+        if are_refused {
+            assert!(matches!(store.take_session(&TAKEN.to_string(), at).await.unwrap(), Taken::Open(_)));
+        }
+        let wanted = (0..MANY).filter(|n| are_refused || *n != NOT_NEXT);
+        let ended = join_all(wanted.clone().map(|n| store.end_session(end(n)))).await;
+        for (n, ended) in wanted.zip(ended) {
+            let expected = match n {
+                UNKNOWN if are_refused => Err(SessionRefusal::NotOpen),
+                TAKEN if are_refused => Err(SessionRefusal::Superseded),
+                NOT_NEXT => Err(SessionRefusal::NotNext),
+                _ => Ok(()),
+            };
+            assert_eq!(ended.unwrap(), expected, "{n}");
+            let row = store.session(&n.to_string()).await.unwrap();
+            let query =
+                sqlx::query_scalar("SELECT EXISTS (SELECT 1 FROM policies WHERE id = $1)").bind(format!("of {n}"));
+            let has_policy: bool = query.fetch_one(&mut *store.reader().await.unwrap()).await.unwrap();
+            assert_eq!(has_policy, expected.is_ok(), "{n}");
+            let Some(row) = row else { continue };
+            let n_observations = if has_policy && n % 2 == 1 { 2 } else { 0 };
+            assert_eq!((row.status == SessionStatus::Done, row.n_observations), (has_policy, n_observations), "{n}");
+        }
+    }
+}
+
 /// Another process stands for another server: what this one knows in memory must not count.
 #[tokio::test]
 async fn an_owner_that_another_process_has_superseded_adds_and_ends_nothing() {
@@ -195,7 +250,10 @@ async fn an_owner_that_another_process_has_superseded_adds_and_ends_nothing() {
     assert_eq!(taken.n_observations, 1);
     assert_eq!(stores[0].append_observations(new(Owner::FIRST, 1)).await.unwrap(), Err(SessionRefusal::Superseded));
     let policy = policy("p", 0).policies.remove(0);
-    let end = |owner| SessionEnd { session_id: "s".to_owned(), owner, policy: policy.clone(), refinement: None };
+    let end = |owner| {
+        let (session_id, policy) = ("s".to_owned(), policy.clone());
+        SessionEnd { session_id, owner, last: None, policy, refinement: None }
+    };
     assert_eq!(stores[0].end_session(end(Owner::FIRST)).await.unwrap(), Err(SessionRefusal::Superseded));
     assert_eq!(stores[1].append_observations(new(taken.owner, 1)).await.unwrap(), Ok(()));
     assert_eq!(stores[1].end_session(end(taken.owner)).await.unwrap(), Ok(()));

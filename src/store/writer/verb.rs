@@ -12,7 +12,7 @@ use crate::store::observations::SessionRefusal;
 use crate::store::policies::AddPolicies;
 use crate::store::statements::Statements;
 use crate::store::trials::{NewReward, NewTrial, Opened, RewardAnswer};
-use crate::store::{NewObservations, NewSession, StoreError};
+use crate::store::{NewObservations, NewSession, SessionEnd, StoreError};
 
 /// Something to be written by itself, whatever else is in the transaction.
 pub(in crate::store) trait Verb: fmt::Debug + Send + Sync + 'static {
@@ -63,6 +63,7 @@ pub(super) enum Job {
     Policies(Asked<AddPolicies, ()>),
     Trial(Asked<Box<NewTrial>, Opened>),
     Session(Asked<Box<NewSession>, Opened>),
+    End(Asked<Box<SessionEnd>, Result<(), SessionRefusal>>),
     Reward(Asked<NewReward, RewardAnswer>),
     Other(Box<dyn AnyVerb>),
 }
@@ -74,6 +75,7 @@ impl Job {
             Self::Policies(asked) => asked.request.n_bytes(),
             Self::Trial(asked) => asked.request.n_bytes(),
             Self::Session(asked) => asked.request.n_bytes(),
+            Self::End(asked) => asked.request.n_bytes(),
             Self::Reward(_) => 0,
             Self::Other(verb) => verb.n_bytes(),
         }
@@ -86,6 +88,7 @@ impl Job {
             Self::Policies(asked) => asked.tell(committed),
             Self::Trial(asked) => asked.tell(committed),
             Self::Session(asked) => asked.tell(committed),
+            Self::End(asked) => asked.tell(committed),
             Self::Reward(asked) => asked.tell(committed),
             Self::Other(verb) => verb.tell(committed),
         }

@@ -9,7 +9,6 @@ use etude::stream::{Closed, Incoming, Outgoing, Receiver, Sender, queue};
 use etude_core::document::Place;
 use jiff::Timestamp;
 use serde_json::{Value, json};
-use sqlx::ConnectOptions;
 use tempfile::TempDir;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -18,6 +17,8 @@ use tokio_util::task::TaskTracker;
 use super::figure_4;
 use crate::harness::service::{Service, flags, long_way, to_and_fro};
 use crate::harness::waiting::within;
+
+mod commits;
 
 /// Whoever speaks the protocol without a connection.
 const CLIENT: etude::client::Client = etude::client::Client::LOCAL;
@@ -184,13 +185,6 @@ fn script(demonstration: &[Value]) -> Vec<Value> {
     script
 }
 
-/// How many commits have added observations since they were last settled.
-async fn n_commits(directory: &TempDir) -> i64 {
-    let options = sqlx::sqlite::SqliteConnectOptions::new().filename(directory.path().join("etude.db"));
-    let mut connection = options.connect().await.unwrap();
-    sqlx::query_scalar("SELECT COUNT(*) FROM arrivals").fetch_one(&mut connection).await.unwrap()
-}
-
 #[tokio::test]
 async fn frames_are_answered_alike_one_by_one_or_one_behind_the_other_and_whether_or_not_they_are_read_as_documents() {
     let (service, demonstration) = figure_4().await;
@@ -258,24 +252,6 @@ async fn observations_are_read_again_after_a_break_however_they_were_written() {
     wire.send(json!({"type": "end", "seq": demonstration.len()})).await;
     let done = wire.receive_until("done").await;
     assert_eq!((&done["cost"], &done["actions"]), (&expected["cost"], &expected["actions"]));
-    etude.close().await;
-}
-
-#[tokio::test]
-async fn frames_that_wait_one_behind_the_other_take_one_commit() {
-    let (service, demonstration) = figure_4().await;
-    let (etude, directory) = without_service(service, &CancellationToken::new()).await;
-    let (etude, stopping) = (Arc::new(etude), CancellationToken::new());
-    let mut wire = Wire::connect(&etude, &stopping);
-    wire.send(json!({"type": "open", "model": "figure-4"})).await;
-    wire.receive_until("opened").await;
-    for (seq, state) in demonstration.iter().enumerate() {
-        wire.send(json!({"type": "observe", "seq": seq, "states": [state]})).await;
-    }
-    for seq in 1..=demonstration.len() {
-        assert_eq!(wire.receive_until("received").await["seq"], seq);
-    }
-    assert_eq!(n_commits(&directory).await, 1);
     etude.close().await;
 }
 
