@@ -16,8 +16,11 @@
 //! - A job whose deadline comes while it waits runs beside the pool. It can do nothing but finish at once.
 //! - A background job runs only while there is a spare thread, and is stopped as soon as another job needs that.
 //! - A job that is shorter than a change of threads runs on the caller's thread ([`SearchPool::run_here`]).
+//! - What a job uses of a processor is charged to its client. Whoever has used less comes first, and a short job of a client that has used little
+//!   runs on a thread of its own that the operating system prefers to those of long jobs.
 
 mod place;
+mod priority;
 mod threads;
 mod turns;
 mod watch;
@@ -34,10 +37,11 @@ use crate::client::Client;
 use crate::clock::Clock;
 use etude_core::interrupt::{Cancelled, Interrupt, Signal};
 use place::PoolPlace;
+use priority::Niceness;
 use threads::{Threads, Turn};
 pub(crate) use turns::Places;
 use turns::{Class, Level};
-use watch::{Job, Watch, give_way};
+use watch::{Job, Watch};
 
 /// How long a background job may go on once no thread is free: longer than most jobs keep theirs.
 const LAST_THREAD_KEPT: Duration = Duration::from_millis(100);
@@ -157,8 +161,7 @@ impl SearchPool {
     {
         let class = if n_bytes > LONG_READ_BYTES { Class::Long } else { Class::Short };
         let turn = self.turn(&self.0.reading, client, class, 0).await?;
-        let reading = Job { client, turn: None, place: None, deadline: None };
-        self.run_holding((held, turn), reading, |_| Ok(job())).await
+        self.run_holding(held, Job { client, turn: Some(turn), place: None, deadline: None }, |_| Ok(job())).await
     }
 
     /// Runs a background job, if there is a thread to spare: where there are several threads, one more stays free when it begins.
@@ -173,10 +176,10 @@ impl SearchPool {
         F: FnOnce(&mut dyn Interrupt) -> Result<T, Cancelled> + Send + 'static,
     {
         let threads = Arc::clone(&self.0.searching);
-        if !threads.lines().turns.try_start_spare() {
+        if !threads.lines().turns.try_start_spare(Client::LOCAL) {
             return Err(PoolError::Busy);
         }
-        let turn = Turn { threads: Arc::clone(&threads), class: Class::Long };
+        let turn = Turn { threads: Arc::clone(&threads), client: Client::LOCAL, class: Class::Long };
         let clock = self.0.clock.clone();
         let yielding = move |watch: &mut dyn Interrupt| {
             let mut last_since: Option<Instant> = None;
@@ -266,17 +269,18 @@ impl SearchPool {
         let _gone: DropGuard = cancel.clone().drop_guard();
         let span = tracing::Span::current();
         let (runtime, clock) = (Handle::current(), self.0.clock.clone());
-        let running = self.0.tasks.spawn_blocking(move || {
-            let _held = held;
-            give_way();
+        let is_quick = job.turn.as_ref().is_some_and(|turn| turn.class == Class::Quick);
+        let niceness = if is_quick { Niceness::Quick } else { Niceness::Long };
+        let token = self.0.tasks.token();
+        let running = priority::run(niceness, move || {
+            let _held = (held, token);
             let mut watch = Watch::new(job, cancel, runtime, clock);
             let done = span.in_scope(|| run(&mut watch));
             (done, watch.is_refused)
-        });
-        match running.await {
-            Ok((Ok(answer), _)) => Ok(answer),
-            Ok((Err(Cancelled), is_refused)) => Err(if is_refused { PoolError::Busy } else { PoolError::Stopped }),
-            Err(_) => Err(PoolError::Panicked),
+        })?;
+        match running.await.map_err(|_| PoolError::Panicked)? {
+            (Ok(answer), _) => Ok(answer),
+            (Err(Cancelled), is_refused) => Err(if is_refused { PoolError::Busy } else { PoolError::Stopped }),
         }
     }
 }

@@ -6,7 +6,9 @@ use std::sync::atomic::Ordering;
 use tokio::task::JoinHandle;
 
 use super::place::MOMENT;
+use super::priority::Niceness;
 use super::*;
+use crate::clock::thread_time;
 
 fn client(n: u8) -> Client {
     IpAddr::from(Ipv4Addr::new(10, 0, 0, n)).into()
@@ -206,4 +208,26 @@ async fn what_nobody_waits_for_leaves_a_thread_free() {
 async fn a_passed_deadline_asks_the_job_to_finish() {
     let (pool, _abort) = pool(1, 0);
     assert_eq!(pool.admit(client(0)).unwrap().run(Some(Clock::system().instant()), until_cancelled).await, Ok(()));
+}
+
+/// On Linux each thread has its own priority.
+#[cfg(target_os = "linux")]
+#[tokio::test]
+async fn the_system_prefers_short_jobs_of_who_uses_little_to_those_of_others() {
+    fn of_this_thread() -> i32 {
+        rustix::process::getpriority_process(Some(rustix::thread::gettid())).unwrap()
+    }
+    let (pool, _abort) = pool(2, 2);
+    let niceness = async |n| pool.admit(client(n)).unwrap().run(None, |_| Ok(of_this_thread())).await.unwrap();
+    // Whatever the tests run with.
+    let [quick, long] = [Niceness::Quick, Niceness::Long].map(|niceness| of_this_thread().max(niceness as i32));
+    assert_eq!(niceness(0).await, quick);
+    let now = Clock::system().instant();
+    pool.0.searching.lines().turns.charge(client(0), Duration::from_secs(1), now);
+    assert_eq!([niceness(0).await, niceness(1).await], [long, quick]);
+    let until_long = move |interrupt: &mut dyn Interrupt| {
+        while interrupt.poll() == Signal::Continue && of_this_thread() == quick {}
+        Ok((of_this_thread(), thread_time() >= MOMENT))
+    };
+    assert_eq!(pool.admit(client(1)).unwrap().run(None, until_long).await, Ok((long, true)));
 }

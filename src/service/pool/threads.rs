@@ -19,7 +19,7 @@ pub(super) struct Lines {
     clock: Clock,
     pub(super) turns: Turns,
     /// How to tell those who wait.
-    waiting: FxHashMap<Ticket, oneshot::Sender<()>>,
+    waiting: FxHashMap<Ticket, oneshot::Sender<Class>>,
     /// Jobs that have made way and wait with all that they have done.
     pub(super) n_parked: usize,
 }
@@ -27,10 +27,10 @@ pub(super) struct Lines {
 impl Lines {
     /// Tells those whose turn it is.
     fn pass_on(&mut self) {
-        while let Some(ticket) = self.turns.next(self.clock.instant()) {
+        while let Some((ticket, class)) = self.turns.next(self.clock.instant()) {
             if let Some(waiting) = self.waiting.remove(&ticket) {
                 // Whoever has gone gives the thread back.
-                let _ = waiting.send(());
+                let _ = waiting.send(class);
             }
         }
     }
@@ -52,8 +52,8 @@ impl Threads {
     pub(super) fn start_or_wait(self: &Arc<Self>, client: Client, class: Class, level: Level) -> Result<Turn, Waiting> {
         let mut lines = self.lines();
         let now = lines.clock.instant();
-        if lines.turns.try_start(class, now) {
-            return Ok(Turn { threads: Arc::clone(self), class });
+        if let Some(class) = lines.turns.try_start(client, class, now) {
+            return Ok(Turn { threads: Arc::clone(self), client, class });
         }
         Err(self.line_up(&mut lines, client, class, level))
     }
@@ -70,13 +70,14 @@ impl Threads {
 #[derive(Debug)]
 pub(super) struct Turn {
     pub(super) threads: Arc<Threads>,
+    pub(super) client: Client,
     pub(super) class: Class,
 }
 
 impl Drop for Turn {
     fn drop(&mut self) {
         let mut lines = self.threads.lines();
-        lines.turns.stop(self.class);
+        lines.turns.stop(self.client, self.class);
         lines.pass_on();
     }
 }
@@ -89,7 +90,7 @@ pub(super) struct Waiting {
     class: Class,
     /// `None` once it has its turn.
     ticket: Option<Ticket>,
-    granted: oneshot::Receiver<()>,
+    granted: oneshot::Receiver<Class>,
 }
 
 impl Waiting {
@@ -97,9 +98,9 @@ impl Waiting {
         loop {
             tokio::select! {
                 biased;
-                _ = &mut self.granted => {
+                Ok(class) = &mut self.granted => {
                     self.ticket = None;
-                    return Turn { threads: Arc::clone(&self.threads), class: self.class };
+                    return Turn { threads: Arc::clone(&self.threads), client: self.client, class };
                 }
                 // By now long jobs may have been lent another thread.
                 () = tokio::time::sleep(LENT_AFTER), if self.class == Class::Long => self.threads.lines().pass_on(),
@@ -113,9 +114,11 @@ impl Drop for Waiting {
         let Some(ticket) = self.ticket else { return };
         let mut lines = self.threads.lines();
         lines.waiting.remove(&ticket);
-        if !lines.turns.give_up(self.client, self.class, ticket) {
+        if !lines.turns.give_up(self.client, self.class, ticket)
+            && let Ok(class) = self.granted.try_recv()
+        {
             // Its turn was granted, but never used.
-            lines.turns.stop(self.class);
+            lines.turns.stop(self.client, class);
         }
         lines.pass_on();
     }

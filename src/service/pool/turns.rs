@@ -1,14 +1,17 @@
 //! Whose turn it is to use a thread: the policy of the pool, without threads or clocks.
 //!
-//! A job is *short* until it has run for a moment, and *long* from then on.
+//! A job is *short* until it has run for a moment, and *long* from then on. A short one of a client that has used threads little of late is
+//! *quick*: there are threads for such jobs alone.
 //!
 //! - Short jobs come before long ones. Long ones have all threads but one and those that only short ones use; one more is lent to
 //!   them while nothing short comes.
-//! - Of jobs of a kind, clients take turns: each is served once before one of them is served again. Of a client's jobs, the one that
+//! - Of jobs of a kind, those of the client that has used threads least of late are next ([`Usage`]). Of a client's jobs, the one that
 //!   has run least is served first (a level is twice as long as the one before it), and of those the first to come.
-//! - A long job makes way for one that has run less, and, once it had its share, for another client's.
+//! - A long job makes way if the next one has run less, or is another client's and it had its share.
 //! - A client may have at most as many places as are left free for others: one client leaves at least half of all places free, two leave
 //!   a quarter.
+
+mod usage;
 
 use std::collections::{BTreeSet, VecDeque};
 use std::time::{Duration, Instant};
@@ -16,6 +19,7 @@ use std::time::{Duration, Instant};
 use rustc_hash::FxHashMap;
 
 use crate::client::Client;
+use usage::Usage;
 
 /// Threads that only short jobs use. There is more than one, as a short job may run longer than it should before it is noticed.
 const N_SHORT_THREADS: usize = 2;
@@ -23,9 +27,14 @@ const N_SHORT_THREADS: usize = 2;
 /// How long nothing short must have come before another thread is lent to long jobs.
 pub(super) const LENT_AFTER: Duration = Duration::from_millis(10);
 
+/// A client that has used less than this of late uses little: a few hundredths of a processor, if it goes on like that.
+const LITTLE_SECONDS: f64 = 0.05;
+
 /// How long a job has run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Class {
+    /// Less than a moment, for a client that uses little. A job is so only while it runs; where it waits it is short.
+    Quick,
     /// Less than a moment.
     Short,
     /// Longer.
@@ -45,13 +54,17 @@ pub(super) struct Turns {
     n_threads: usize,
     /// Those that long jobs may have; one less while short ones come.
     n_long_threads: usize,
+    /// Jobs that have a thread, without the quick ones.
     n_running: usize,
-    n_running_long: usize,
+    n_quick: usize,
+    /// Whose long jobs run.
+    running_long: Vec<Client>,
     short: Places,
     long: Places,
     waiting_short: Queue,
     waiting_long: Queue,
     next_ticket: Ticket,
+    usage: Usage,
     /// When something short last came.
     last_short: Option<Instant>,
 }
@@ -63,12 +76,14 @@ impl Turns {
             n_threads: n_threads + N_SHORT_THREADS,
             n_long_threads: n_threads,
             n_running: 0,
-            n_running_long: 0,
+            n_quick: 0,
+            running_long: Vec::new(),
             short: Places::new(n_short),
             long: Places::new(n_long),
             waiting_short: Queue::default(),
             waiting_long: Queue::default(),
             next_ticket: 0,
+            usage: Usage::default(),
             last_short: None,
         }
     }
@@ -85,9 +100,8 @@ impl Turns {
     }
 
     /// How many jobs have a thread.
-    #[cfg(test)]
     pub(super) fn n_running(&self) -> usize {
-        self.n_running
+        self.n_running + self.n_quick
     }
 
     /// Gives `client` a place among the jobs of a class, if there is one for it.
@@ -105,24 +119,28 @@ impl Turns {
         self.last_short = self.last_short.max(Some(now));
     }
 
-    /// Takes a thread at `now`, if there is one for a job of this class and nobody waits for it.
-    pub(super) fn try_start(&mut self, class: Class, now: Instant) -> bool {
+    /// Notes that `client` has had a thread for so long, until `now`.
+    pub(super) fn charge(&mut self, client: Client, used: Duration, now: Instant) {
+        self.usage.add(client, used, now);
+    }
+
+    /// Takes a thread at `now`, if there is one for a job of this class and nobody waits for it. Says what the job is then.
+    pub(super) fn try_start(&mut self, client: Client, class: Class, now: Instant) -> Option<Class> {
         if class == Class::Short {
             self.note_short(now);
+            if self.may_be_quick(client, now) {
+                return Some(self.start(client, Class::Quick));
+            }
         }
         let is_first = self.waiting_short.is_empty() && (class == Class::Short || self.waiting_long.is_empty());
-        let starts = is_first && self.has_thread_for(class, now);
-        if starts {
-            self.start(class);
-        }
-        starts
+        (is_first && self.has_thread_for(class, now)).then(|| self.start(client, class))
     }
 
     /// Takes a thread for a job that nobody waits for, if another one stays free and nobody waits.
-    pub(super) fn try_start_spare(&mut self) -> bool {
-        let starts = self.n_running + 1 < self.n_long_threads.max(2) && !self.is_waited_for();
+    pub(super) fn try_start_spare(&mut self, client: Client) -> bool {
+        let starts = self.n_running() + 1 < self.n_long_threads.max(2) && !self.is_waited_for();
         if starts {
-            self.start(Class::Long);
+            self.start(client, Class::Long);
         }
         starts
     }
@@ -141,35 +159,44 @@ impl Turns {
     }
 
     /// A job of this class needs its thread no longer.
-    pub(super) fn stop(&mut self, class: Class) {
-        self.n_running -= 1;
-        self.n_running_long -= usize::from(class == Class::Long);
-    }
-
-    /// The next job whose turn it is, which has a thread now; nothing if none waits, or there is no thread for it.
-    pub(super) fn next(&mut self, now: Instant) -> Option<Ticket> {
-        for class in [Class::Short, Class::Long] {
-            if self.has_thread_for(class, now)
-                && let Some(ticket) = self.queue(class).pop()
-            {
-                self.start(class);
-                return Some(ticket);
-            }
+    pub(super) fn stop(&mut self, client: Client, class: Class) {
+        let n_running = if class == Class::Quick { &mut self.n_quick } else { &mut self.n_running };
+        *n_running -= 1;
+        if class == Class::Long
+            && let Some(at) = self.running_long.iter().position(|running| *running == client)
+        {
+            self.running_long.swap_remove(at);
         }
-        None
     }
 
-    /// A running job has become long. Says whether it may keep its thread.
-    pub(super) fn become_long(&mut self, now: Instant) -> bool {
-        self.n_running_long += 1;
-        !self.is_one_too_many(now)
+    /// The next job whose turn it is, which has a thread now, and what it is then; nothing if none waits, or there is no thread for it.
+    pub(super) fn next(&mut self, now: Instant) -> Option<(Ticket, Class)> {
+        let next = self.waiting_short.first(&self.usage, now);
+        let (class, client) = match next {
+            Some(client) if self.may_be_quick(client, now) => (Class::Quick, client),
+            Some(client) if self.has_thread_for(Class::Short, now) => (Class::Short, client),
+            _ if self.has_thread_for(Class::Long, now) => (Class::Long, self.waiting_long.first(&self.usage, now)?),
+            _ => return None,
+        };
+        let ticket = self.queue(class).pop(client)?;
+        Some((ticket, self.start(client, class)))
+    }
+
+    /// A running job of `client`, of this class until now, has become long. Says whether it may keep its thread.
+    pub(super) fn become_long(&mut self, client: Client, class: Class, now: Instant) -> bool {
+        self.stop(client, class);
+        self.start(client, Class::Long);
+        !self.is_one_too_many(client, now)
     }
 
     /// Whether a long job that runs should make way.
     pub(super) fn makes_way(&self, client: Client, level: Level, had_its_share: bool, now: Instant) -> bool {
-        self.is_one_too_many(now)
-            || self.waiting_long.least_level().is_some_and(|least| least < level)
-            || (had_its_share && self.waiting_long.has_others(client))
+        self.is_one_too_many(client, now)
+            || self.waiting_long.first(&self.usage, now).is_some_and(|next| {
+                let is_less = self.waiting_long.least_level(next).is_some_and(|least| least < level);
+                let may_come = next == client || self.usage.of(next, now) <= self.usage.of(client, now);
+                may_come && (is_less || (had_its_share && next != client))
+            })
     }
 
     /// Whether anybody waits for a thread.
@@ -179,12 +206,16 @@ impl Turns {
 
     /// Whether as many threads are taken as there are processors for.
     pub(super) fn are_all_taken(&self) -> bool {
-        self.n_running >= self.n_long_threads.max(2)
+        self.n_running() >= self.n_long_threads.max(2)
     }
 
-    /// Whether more long jobs run than may.
-    fn is_one_too_many(&self, now: Instant) -> bool {
-        self.n_running_long > self.n_for_long(now)
+    /// Whether more long jobs run than may, and this one of `client` is to make way. That is up to the client that has used threads most, which
+    /// may take a while to see it: until then, there is one more.
+    fn is_one_too_many(&self, client: Client, now: Instant) -> bool {
+        let n_beyond = self.running_long.len().saturating_sub(self.n_for_long(now));
+        let used = self.usage.of(client, now);
+        let has_used_more = |other: &Client| self.usage.of(*other, now) > used;
+        n_beyond > 1 || (n_beyond == 1 && !self.running_long.iter().any(has_used_more))
     }
 
     /// How many threads long jobs may have.
@@ -196,24 +227,37 @@ impl Turns {
 
     fn has_thread_for(&self, class: Class, now: Instant) -> bool {
         let is_free = self.n_running < self.n_threads;
-        is_free && (class == Class::Short || self.n_running_long < self.n_for_long(now))
+        is_free && (class == Class::Short || self.running_long.len() < self.n_for_long(now))
     }
 
-    fn start(&mut self, class: Class) {
-        self.n_running += 1;
-        self.n_running_long += usize::from(class == Class::Long);
+    /// Whether a short job of `client` would have a thread for quick ones.
+    fn may_be_quick(&self, client: Client, now: Instant) -> bool {
+        self.n_quick < self.n_long_threads && self.usage.of(client, now) < LITTLE_SECONDS
+    }
+
+    /// Takes a thread.
+    fn start(&mut self, client: Client, class: Class) -> Class {
+        match class {
+            Class::Quick => self.n_quick += 1,
+            Class::Short => self.n_running += 1,
+            Class::Long => {
+                self.n_running += 1;
+                self.running_long.push(client);
+            }
+        }
+        class
     }
 
     fn places(&mut self, class: Class) -> &mut Places {
         match class {
-            Class::Short => &mut self.short,
+            Class::Quick | Class::Short => &mut self.short,
             Class::Long => &mut self.long,
         }
     }
 
     fn queue(&mut self, class: Class) -> &mut Queue {
         match class {
-            Class::Short => &mut self.waiting_short,
+            Class::Quick | Class::Short => &mut self.waiting_short,
             Class::Long => &mut self.waiting_long,
         }
     }
@@ -272,14 +316,15 @@ impl Queue {
         self.turns.is_empty()
     }
 
-    /// Whether jobs of anybody else wait.
-    fn has_others(&self, client: Client) -> bool {
-        self.turns.iter().any(|other| *other != client)
+    /// The client that is next: of those that have used threads least, the one that has waited longest for its turn.
+    fn first(&self, usage: &Usage, now: Instant) -> Option<Client> {
+        let used = |client: &Client| usage.of(*client, now);
+        self.turns.iter().copied().min_by(|a, b| used(a).total_cmp(&used(b)))
     }
 
-    /// The level of the job that has run least.
-    fn least_level(&self) -> Option<Level> {
-        self.jobs.values().filter_map(|jobs| Some(jobs.first()?.0)).min()
+    /// The level of the client's job that has run least.
+    fn least_level(&self, client: Client) -> Option<Level> {
+        Some(self.jobs.get(&client)?.first()?.0)
     }
 
     fn push(&mut self, client: Client, job: (Level, Ticket)) {
@@ -290,10 +335,11 @@ impl Queue {
         jobs.insert(job);
     }
 
-    fn pop(&mut self) -> Option<Ticket> {
-        let client = self.turns.pop_front()?;
+    /// Takes out the client's job that is next. The client goes to the end of the line.
+    fn pop(&mut self, client: Client) -> Option<Ticket> {
         let jobs = self.jobs.get_mut(&client)?;
         let next = jobs.pop_first();
+        self.turns.retain(|waiting| *waiting != client);
         if jobs.is_empty() {
             self.jobs.remove(&client);
         } else {

@@ -1,6 +1,5 @@
 //! What a job asks while it runs: whether it is to stop, to finish, or to make way for another one.
 
-use std::cell::Cell;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
@@ -9,10 +8,11 @@ use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 
 use super::place::{MOMENT, PoolPlace, level};
+use super::priority::{Niceness, give_way};
 use super::threads::{Threads, Turn, Waiting};
 use super::turns::Class;
 use crate::client::Client;
-use crate::clock::Clock;
+use crate::clock::{Clock, thread_time};
 use etude_core::interrupt::{Interrupt, Signal};
 
 /// How long a long job keeps its thread while those of other clients wait. Long beside the change of threads that it costs.
@@ -23,21 +23,6 @@ const LOOK_EVERY: Duration = Duration::from_millis(1);
 
 /// Most jobs that have made way, each of which keeps a thread of the operating system; more are refused.
 const MAX_PARKED: usize = 256;
-
-/// Lowers the priority of this thread for good, so that threads which talk to clients and to the disk run first.
-pub(super) fn give_way() {
-    /// About a thirtieth of a normal thread's share while all processors are busy: a thread that has an answer to send then preempts a
-    /// search at once.
-    const NICENESS: i32 = 15;
-    thread_local! {
-        static HAS_GIVEN_WAY: Cell<bool> = const { Cell::new(false) };
-    }
-    #[cfg(target_os = "linux")]
-    if !HAS_GIVEN_WAY.replace(true) {
-        // On Linux each thread has its own priority. If it cannot be set, the thread only competes with the others.
-        let _ = rustix::process::setpriority_process(Some(rustix::thread::gettid()), NICENESS);
-    }
-}
 
 /// What is known of a job that is about to run.
 pub(super) struct Job {
@@ -60,6 +45,10 @@ pub(super) struct Watch {
     /// How long it had run before.
     before: Duration,
     next_look: Instant,
+    /// What the thread has used of its processor when the job began.
+    used_before: Duration,
+    /// How much the job has used since, as far as it is charged to its client.
+    charged: Duration,
     /// Whether it was stopped as there was no place for it among the long ones.
     pub(super) is_refused: bool,
 }
@@ -70,26 +59,33 @@ impl Watch {
         let before = job.place.as_ref().map_or(0, |place| place.spent_us.load(Ordering::Relaxed));
         let before = Duration::from_micros(before);
         let next_look = began + MOMENT.saturating_sub(before);
-        Self { job, cancel, runtime, clock, began, before, next_look, is_refused: false }
+        let (used_before, charged) = (thread_time(), Duration::ZERO);
+        Self { job, cancel, runtime, clock, began, before, next_look, used_before, charged, is_refused: false }
     }
 
     /// Becomes long, or makes way if it should.
     fn look(&mut self, now: Instant) -> Signal {
         self.next_look = now + LOOK_EVERY;
+        self.charge(now);
         let Some(turn) = &mut self.job.turn else { return Signal::Continue };
         let ran = now - self.began;
         let level = level(self.before + ran);
         let threads = Arc::clone(&turn.threads);
+        // Whoever uses little is not to suffer for others that use the processors.
+        if turn.class == Class::Quick && self.charged < MOMENT {
+            return Signal::Continue;
+        }
         let mut lines = threads.lines();
-        let makes_way = if turn.class == Class::Short {
+        let makes_way = if turn.class == Class::Long {
+            lines.turns.makes_way(self.job.client, level, ran >= SHARE, now)
+        } else {
             if self.job.place.as_ref().is_some_and(|place| !place.become_long(&mut lines.turns)) {
                 self.is_refused = true;
                 return Signal::Cancel;
             }
-            turn.class = Class::Long;
-            !lines.turns.become_long(now)
-        } else {
-            lines.turns.makes_way(self.job.client, level, ran >= SHARE, now)
+            give_way(Niceness::Long);
+            let class = std::mem::replace(&mut turn.class, Class::Long);
+            !lines.turns.become_long(turn.client, class, now)
         };
         if !makes_way {
             return Signal::Continue;
@@ -135,6 +131,15 @@ impl Watch {
         }
     }
 
+    /// Charges to the client what its job has used of a processor until `now`.
+    fn charge(&mut self, now: Instant) {
+        if let Some(turn) = &self.job.turn {
+            let used = thread_time().saturating_sub(self.used_before);
+            turn.threads.lines().turns.charge(turn.client, used.saturating_sub(self.charged), now);
+            self.charged = used;
+        }
+    }
+
     /// Adds to the place what this turn has taken.
     fn count(&self) {
         if let Some(place) = &self.job.place {
@@ -146,6 +151,7 @@ impl Watch {
 
 impl Drop for Watch {
     fn drop(&mut self) {
+        self.charge(self.clock.instant());
         self.count();
     }
 }
