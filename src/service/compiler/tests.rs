@@ -3,6 +3,7 @@
 use tokio_util::sync::CancellationToken;
 
 use super::*;
+use crate::service::pool::tests::keep_all_threads;
 use crate::service::{Caller, Name, PoolSettings, TimeLimits};
 
 /// Longer than anything here takes; a test that waits for this fails.
@@ -33,32 +34,11 @@ async fn cold(directory: &std::path::Path, tasks: &TaskTracker) -> Etude {
     etude
 }
 
-/// Keeps all threads of the pool until what it gives is dropped.
-async fn keep_all_threads(etude: &Etude) -> Vec<std::sync::mpsc::Sender<()>> {
-    let mut kept = Vec::new();
-    for _ in 0..3 {
-        let (until, ends) = std::sync::mpsc::channel::<()>();
-        let (begins, begun) = tokio::sync::oneshot::channel();
-        let pool = etude.pool().clone();
-        tokio::spawn(async move {
-            let job = move |_: &mut dyn Interrupt| {
-                let _ = begins.send(());
-                let _ = ends.recv();
-                Ok(())
-            };
-            pool.run_in_turn(Client::LOCAL, job).await
-        });
-        begun.await.unwrap();
-        kept.push(until);
-    }
-    kept
-}
-
 #[tokio::test(flavor = "multi_thread")]
 async fn whoever_leaves_before_a_cold_model_is_ready_leaves_nothing_behind() {
     let (directory, tasks) = (tempfile::tempdir().unwrap(), TaskTracker::new());
     let etude = cold(directory.path(), &tasks).await;
-    let kept = keep_all_threads(&etude).await;
+    let kept = keep_all_threads(etude.pool()).await;
     let before = (tasks.len(), etude.pool().n_jobs());
     let mut others = Vec::new();
     for _ in 0..50 {

@@ -369,4 +369,4 @@ impl Admission {
 }
 
 #[cfg(test)]
-mod tests;
+pub(in crate::service) mod tests;

@@ -37,6 +37,28 @@ fn until_cancelled(interrupt: &mut dyn Interrupt) -> Result<(), Cancelled> {
     }
 }
 
+/// Keeps all threads of the pool until what it gives is dropped.
+pub(in crate::service) async fn keep_all_threads(pool: &SearchPool) -> Vec<std::sync::mpsc::Sender<()>> {
+    let n_threads = pool.0.searching.lines().turns.n_all();
+    let mut kept = Vec::new();
+    for _ in 0..n_threads {
+        let (until, ends) = std::sync::mpsc::channel::<()>();
+        let (begins, begun) = tokio::sync::oneshot::channel();
+        let pool = pool.clone();
+        tokio::spawn(async move {
+            let job = move |_: &mut dyn Interrupt| {
+                let _ = begins.send(());
+                let _ = ends.recv();
+                Ok(())
+            };
+            pool.run_in_turn(Client::LOCAL, job).await
+        });
+        begun.await.unwrap();
+        kept.push(until);
+    }
+    kept
+}
+
 /// A job that is in the pool until it is cancelled.
 async fn busy(pool: &SearchPool) -> JoinHandle<Result<(), PoolError>> {
     busy_as(pool, 0).await

@@ -104,6 +104,12 @@ impl Turns {
         self.n_running + self.n_quick
     }
 
+    /// How many threads there are, with those for what is quick.
+    #[cfg(test)]
+    pub(super) fn n_all(&self) -> usize {
+        self.n_threads + self.n_long_threads
+    }
+
     /// Gives `client` a place among the jobs of a class, if there is one for it.
     pub(super) fn admit(&mut self, client: Client, class: Class) -> bool {
         self.places(class).take(client)

@@ -6,6 +6,7 @@ use tokio_util::task::TaskTracker;
 use super::super::tests::receive;
 use super::*;
 use crate::client::Client;
+use crate::service::pool::tests::keep_all_threads;
 use crate::service::{Caller, Coming, ModelText, Name, Settings};
 use etude_core::document::{Faults, Place};
 use etude_core::interrupt::Uninterrupted;
@@ -79,19 +80,12 @@ async fn slow(directory: &std::path::Path) -> (Etude, Session, Waiting) {
 async fn sessions_that_wait_for_their_turn_take_no_memory_meanwhile() {
     let directory = tempfile::tempdir().unwrap();
     let (etude, mut session, waiting) = slow(directory.path()).await;
-    let mut running =
-        Box::pin(etude.pool.run_in_turn(Client::from(std::net::IpAddr::from([10, 0, 0, 1])), |interrupt| {
-            while interrupt.poll() != Signal::Cancel {
-                std::thread::yield_now();
-            }
-            Ok(())
-        }));
-    assert!(futures_util::poll!(&mut running).is_pending());
+    let kept = keep_all_threads(&etude.pool).await;
     let free = etude.memory.free();
     let mut advancing = Box::pin(session.advance(&etude, waiting));
     assert!(futures_util::poll!(&mut advancing).is_pending());
     assert_eq!(etude.memory.free(), free);
-    drop(running);
+    drop(kept);
     assert!(!advancing.await.unwrap().is_empty());
 }
 
