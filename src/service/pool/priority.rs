@@ -41,18 +41,21 @@ pub(super) fn run<T: Send + 'static>(
     work: impl FnOnce() -> T + Send + 'static,
 ) -> Result<oneshot::Receiver<T>, PoolError> {
     let (sender, done) = oneshot::channel();
-    let runtime = Handle::current();
     let run = move || {
-        let _entered = runtime.enter();
         give_way(niceness);
         // Whoever waited may be gone.
         let _ = sender.send(work());
     };
     match niceness {
         Niceness::Quick => {
+            let runtime = Handle::current();
+            let run = move || {
+                let _entered = runtime.enter();
+                run();
+            };
             thread::Builder::new().name("quick".to_owned()).spawn(run).map_err(|_| PoolError::Busy)?;
         }
-        Niceness::Long => drop(Handle::current().spawn_blocking(run)),
+        Niceness::Long => drop(tokio::task::spawn_blocking(run)),
     }
     Ok(done)
 }

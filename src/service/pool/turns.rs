@@ -1,11 +1,11 @@
 //! Whose turn it is to use a thread: the policy of the pool, without threads or clocks.
 //!
-//! A job is *short* until it has run for a moment, and *long* from then on. A short one of a client that has used threads little of late is
+//! A job is *short* until it has run for a moment, and *long* from then on. A short one of a client that has used processors little of late is
 //! *quick*: there are threads for such jobs alone.
 //!
 //! - Short jobs come before long ones. Long ones have all threads but one and those that only short ones use; one more is lent to
 //!   them while nothing short comes.
-//! - Of jobs of a kind, those of the client that has used threads least of late are next ([`Usage`]). Of a client's jobs, the one that
+//! - Of jobs of a kind, those of the client that has used processors least of late are next ([`Usage`]). Of a client's jobs, the one that
 //!   has run least is served first (a level is twice as long as the one before it), and of those the first to come.
 //! - A long job makes way if the next one has run less, or is another client's and it had its share.
 //! - A client may have at most as many places as are left free for others: one client leaves at least half of all places free, two leave
@@ -125,7 +125,7 @@ impl Turns {
         self.last_short = self.last_short.max(Some(now));
     }
 
-    /// Notes that `client` has had a thread for so long, until `now`.
+    /// Notes that `client` has used a processor for so long, until `now`.
     pub(super) fn charge(&mut self, client: Client, used: Duration, now: Instant) {
         self.usage.add(client, used, now);
     }
@@ -215,7 +215,7 @@ impl Turns {
         self.n_running() >= self.n_long_threads.max(2)
     }
 
-    /// Whether more long jobs run than may, and this one of `client` is to make way. That is up to the client that has used threads most, which
+    /// Whether more long jobs run than may, and this one of `client` is to make way. That is up to the client that has used processors most, which
     /// may take a while to see it: until then, there is one more.
     fn is_one_too_many(&self, client: Client, now: Instant) -> bool {
         let n_beyond = self.running_long.len().saturating_sub(self.n_for_long(now));
@@ -322,7 +322,7 @@ impl Queue {
         self.turns.is_empty()
     }
 
-    /// The client that is next: of those that have used threads least, the one that has waited longest for its turn.
+    /// The client that is next: of those that have used processors least, the one that has waited longest for its turn.
     fn first(&self, usage: &Usage, now: Instant) -> Option<Client> {
         let used = |client: &Client| usage.of(*client, now);
         self.turns.iter().copied().min_by(|a, b| used(a).total_cmp(&used(b)))

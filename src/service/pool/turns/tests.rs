@@ -38,7 +38,7 @@ fn clients_take_turns_and_a_clients_jobs_keep_their_order() {
 }
 
 #[test]
-fn who_has_used_threads_least_of_late_is_next() {
+fn who_has_used_processors_least_of_late_is_next() {
     let long_ago = any_instant();
     let now = long_ago + Duration::from_secs(10);
     let mut turns = Turns::new(2, 10, 10);

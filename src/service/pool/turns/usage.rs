@@ -1,4 +1,4 @@
-//! How much clients have used threads of late.
+//! How much clients have used processors of late.
 
 use std::time::{Duration, Instant};
 
@@ -12,7 +12,7 @@ const HALF_LIFE: Duration = Duration::from_secs(1);
 /// Who has used less than this is forgotten.
 const NEGLIGIBLE_SECONDS: f64 = 1e-3;
 
-/// The time that each client has had threads for, of late.
+/// How long each client has used processors, of late.
 #[derive(Debug, Default)]
 pub(super) struct Usage {
     by_client: FxHashMap<Client, Used>,
