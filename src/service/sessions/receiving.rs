@@ -7,6 +7,7 @@
 //!   v
 //! Coming
 //!   | receive: one commit, and mapping while the disk is at work
+//!   | receive_last, where the end waits behind them: mapping first, then one commit with the end
 //!   v
 //! one ReceivedFrame for each
 //! ```
